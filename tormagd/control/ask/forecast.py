@@ -1,10 +1,11 @@
-"""What comes next in a force that repeats itself, as a pulse does, where the setpoints bring no preview.
+"""Forecast of a force that repeats itself, as a pulse does, where the setpoints bring no preview.
 
-No period is assumed, for heart beats vary: the newest stretch of force, as a delay embedding, is compared with those
-remembered, and what followed them tells what will follow it (analogue forecasting, Lorenz, J. Atmos. Sci. 26, 1969;
-locally weighted linear regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988). Two embeddings do that, one as
-long as the rise of a pulse and one as half its beat; the one that missed less lately counts more. How far both are
-believed has to be earned: by their skill over the slope that is extrapolated otherwise, judged by what came.
+No period is assumed, for heart beats vary. The newest stretch of force, as a delay embedding, is compared with those
+remembered. What followed those tells what will follow the newest (analogue forecasting, Lorenz, J. Atmos. Sci. 26,
+1969; locally weighted linear regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988).
+
+One embedding is as long as the rise of a pulse, another as half its beat; the one with less recent error counts more.
+The forecast has to earn trust by its skill over the slope, which is extrapolated otherwise.
 """
 
 import math
@@ -28,9 +29,9 @@ MIN_HISTORY: Final = 100
 "With less, which is less than a heart beat, nothing is forecast."
 RISE_DELAYS: Final = (1, 2, 4, 7, 11)
 BEAT_DELAYS: Final = (1, 3, 8, 18, 38)
-"""Of the embeddings: a stretch is compared at these points before its end, as changes from there. Close together where
-the slope and its change show, and back to the rise of a pulse, which takes a tenth of a second, or to what came before
-it: a rise is foreseen from there, but fewer stretches are alike for so long. The second were chosen on sample 1."""
+"""Of the embeddings: a stretch is compared at these points before its end, as changes from there. They are close where
+slope and curvature show, and reach back to the rise of a pulse, or to what came before it. The second foresee the rise,
+but fewer stretches are alike for so long; they were chosen on sample 1."""
 TAPS: Final = 5
 "As many as there are delays in each."
 STRIDE: Final = 3
@@ -45,8 +46,7 @@ MAX_STEP_S: Final = 0.1
 SAME_N: Final = 1e-4
 "Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
 UNLIKE_N: Final = 0.05
-"""Where every stretch differs by more, none is like the newest. Pulses on sample 1 are missed by as much with 30 and by
-1 % more with 80 mN."""
+"Where every stretch differs by more, none is like the newest. Chosen on sample 1."
 RIDGE: Final = 0.01
 "Share by which the regression's variances are raised: from stretches that hardly differ no dependence is learned."
 MAX_LEVERAGE: Final = 100.0
@@ -62,9 +62,11 @@ _MAX_BYTES: Final = HISTORY * array("d").itemsize
 
 
 def embedding(delays: tuple[int, ...]) -> Array:
-    """Where stretches and what followed them are in a full history: (TAPS + 1 + HORIZON, n) places from its end, a
-    column for each stretch: what is compared of it, its end, what followed. The first is the newest stretch, which
-    nothing has followed yet."""
+    """Return the places of all stretches in a full history, as negative indices from its end.
+
+    Shape (TAPS + 1 + HORIZON, n): a column for each stretch, with its compared points, its end, and what followed. The
+    first column is the newest stretch: what followed is its own end.
+    """
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
     ends = np.arange(-1 - HORIZON, delays[-1] - HISTORY - 1, -STRIDE)
     return np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
@@ -76,7 +78,7 @@ BEAT: Final = embedding(BEAT_DELAYS)
 
 @final
 class Guess(Value):
-    """What both embeddings, their mixture and the slope said that a point of the grid would be, N."""
+    """What was said of the force at one point of the grid, N: by each embedding, by their mixture and by the slope."""
 
     def __init__(self, rise_N: float, beat_N: float, forecast_N: float, slope_N: float) -> None:
         self.rise_N: Final = rise_N
@@ -93,7 +95,7 @@ LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
 
 @final
 class Forecast:
-    """Learns one stream of setpoints, and says how it goes on."""
+    """Learner of one stream of setpoints, which tells how the stream goes on."""
 
     stamp_s: float
     "Of the newest setpoint."
@@ -133,11 +135,10 @@ class Forecast:
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     def update(self, stamp_s: float, force_N: float) -> None:
-        """Takes one setpoint more. What comes next is not looked for here, as something waits for this setpoint:
-        `foresee` does that afterwards.
+        """Take one setpoint, and judge what was forecast for its time. Makes no forecast: `foresee` does.
 
-        Another force with the same stamp, or one from up to GRID_S before, takes the place of the first; a stamp from
-        longer before, or after MAX_STEP_S, begins anew.
+        A stamp up to GRID_S before the newest counts as the newest. A force with the newest stamp takes the place of
+        the newest force. An older stamp, or a pause of more than MAX_STEP_S, begins anew.
         """
         if -GRID_S < stamp_s - self.stamp_s < 0.0:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
@@ -151,9 +152,10 @@ class Forecast:
         self.stamp_s, self.force_N = stamp_s, force_N
 
     def foresee(self, slope_N_s: float) -> bool:
-        """Forecasts from the newest point of the grid, once for each, and notes what forecast and `slope_N_s`, which is
-        extrapolated otherwise, say, to be judged by. Whether there was something to do: it takes several times as long
-        as a plan."""
+        """Forecast from the newest point of the grid, once for each, and return whether there was something to do.
+
+        The forecast and `slope_N_s` are noted, to be judged by what comes. This takes several times as long as a plan.
+        """
         if self.from_s >= self.time_s or len(self.history) < _MIN_BYTES:
             return False
         history = np.frombuffer(self.history)
@@ -175,8 +177,10 @@ class Forecast:
         return True
 
     def forces_N(self, begins_s: float, after_s: list[float]) -> list[float]:
-        """The forces at `begins_s` plus each of `after_s` (n), all 0 or more, after the newest setpoint; they stay
-        where the forecast ends. Only where `trust` is above 0."""
+        """Return the forces (n) at `begins_s` + `after_s` (n), seconds >= 0 after the newest setpoint's stamp.
+
+        Beyond the forecast's end its last force holds. `trust` must be above 0.
+        """
         changes = self.changes_N
         # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
         since_s = self.stamp_s - self.from_s
@@ -229,9 +233,10 @@ def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
 
 
 def _search(history: Array, around: Array, longest: int) -> tuple[list[float], float]:
-    """The changes from the newest point of the grid to itself and the next HORIZON, empty where nothing is like it; and
-    how far the stretch most like the newest is from it: the mean square of a point, N², SAME_N's at least. `around` is
-    an embedding, `longest` the longest of its delays.
+    """Return the changes from the newest point of the grid to itself and the next HORIZON; none without a like stretch.
+
+    Also returned is the distance of the stretch most like the newest: the mean square of a point, N², at least
+    SAME_N's. `around` is an embedding, `longest` the longest of its delays.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.
@@ -251,8 +256,11 @@ def _search(history: Array, around: Array, longest: int) -> tuple[list[float], f
 
 
 def _constants(rows: list[list[float]]) -> list[float]:
-    """The regression's constants, the first 0, by elimination of all else from its normal equations: weighted sums of
-    products, a row for each regressor, that of 1 the last; a column for each, and behind them for what followed."""
+    """Return the regression's constants, the first 0, by elimination from its normal equations.
+
+    `rows` are weighted sums of products, one row for each regressor, with 1 last. Columns are the regressors, then the
+    points that followed.
+    """
     total = rows[TAPS][TAPS]
     variance = 0.0
     for place in range(TAPS):

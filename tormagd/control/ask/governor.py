@@ -1,11 +1,10 @@
-"""From the publisher's setpoint to the force that is asked of the device, now and ahead, with the reason for every
-difference.
+"""The force asked of the device, now and ahead, from the publisher's setpoint, with the reason for every difference.
 
-    now       the setpoint, within what the scene allows and the device gives
-    ahead     its preview; without one its slope, and the forecast as far as that is trusted
-    path      where what comes is known: the forces along the gap's path that misses least of them
-    decay     without a setpoint, or with one that is too old: to F_min at the scene's release rate
-    takeover  from one publisher's force to the next one's, at the same rate
+now       the setpoint, within what the scene allows and the device gives
+ahead     its preview; without one its slope, and the forecast as far as that is trusted
+path      where what comes is known: the forces along the gap's path that misses least of them
+decay     without a setpoint, or with one that is too old: to F_min at the scene's release rate
+takeover  from one publisher's force to the next one's, at the same rate
 """
 
 import math
@@ -40,7 +39,7 @@ Bounds = tuple[float, float]
 
 @final
 class Governor:
-    """Follows the setpoints of one publisher after another."""
+    """The stage that turns the setpoints of one publisher after another into forces to render."""
 
     time_s: float
     "Of the newest plan."
@@ -66,7 +65,8 @@ class Governor:
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
     ) -> None:
-        """`force` is the scene's."""
+        """Begin with the gap open. `force` is the scene's, `gap_speed_mm_s` the gap's greatest, `terms` what is in
+        use."""
         self._has_slope: Final = terms.slope
         self._has_forecast: Final = terms.forecast
         self._has_preview: Final = terms.preview
@@ -86,9 +86,15 @@ class Governor:
         self._forget()
 
     def update(self, now_s: float, setpoint: TimedSetpoint | None, device: DeviceFit, lag_s: float) -> Ask:
-        """What is asked at `now_s`. Of what is known ahead it looks up to `lag_s` further. The force is within what the
-        scene allows and `device` gives. It never jumps, and is never held for ever: see `decay` and `takeover`.
-        Raises DomainError for a number of the setpoint that is not finite, or beyond LARGEST."""
+        """Return what is asked of `device` at `now_s`.
+
+        `setpoint` is None without a publisher. `lag_s` is the carriages' lag: what is known ahead is looked at this
+        much further on. A setpoint that jumps is followed at once, within the scene's and the device's bounds. Decay to
+        F_min without a valid setpoint, and takeover by a new publisher, go at the scene's release rate.
+
+        Raises DomainError for a number that is not finite or beyond LARGEST, and for a preview without `preview_dt_s` >
+        0.
+        """
         lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
         dt_s = max(now_s - self.time_s, 0.0)
         self.time_s = now_s
@@ -124,7 +130,7 @@ class Governor:
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True)
 
     def foresee(self) -> bool:
-        """Prepares a forecast for the next plans, where one is due, and tells whether: for the time between plans."""
+        """Make a forecast for the next plans, and return whether one was due: for the time between plans."""
         return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def _hear(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
@@ -159,8 +165,10 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> tuple[list[float], float]:
-        """The forces at PATH_S on the best path for a preview, from `soon_s` after its stamp on; and the one by now,
-        behind the carriages' lag."""
+        """Return the forces at PATH_S on the best path for a preview, and the force by now behind the carriages' lag.
+
+        The path begins `soon_s` after the setpoint's stamp.
+        """
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
             self.slope_N_s = setpoint.preview_slope_N_s
@@ -265,9 +273,11 @@ def _within_reach(
 
 
 def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:
-    """The forces at TIMES_S from `begins_s`, 0 or more, after the stamp of a preview on: as many as it knows of, and at
-    least MIN_TIMES. Past its end a short preview goes on as it is forecast, as far as that is trusted, or else as it
-    has run so far; a long one has no end in sight."""
+    """Return the forces at TIMES_S from `begins_s` >= 0 after the stamp, as far as the preview goes, MIN_TIMES at
+    least.
+
+    Past its end, a short preview goes on along its mean slope, mixed with a trusted forecast.
+    """
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
     ends_s, mean_N_s, trust = setpoint.preview_s, setpoint.preview_slope_N_s, forecast.trust

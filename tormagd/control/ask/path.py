@@ -1,13 +1,11 @@
-"""The path of a gap that misses least of a force that is known ahead, at the speeds that the gap has.
+"""The path of a gap that misses least of a force known ahead, at the gap's speed.
 
     least sum of weight (path - wanted)^2    with    |path'| <= speed
 
-The sum is over TIMES_S, and a weight is the time that a point stands for times the square of |dF/dgap|: so newtons are
-missed least. One dynamic programme solves it exactly, backwards over the points: the least cost of the rest is a convex
-function of the gap, and its derivative is piecewise linear. A step of the gap shifts what falls to one side and what
-rises to the other, and opens a flat piece in between; a point adds a line. As each kink is passed only as often as the
-optimum moves across it, this takes microseconds (Johnson, J. Comput. Graph. Stat. 22, 2013, for the fused lasso, whose
-dual this is).
+The sum is over TIMES_S. A weight is a point's share of the time, times the square of |dF/dgap|, so newtons are missed
+least. A dynamic programme solves this exactly, backwards over the points (Johnson, J. Comput. Graph. Stat. 22, 2013,
+for the fused lasso, the dual). The least cost of the rest is a convex function of the gap, with a piecewise linear
+derivative. A step of the gap shifts its two sides apart, and a point adds a line.
 """
 
 import math
@@ -32,26 +30,26 @@ CHANGES_PER_S: Final = [1.0 / (after_s - before_s) for before_s, after_s in pair
 "From how much the gap wanted changes to the next point to its speed."
 SPEEDING_UP_S: Final = 0.025
 """Time constant with which the gap comes to another speed where its carriages are not late. Chosen on sample 1 with its
-inertia, 1.7 and 2.5 times of it: a finger's pulse, which is too steep (AAC249), is missed by 10.5, 10.1 and 10.0 mN
-with 20, 25 and 30 ms, palpation by 318 each."""
+inertia, 1.7 and 2.5 times of it; 20 to 30 ms miss pulses and palpation by the same, to 0.5 mN."""
 NEAR_S: Final = 0.18
-"""What the gap gets to in this time is near. Chosen on sample 1: with a third of it a finger's pulse (AAC364) is missed
-by 39 instead of 35 mN, and without an end palpation, which nobody foresees, by 521 instead of 510."""
+"What the gap gets to in this time is near. Chosen on sample 1, for a finger's pulse and for palpation."
 FLATTEST_N_MM: Final = 1e-3
 "A force that hardly depends on the gap counts as if it did by this much."
 
 
 @final
 class Path:
-    """The constants of a path: the force over the gap and the gap's top speed."""
+    """The best path for one portrait (force over gap) and one top speed of the gap."""
 
     def __init__(self, portrait: Portrait, gap_speed_mm_s: float) -> None:
         self._portrait: Final = portrait
         self._gap_speed_mm_s: Final = gap_speed_mm_s
 
     def is_near(self, from_N: float, to_N: float, device: DeviceFit) -> bool:
-        """Whether the gap of this device gets from one force to the other within NEAR_S. Where it does not, nothing is
-        gained by looking ahead, and it sets out at once."""
+        """Tell whether this device's gap gets from one force to the other within NEAR_S.
+
+        Where it does not, looking ahead gains nothing, and the gap sets out at once.
+        """
         portrait = self._portrait
         away_mm = portrait.gap_mm_at(device.model_N(from_N)) - portrait.gap_mm_at(device.model_N(to_N))
         return abs(away_mm) < NEAR_S * self._gap_speed_mm_s
@@ -59,11 +57,13 @@ class Path:
     def pursue(
         self, from_N: float, sent_N: float, dt_s: float, wanted_N: list[float], device: DeviceFit, lag_s: float
     ) -> tuple[list[float], float]:
-        """The forces at PATH_S along the best path for those wanted (n) at TIMES_S, and the force of the gap that the
-        carriages are sent to. `dt_s` ago the gap gave `from_N` and the carriages were sent to `sent_N`.
+        """Return the forces (7) at PATH_S along the best path for `wanted_N` (n) at TIMES_S, and the force to send.
 
-        A gap is taken to follow its carriages with the time constant SPEEDING_UP_S and by how much a device is later,
-        `lag_s`. So those are wanted ahead of it by what its speed takes in that time.
+        `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`. The returned force is
+        that of the gap to send the carriages to now.
+
+        The gap follows its carriages with the time constant SPEEDING_UP_S plus `lag_s`. So the carriages are sent ahead
+        of the path by its speed times this time.
         """
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
@@ -96,8 +96,10 @@ def nearest_path_mm(
     speed_mm_s: float,
     count: int,
 ) -> list[float]:
-    """The first `count` gaps of the best path along wanted gaps (n) with weights (n) > 0, at the first n of rising
-    times. The first of them is `elapsed_s` after the gap was at `start_mm`."""
+    """Return the first `count` gaps of the best path for `wanted_mm` (n), with `weights` (n) > 0.
+
+    The points are the first n of the rising `times_s`. The first is `elapsed_s` after the gap was at `start_mm`.
+    """
     best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
     path_mm: list[float] = []
     gap_mm, before_s = start_mm, times_s[0] - elapsed_s

@@ -1,4 +1,4 @@
-"""How much better one of two guesses at a force was than the other, lately."""
+"""Recent skill of one guess at a force over another."""
 
 from typing import Final, final
 
@@ -12,15 +12,18 @@ FORGIVEN_N: Final = 0.003
 
 @final
 class Skill(Value):
-    """Means of squares, N², with the newest counting most: what one guess gained on the other, and how far apart they
-    were."""
+    """Means of squares, N², with the newest counting most.
+
+    gained   the other guess's squared error less this one's
+    apart    the squared difference of the two guesses
+    """
 
     def __init__(self, gained: float, apart: float) -> None:
         self.gained: Final = gained
         self.apart: Final = apart
 
     def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
-        """With the errors of one guess and of the other once more, which count for so large a share of all."""
+        """Return the skill with both guesses' newest errors, which count for `share` of the means, 0..1."""
         gained = other_error_N * other_error_N - error_N * error_N
         difference_N = other_error_N - error_N
         apart = difference_N * difference_N
