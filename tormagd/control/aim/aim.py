@@ -1,4 +1,4 @@
-"""From the force that is asked to the gap that gives it: force -> field -> gap, and what holds the gap back.
+"""The gap that gives the force asked for: force -> field -> gap, and what holds the gap back.
 
 force  m = (F - o) / s                   of the model, without memory, for the device that is believed in
 field  B: m(B) = m                       the search, held near the force law
@@ -41,9 +41,16 @@ _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
 
 
 class Element(NamedTuple):
-    """How the nominal device makes force: the model and its memory, the field over the gap, the force over the gap
-    (without memory), the search for a field, and the force law beside the model; of a pad no law is known.
-    `is_beside`: the search takes longer than a plan has, and runs beside the plans."""
+    """How the nominal device makes force.
+
+    nominal    the force over the field
+    memory     relaxation and the field's hysteresis
+    field      the field over the gap
+    portrait   the force over the gap, without memory
+    search     the search for a field
+    law        the force law that the model is held against; None for a pad, of which no law is known
+    is_beside  the search takes longer than a plan has, and runs beside the plans
+    """
 
     nominal: Nominal
     memory: Memory
@@ -56,7 +63,7 @@ class Element(NamedTuple):
 
 @final
 class Aim:
-    """Plans one gap after another."""
+    """The last stage of planning, which makes one plan of the gap after another."""
 
     number: int = 0
     "Of the newest plan."
@@ -83,7 +90,8 @@ class Aim:
         self._low_confidence: Final = config.limits.low_confidence
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
-        """The plan before the first, numbered `number`: gap open. The element's field lags by `lag_mT`."""
+        """Return the plan before the first, with the gap open and this `number`. The element's field lags by
+        `lag_mT`."""
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
@@ -99,8 +107,12 @@ class Aim:
         memory: ElementMemory,
         measured: Measured | None,
     ) -> Plan:
-        """The plan for what is asked of the device that is believed in, whose element has this `memory`. `setpoint` is
-        what `ask` was made of. Raises DomainError where no field or gap can be found."""
+        """Return the next plan, for the force in `ask` and the device in `belief`.
+
+        `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent. A
+        search beside the plans finds its `question` updated. Raises DomainError where no gap gives the field, or the
+        newest answer is older than OLDEST_ANSWER_S.
+        """
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
@@ -119,7 +131,8 @@ class Aim:
         return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
 
     def found(self, question: Question) -> Answer:
-        """What the search answers: for who runs it beside the plans. Raises DomainError."""
+        """Return the answer of the search to `question`, for a search beside the plans. Changes nothing; raises
+        DomainError."""
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
 

@@ -1,4 +1,4 @@
-"""The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
+"""The phase portrait of a device: which forces its gaps give, and how fast a gap speed changes them."""
 
 from typing import Final, final
 
@@ -18,8 +18,10 @@ GRID: Final = 201
 
 @final
 class Portrait:
-    """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: along the
-    lists forces rise, and gaps fall evenly."""
+    """Force and its slope |dF/dgap|, N/mm, over the gap, at n points, for one contact and without memory.
+
+    Along the lists forces rise, and gaps fall evenly.
+    """
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
@@ -39,38 +41,39 @@ class Portrait:
         return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
-        """|dF/dgap| where the gap gives this force."""
+        """Return |dF/dgap| at the gap that gives this force."""
         return interpolated(force_N, self._rising_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
-        """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
+        """Return the gap of `gap_mm_at`, and |dF/dgap| at the next point of more force."""
         after = self._rising_N.after(force_N)
         gap_mm = interpolated_before(after, force_N, self._rising_N, self.gap_mm)
         return gap_mm, self.slope_N_mm[min(after, len(self.slope_N_mm) - 1)]
 
     def gap_mm_at(self, force_N: float) -> float:
-        """The gap that gives this force; the nearest end of the range where none does."""
+        """Return the gap that gives this force; the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.gap_mm)
 
     def force_N_at(self, gap_mm: float) -> float:
-        """What this gap gives; of the nearest end of the range outside of it."""
+        """Return the force at this gap; outside the range, the force of the nearer end."""
         return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
-        """The fastest change of force that a gap speed renders at this force."""
+        """Return the fastest change of force that this gap speed makes at this force."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 
 @final
 class PortraitSearch:
-    """The search where the handle's rate is no input: the portrait itself, by straight lines, and no network."""
+    """The search for a model without the handle's rate: it interpolates the portrait, without the network."""
 
     def __init__(self, shown: Portrait, field: FieldOfGap) -> None:
         self._portrait: Final = shown
         self._field: Final = field
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """See `FieldSolver.solve`; of `curve` only the confidence is asked, where no field gives the force."""
+        """Return the field for `force_N`, as `FieldSolver.solve` does. `curve` gives the confidence of a force out of
+        reach. Raises DomainError for numbers that are not finite."""
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
         field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
@@ -83,23 +86,27 @@ class PortraitSearch:
 
 @final
 class LawOfField:
-    """The magnetoelastic law of the insert (Eq. 29 to 34) over the gaps of a portrait, scaled to its force: what the
-    learned model is held against. Force and field rise along the lists."""
+    """The magnetoelastic law of the insert (Eq. 29 to 34) over a portrait's gaps, scaled to the portrait's force.
+
+    The learned model is held against it. Force and field rise along the lists.
+    """
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
         self._rising_N: Final = Rising(force_N)
         self.fields_mT: Final = fields_mT
 
     def field_mT(self, force_N: float) -> float:
-        """The field for a force; that of the nearer end where none gives it."""
+        """Return the field for a force; the field of the nearer end where none gives it."""
         return interpolated(force_N, self._rising_N, self.fields_mT)
 
 
 def law_beside(
     shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
 ) -> LawOfField:
-    """The force law over the gaps of a portrait, times the median of how much stronger that is. Raises `DomainError`
-    where the gaps leave the law's domain."""
+    """Return the force law over the gaps of the portrait `shown`, times the median ratio of the portrait's force to it.
+
+    Raises `DomainError` where the gaps leave the law's domain.
+    """
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
     scaled_N: list[float] = (scale * forces_N).tolist()
@@ -107,7 +114,8 @@ def law_beside(
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
-    """The portrait that a curve of the learned model predicts over a gap range."""
+    """Return the portrait that the model's `curve` predicts at GRID gaps over `gap_range_mm`, closed and open. Raises
+    `DomainError` where the field law ends."""
     gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))
