@@ -1,4 +1,4 @@
-"""The seam to what moves the gap: a plan in, two duties out, and what is known of the motion."""
+"""The interface to what moves the gap: a plan in, two duties out, and what is known of the motion."""
 
 import math
 from typing import Final, final
@@ -12,10 +12,10 @@ from tormagd.safety.codes import Limit
 
 @final
 class Acted:
-    """In how many ticks each limit of the output has acted, in the order in which they stand.
+    """Number of ticks in which each limit of the output has acted.
 
-    Duties have no slew limit: the reference's acceleration bounds what is asked of the motors, their windings smooth
-    the rest within `motor.inductance`, and a limit in between would only take phase away from the position loop.
+    Duties have no slew limit. The reference's acceleration bounds what is asked of the motors, and the windings smooth
+    the rest. A limit between them would only take phase from the position loop.
     """
 
     rate: int = 0
@@ -30,8 +30,11 @@ class Acted:
 
 @final
 class Drive(Value):
-    """Duties as the device takes them, each within its limit; what limits them; and the motors' part of them, before
-    the device's own supply is allowed for."""
+    """The duties of one tick, and the limits that held the gap back.
+
+    left_duty, right_duty     as the device takes them, each within its limit
+    left_motor, right_motor   what the motors need at their nominal supply
+    """
 
     def __init__(
         self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: list[Limit]
@@ -44,7 +47,7 @@ class Drive(Value):
 
 
 class Actuator:
-    """Follows a plan's gap. The carriages are one; another is made by giving the methods that raise here."""
+    """A follower of a plan's gap. Another actuator than the carriages gives the methods that raise here."""
 
     reference: Reference | None = None
     "Where the gap is driven; None while nothing is driven."
@@ -60,11 +63,11 @@ class Actuator:
         return math.nan if self.reference is None else self.reference.gap_mm
 
     def begin(self, gap_mm: float) -> None:
-        """Begins from that gap, at rest."""
+        """Begin at this gap, at rest."""
         raise NotImplementedError
 
     def resume(self, measured: Measured) -> None:
-        """Goes on, without a leap, from where the gap has come to while nobody saw it."""
+        """Go on, without a jump, from the gap and speed that a blind time ended with."""
         raise NotImplementedError
 
     def update(
@@ -76,21 +79,23 @@ class Actuator:
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """One tick, `dt_s` > 0 after the last. Without a `plan` the gap is held; it opens while the force `is_over`
-        what it may be. The gap is never to be closer than the plan's least. Raises DomainError for what is not
-        finite: `forget` follows."""
+        """Return the duties of one tick, `dt_s` > 0 after the last.
+
+        Without a `plan` the gap is held. With one it opens while the force `is_over` the ceiling. The gap is never to
+        be closer than the plan's least. Raises DomainError for a duty that is not finite: call `forget` then.
+        """
         raise NotImplementedError
 
     def stop(self) -> None:
-        """Nothing is driven."""
+        """Drop the reference: nothing is driven."""
         self.reference = None
 
     def lose_device(self) -> None:
-        """Another device may come."""
+        """Forget how fast this device's motors gain speed: another device may come."""
         self.acceleration_scale = 1.0
 
     def forget(self) -> None:
-        """A number was not finite: nothing that it may have come into is kept."""
+        """Stop, forget the device, and count a number that was not finite."""
         self.stop()
         self.lose_device()
         self.acted.not_finite += 1

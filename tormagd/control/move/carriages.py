@@ -1,4 +1,4 @@
-"""The carriages: a gap with its speed and acceleration in, two duties out. This is the seam to the actuator.
+"""The carriages as the actuator: from a gap with its speed and acceleration to two duties.
 
 target     where the plan leads by when a duty of now shows; a floor that acts ends the motion towards it
 reference  follows the target at the speed and acceleration of the motors
@@ -38,8 +38,11 @@ LAGGING_MM: Final = 0.1
 
 @final
 class Carriages(Actuator):
-    """Drives the two carriages of one device. Those whose motors are livelier than believed get ahead of what is
-    expected, and `acceleration_scale` grows. Of weaker ones no less is asked: they would turn too late."""
+    """The two carriages of one device.
+
+    Carriages whose motors are livelier than believed get ahead of what is expected, and `acceleration_scale` grows.
+    Weaker ones are asked for no less: they would turn too late.
+    """
 
     def __init__(self, config: Config, scene: Scene) -> None:
         super().__init__()
@@ -67,7 +70,7 @@ class Carriages(Actuator):
         self._learns: Final = terms.learning
 
     def begin(self, gap_mm: float) -> None:
-        """See `Actuator.begin`: with empty integrals, so that no duty jumps."""
+        """See `Actuator.begin`: the integrals begin empty, so no duty jumps."""
         self.reference = Reference(gap_mm)
         self.expected.begin(gap_mm)
         self.left.begin()
@@ -148,8 +151,11 @@ class Carriages(Actuator):
         return reference, is_slewed
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
-        """The motors' and the configured one, or what the carriages show where they fall behind; not below half, so
-        that carriages that are held still are found out by their following error."""
+        """Return the speeds of the motors and the configuration, or the carriages' measured speed where they fall
+        behind.
+
+        The speed is never below half, so a carriage that is held still is found by its following error.
+        """
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)

@@ -1,6 +1,6 @@
-"""The device's homing, watched from here: it opens, it finds both switches, it ends, and the force stays what it was.
+"""The watch on the device's homing: the gap opens, both switches close, homing ends, and the force does not grow.
 
-Homing is the firmware's own routine, and a motor that is wired the wrong way presses shut while it believes to open.
+Homing is the firmware's own routine, and a motor with wrong wiring presses shut while it believes to open.
 """
 
 from typing import Final, final
@@ -29,7 +29,7 @@ _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
 
 @final
 class Homing:
-    """Watches one homing after another."""
+    """The watch on one homing after another; `faults` are those of the newest look."""
 
     is_running: bool = False
     began_s: float = 0.0
@@ -48,10 +48,10 @@ class Homing:
     over_s: float = 0.0
     "and for how long it has shown more."
     faults: tuple[Fault, ...] = ()
-    "What was wrong at the newest look; told once."
+    "What was wrong at the newest look."
 
     def __init__(self, ceiling_N: float) -> None:
-        """`ceiling_N` is what the force sensor may show at any time."""
+        """Take what the force sensor may show at any time, `ceiling_N`."""
         self._ceiling_N: Final = ceiling_N
 
     @property
@@ -70,7 +70,7 @@ class Homing:
         )
 
     def update(self, now_s: float, measurement: Measurement) -> None:
-        """Takes one more look at the device."""
+        """Take one look at the device, and set `faults`."""
         self.faults = ()
         if measurement.mode is not _HOMING:
             if self.is_running:

@@ -31,8 +31,12 @@ class TransferFunction(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Open-loop stability margins: gain margin dB, upwards or downwards, within MAX_MARGIN_DB, phase margin degrees,
-    crossover Hz."""
+    """Stability margins of the open position loop.
+
+    gain_margin_dB     up or down, the nearer, within MAX_MARGIN_DB; negative where the loop swings
+    phase_margin_deg   negative where the loop swings
+    crossover_Hz       where the gain is 1
+    """
 
     gain_margin_dB: float
     phase_margin_deg: float
@@ -40,13 +44,14 @@ class Margins(NamedTuple):
 
 
 def full_speed_mm_s(motor: Motor) -> float:
-    """Speed of one carriage at full duty without load, mm/s."""
+    """Return the speed of one carriage at full duty without load, mm/s."""
     return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:
-    """Voltage that the magnets' pull takes of either motor to open a gap of 0 or more, where `motor.pull_V` is
-    `stated_V`: dipoles attract with the fourth power of their distance.
+    """Return the voltage that the magnets' pull takes of either motor to open a gap of 0 or more.
+
+    `stated_V` is that at PULL_STATED_MM (`motor.pull_V`). Dipoles attract with the fourth power of their distance.
     """
     nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
     nearness *= nearness
@@ -104,13 +109,14 @@ def _exponential(matrix: Array) -> Array:
 
 
 def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
-    """The delay besides that of one exchange which the position loop bears before it swings, s."""
+    """Return the delay, s, beyond that of one exchange, which the position loop bears before it swings."""
     known = margins(motor, position, period_s)
     return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
 
 
 def margins(motor: Motor, position: Position, period_s: float, *, delay_periods: float = 1.0) -> Margins:
-    """Margins of the position loop as it is computed: PID and its filter in z, H(z), and the delay of one exchange."""
+    """Return the margins of the position loop as it is computed: PID and its filter in z, H(z), and the exchange's
+    delay. `delay_periods` is the last, in periods."""
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)
     plant = zero_order_hold(motor, period_s)

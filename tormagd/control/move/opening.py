@@ -1,11 +1,12 @@
-"""The gap's opening, watched from here: while nothing is driven, each carriage is at its open end or there in time.
+"""The watch on the gap's opening: while nothing is driven, each carriage is open, or gets there in time.
 
     late  <-  max(late + dt - way / v, 0)        way: opened by since the last State; v: the device's own speed
 
-A carriage that stands loses a second in each second, a slow one what it is slower by, one that goes back more. So it is
-named LATE_S after it should have moved, or have been there, from wherever it began. Opening is the firmware's own
-routine. While positions are not known (not homed, or no State comes) its word is judged instead: once asked, it says
-that it opens, for no longer than a search of the switches takes, or shows both open switches, or that it failed.
+A carriage that stands loses a second in each second, a slow one what it is slower by, one that goes back more. A fault
+comes LATE_S after it should have moved or arrived, from wherever it began. Opening is the firmware's own routine.
+
+Without known positions (not homed, or no State comes) the device's word is judged. Once asked to open, it must show
+both open switches, or that it failed. Or it says that it opens, for no longer than a search of the switches takes.
 """
 
 from typing import Final, final
@@ -36,7 +37,7 @@ _FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED
 
 
 def is_open(measurement: Measurement, is_placed: bool) -> bool:
-    """Whether the gap is open: by the carriages' places where `is_placed`, and else by both open switches."""
+    """Tell whether the gap is open: by the carriages' places where `is_placed`, else by both open switches."""
     if is_placed:
         return min(measurement.left_mm, measurement.right_mm) >= -OPEN_MM
     return measurement.is_left_open and measurement.is_right_open
@@ -44,7 +45,7 @@ def is_open(measurement: Measurement, is_placed: bool) -> bool:
 
 @final
 class Opening:
-    """Watches a device that is not driven from here."""
+    """The watch on a device that is not driven from here; `faults` are those of the newest look."""
 
     is_watching: bool = False
     device_s: float = 0.0
@@ -81,11 +82,15 @@ class Opening:
         )
 
     def rest(self, request_number: int) -> None:
-        """Nothing is watched: the device is driven, homes, or has gone. What was asked for so far is not judged."""
+        """Stop watching: the device is driven, homes or has gone. Requests up to `request_number` are not judged."""
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
-        """Takes one more look at the device. `is_placed`: its carriages' places are known; `is_blind`: not now."""
+        """Take one look at the device, and set `faults`.
+
+        With `is_placed` the carriages' places are known; `is_blind` says not at present. `safety` gives the newest
+        request.
+        """
         number = safety.request_number
         if self.faults:
             self.told_request, self.faults = number, ()

@@ -1,10 +1,10 @@
-"""PID on position with two degrees of freedom.
+"""PID controller on position with two degrees of freedom.
 
     asked  u = Kp (e + Td e' + integral of e / Ti) + f        e position error, e' speed error, f feed-forward
     limit  back-calculation: the integral also takes (duty - u) / Tb
 
-The speed error carries the derivative action. Its measured half is the filtered derivative of the position, its other
-half the speed that is expected, so that a moving reference gives no derivative kick and no lag.
+The speed error carries the derivative action. One half is the filtered derivative of the measured position, the other
+the expected speed. So a moving reference gives no derivative kick and no lag.
 """
 
 from typing import Final, final
@@ -20,8 +20,10 @@ ON_TARGET_MM: Final = 0.001
 
 @final
 class Pid:
-    """The position loop of one carriage. Its integral starts at 0, which is bumpless: holding takes no duty, because
-    friction holds."""
+    """The position loop of one carriage.
+
+    Its integral starts at 0, which is bumpless: holding takes no duty, because friction holds.
+    """
 
     integral: float = 0.0
     "Duty."
@@ -36,19 +38,24 @@ class Pid:
         self._limit: Final = position.duty_limit
 
     def begin(self) -> None:
-        """Begins with an empty integral."""
+        """Begin with an empty integral, and without saturation."""
         self.integral, self.is_saturated = 0.0, False
 
     def rest(self, error_mm: float, dt_s: float) -> None:
-        """The reference rests. On target friction holds the carriage, and no error would ever take back what the
-        integral learned on the way, which is wrong on the way back: it forgets in its own time."""
+        """Let the integral forget, in its time constant, while the reference rests and the carriage is on target.
+
+        Friction holds the carriage then. What the integral learned on the way in would be wrong on the way back.
+        """
         if abs(error_mm) <= ON_TARGET_MM:
             self.integral = self.integral * self._integral_time_s / (self._integral_time_s + dt_s)
 
     def update(self, error_mm: float, error_mm_s: float, feed_forward: float, dt_s: float, is_blocked: bool) -> float:
-        """The duty, `dt_s` > 0 after the last. Where `is_blocked`, opening moves nothing: no duty above 0 is given, the
-        integral does not rise against that, and it is no saturation. Raises DomainError for a duty that is no finite
-        number, or beyond LARGEST: nothing has changed then."""
+        """Return the duty, within the duty limit, `dt_s` > 0 after the last.
+
+        `error_mm` is the place error, `error_mm_s` the speed error, `feed_forward` a duty. Where `is_blocked`, opening
+        moves nothing: no duty above 0 is given, the integral does not rise, and this is no saturation. Raises
+        DomainError for a duty that is not finite or beyond LARGEST: nothing has changed then.
+        """
         proportional = self._proportional_per_mm * error_mm
         derivative = self._proportional_per_mm * self._derivative_time_s * error_mm_s
         asked = proportional + self.integral + derivative + feed_forward

@@ -1,4 +1,4 @@
-"""The gap reference: follows a moving target as fast as the motors can, and no faster."""
+"""The reference of the gap: it follows a moving target as fast as the motors can, and no faster."""
 
 import math
 from typing import Final, final
@@ -17,7 +17,7 @@ MIN_BRAKING: Final = 0.2
 
 @final
 class Reference(Value):
-    """Where the gap is driven, mm, and how fast it is driven there, mm/s and mm/s^2."""
+    """A place to drive the gap to, mm, with its speed, mm/s, and acceleration, mm/s^2."""
 
     def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, acceleration_mm_s2: float = 0.0) -> None:
         self.gap_mm: Final = gap_mm
@@ -27,7 +27,8 @@ class Reference(Value):
 
 @final
 class Speeds(Value):
-    """Of the gap, mm/s, > 0: where the motors have no torque left, and the fastest that the reference may be."""
+    """Speeds of the gap, mm/s, > 0: at no load, where the motors have no torque left, and the reference's greatest each
+    way."""
 
     def __init__(self, no_load_mm_s: float, opening_mm_s: float, closing_mm_s: float) -> None:
         self.no_load_mm_s: Final = no_load_mm_s
@@ -36,8 +37,11 @@ class Speeds(Value):
 
 
 def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
-    """Where the plan leads `lag_s` from now, when what is done now shows. The least gap, `floor_mm`, or the greatest,
-    `open_mm`, where it acts, also ends the motion towards it."""
+    """Return where the plan leads, `lag_s` from now, when the present duty shows.
+
+    The plan is carried on by CARRY_S at most beside `lag_s`. The least gap `floor_mm` and the greatest `open_mm` hold
+    it, and end the motion towards them.
+    """
     age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + lag_s
     gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
     speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
@@ -57,14 +61,12 @@ def follow(
     speeds: Speeds,
     floor_mm: float = -math.inf,
 ) -> tuple[Reference, bool, bool]:
-    """The reference `dt_s` later, whether the speed limit holds it back from the target, which moves, and whether the
-    limit of its acceleration does. It closes no faster than it can still come to rest at `floor_mm`.
+    """Return the reference `dt_s` later, and two limits: whether speed held it back, and whether acceleration did.
 
-    The closing speed is the largest from which the distance left still suffices to brake with
-    `acceleration_mm_s2`, so that a step is time-optimal under the limits and does not overshoot. The target's own
-    speed is added, so that a moving target is followed without lag, and a target that itself turns round leaves less
-    to brake with. Speeding up, the acceleration falls with speed to nothing at `speeds.no_load_mm_s`, where the motors
-    have no torque left.
+    It closes no faster than it can stop at `floor_mm`. It approaches the target at the greatest speed that it can still
+    brake from with `acceleration_mm_s2`. So a step is time-optimal and does not overshoot. The target's own speed is
+    added, which follows a moving target without lag. A target that turns round leaves less to brake with. While
+    speeding up, the acceleration falls to nothing at `speeds.no_load_mm_s`.
     """
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
@@ -95,10 +97,10 @@ def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> flo
 
 @final
 class Expected:
-    """Where the gap must be by now if it follows its reference: the reference with its jerk limited.
+    """The expected gap, for a gap that follows its reference: the reference with its jerk limited.
 
-    The windings take the acceleration with a lag, and the exchange brings it in and back a little later. A lag has a
-    positive kernel: it adds no overshoot.
+    The windings take the acceleration with a lag, and the exchange adds a delay. A lag has a positive kernel: it adds
+    no overshoot.
     """
 
     gap_mm: float = 0.0
@@ -107,11 +109,12 @@ class Expected:
     "The speed as the measured one is filtered."
 
     def begin(self, gap_mm: float, speed_mm_s: float = 0.0) -> None:
-        """The gap is there, and moves so fast."""
+        """Begin at this gap and speed."""
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """`dt_s` later, `lag_s` behind the reference; `filter_s` is that of the measured speeds."""
+        """Follow the `reference` for `dt_s`, `lag_s` behind it. `filter_s` is the time constant of the measured speeds'
+        filter."""
         self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
         self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)
         self.filtered_mm_s = low_pass(self.filtered_mm_s, self.speed_mm_s, dt_s, filter_s)

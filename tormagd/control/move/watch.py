@@ -1,4 +1,4 @@
-"""What shows that something is wrong: with the device, the positions, the link, the force or the motion."""
+"""Faults and limits: what shows that the device, positions, link, force or motion is wrong."""
 
 import math
 from typing import Final, final
@@ -49,13 +49,13 @@ _DEVICE_RUN: Final = DeviceMode.RUN
 
 
 def ceiling_N(scene: Scene) -> float:
-    """What the force sensor may show in a scene."""
+    """Return the greatest force that the sensor may show in a scene."""
     return STARTS_OVER * scene.force.most_N + OVER_N
 
 
 @final
 class Watch:
-    """Watches one device. Times are counted in periods: a process that stood still saw nothing."""
+    """The watch on one device. Times count in periods: a process that stood still saw nothing."""
 
     enabled_s: float = math.inf
     straying_s: float = 0.0
@@ -98,8 +98,11 @@ class Watch:
         return self.over_s > OVER_HELD_S
 
     def known(self, conditions: Conditions, measured: Measured | None) -> Conditions:
-        """The conditions of a command, with how far the carriages are apart, and what skew, round trip and drift of the
-        clock a command may find at most."""
+        """Return the `conditions` of a command, with the skew of the carriages and the greatest values that a command
+        may find.
+
+        `measured` is None while the device is silent: not fresh, and the skew infinite.
+        """
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
@@ -109,7 +112,7 @@ class Watch:
         )
 
     def begin(self, enabled_s: float) -> None:
-        """Nothing has been seen since `enabled_s`."""
+        """Begin all counts anew for a device enabled at `enabled_s`, inf where it is not enabled."""
         self.enabled_s = enabled_s
         self.straying_s = self.still_s = self.opposed_s = self.over_s = 0.0
 
@@ -123,7 +126,11 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        """All that show now; `latch` names them in the order of their table."""
+        """Return all faults that show now; `latch` sorts them.
+
+        `leap` is an encoder step that no carriage makes, None without one. `sensor_doubted_s` is how long the force
+        sensor has not been believed.
+        """
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # so it was not reset in between
@@ -143,7 +150,7 @@ class Watch:
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """What is not as it should be, and no fault."""
+        """Return what is not as it should be and no fault."""
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
@@ -159,7 +166,8 @@ class Watch:
         return limits
 
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
-        """Takes a tick in which the carriages were driven with these duties, towards the gap `reference_mm`."""
+        """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap
+        `reference_mm`."""
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
@@ -169,7 +177,7 @@ class Watch:
         self.left_duty, self.right_duty = left_duty, right_duty
 
     def rest(self) -> None:
-        """Takes a tick without duties."""
+        """Take one tick without duties. The counted times stand."""
         self.left_duty = self.right_duty = 0.0
 
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
