@@ -1,4 +1,4 @@
-"""What the hand does to the element, in the model's terms: a handle slides, a finger presses."""
+"""What the hand does to the element, in the model's terms: it slides a handle, or presses a finger."""
 
 from typing import Final, final
 
@@ -16,8 +16,11 @@ PRESSED: Final = 0.9
 
 
 class Contact:
-    """How a scene's element is touched. `displacement_mm` and `rate_mm_s` are those that its portrait is drawn for, and
-    what a model is asked about that knows of no others; `slides` tells whether friction makes the force."""
+    """How a scene's element is touched.
+
+    displacement_mm, rate_mm_s   those of the portrait, for a model that knows no others
+    slides                       friction makes the force
+    """
 
     def __init__(self, displacement_mm: float, rate_mm_s: float, slides: bool) -> None:
         self.displacement_mm: Final = displacement_mm
@@ -25,29 +28,34 @@ class Contact:
         self.slides: Final = slides
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Displacement, mm, and rate, mm/s, that the force is planned for: the setpoint's own where it states them, but
-        of a handle that slides the measured rate."""
+        """Return the displacement, mm, and the rate, mm/s, that the force is planned for.
+
+        A setpoint that states them decides. A sliding handle keeps its measured rate once friction is mobilised.
+        `setpoint` is None without a publisher, `measured` before a measurement: the contact's own values then stand in.
+        """
         raise NotImplementedError
 
     def present(self, measured: Measured) -> tuple[float, float]:
-        """Displacement, mm, and rate, mm/s, at which the model gives the force of now."""
+        """Return the displacement, mm, and the rate, mm/s, to ask the model for now's force."""
         raise NotImplementedError
 
     def is_known(self, measured: Measured) -> bool:
-        """Whether the model knows the force of now."""
+        """Tell whether the model can give the force of now."""
         raise NotImplementedError
 
 
 @final
 class Sliding(Contact):
-    """The brake's handle, planned for at full mobilisation and in motion: the field sets how much friction there can
-    be. Before break-away the force is the hand's choice, and the inverse is ill-posed."""
+    """The handle of a brake, planned for with friction mobilised and in motion: there the field decides the force.
+
+    Before break-away the hand chooses the force, and the inverse is ill-posed.
+    """
 
     def __init__(self) -> None:
         super().__init__(MOBILISED_MM, ROLLER_RATE_MM_S, slides=True)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """See `Contact.planned`."""
+        """See `Contact.planned`. The rate is CREEP_MM_S at least, and MOVING_MM_S before a measurement."""
         displacement_mm = MOBILISED_MM
         rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
         if setpoint is not None:
@@ -59,11 +67,11 @@ class Sliding(Contact):
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def present(self, measured: Measured) -> tuple[float, float]:
-        """See `Contact.present`."""
+        """See `Contact.present`: the mobilised displacement and the handle's rate without its sign."""
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
     def is_known(self, measured: Measured) -> bool:
-        """Whether the handle has gone far enough one way, and not begun to come back: its friction is mobilised."""
+        """Tell whether friction is mobilised: the handle has gone far enough one way, and not begun to come back."""
         handle = measured.handle
         gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
         return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
@@ -71,14 +79,18 @@ class Sliding(Contact):
 
 @final
 class Pressing(Contact):
-    """A finger in a pad. Until it is about as deep as the scene says, the force is planned for that depth: what the pad
-    gives before, no field changes much, and carriages that ran to and fro for it would be late where it counts."""
+    """A finger in a pad.
+
+    Until the finger is nearly as deep as the scene says, the force is planned for the scene's depth. Before, no field
+    changes the pad's force much, and carriages that moved for it would be late later.
+    """
 
     def __init__(self, depth_mm: float) -> None:
         super().__init__(depth_mm, 0.0, slides=False)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """See `Contact.planned`."""
+        """See `Contact.planned`. Without a setpoint's, the depth is the measured one once deep enough, else the
+        scene's."""
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
             depth_mm, rate_mm_s = self.present(measured)
@@ -90,9 +102,9 @@ class Pressing(Contact):
         return depth_mm, rate_mm_s
 
     def present(self, measured: Measured) -> tuple[float, float]:
-        """See `Contact.present`."""
+        """See `Contact.present`: the measured depth and its rate."""
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
     def is_known(self, measured: Measured) -> bool:
-        """Whether the finger is about as deep as the scene says, or deeper."""
+        """Tell whether the finger is at least the share PRESSED of the scene's depth deep."""
         return measured.handle.displacement_mm >= PRESSED * self.displacement_mm

@@ -1,4 +1,4 @@
-"""The core: `plan` and `step`, which call the stages in the order in which data flows.
+"""The control core: `plan` and `step` call the stages in the order in which data flows.
 
     step   every tick    measure -> watch -> move
     plan   when due      believe -> ask -> aim
@@ -38,10 +38,10 @@ _PAUSED: Final = OperatingState.PAUSED
 
 @final
 class Planner:
-    """From setpoints to gaps, for one device."""
+    """The planning half of the core: from setpoints to gaps, for one device."""
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
-        """Begins with the gap open at `now_s`."""
+        """Begin at `now_s` with the gap open and an unseen device."""
         terms, insert = terms_of(scene), scene.insert
         gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
@@ -53,8 +53,11 @@ class Planner:
         "The newest."
 
     def plan(self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None) -> Plan:
-        """The next plan. `measured` is None while the device has said nothing: nothing is learned of it then. Raises
-        what its searches raise, and DomainError for a number that is not finite: call `afresh` then."""
+        """Return the next plan, and keep it in `planned`.
+
+        `setpoint` is None without a publisher. `measured` is None while the device is silent: nothing is learned of it.
+        Raises DomainError for a number that is not finite, or for a field that no gap gives: call `afresh` then.
+        """
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
@@ -66,8 +69,10 @@ class Planner:
         return plan
 
     def foresee(self) -> bool:
-        """Prepares what the next plans need of what comes, and says whether there was something to do: to be called
-        after each plan, when nothing waits."""
+        """Prepare the forecast for the next plans, and return whether there was something to do.
+
+        Call it after each plan, when nothing waits.
+        """
         return self.governor.foresee()
 
     @property
@@ -76,20 +81,20 @@ class Planner:
         return self.aim.question
 
     def answered(self, answer: Answer) -> None:
-        """The search beside the plans has found this: plans use it from now on."""
+        """Take the answer of the search beside the plans, for all plans until the next answer."""
         self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
-        """Takes that for what is known of the device. The element's memory stays."""
+        """Take `learned` for what is known of the device. The element's memory stays."""
         self.believe.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """The operator settles a dispute of device and sensor."""
+        """Take the operator's word in a dispute of device and sensor."""
         self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
-        """Begins anew after a plan that could not be made. Plans go on being numbered, and the element has not
-        forgotten."""
+        """Begin anew at `now_s` after a plan that failed: nothing of the device is known. Plan numbers go on; the
+        memory stays."""
         self.believe.forget()
         self.governor.begin(now_s)
         self.planned = self.aim.begin(now_s, self.planned.number + 1, self.believe.memory.lag_mT)
@@ -97,10 +102,10 @@ class Planner:
 
 @final
 class Stepper:
-    """From measurements and plans to duties, for one device."""
+    """The driving half of the core: from measurements and plans to duties, for one device."""
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
-        """Begins disabled at `now_s`. Without `move` the carriages are what moves the gap."""
+        """Begin disabled at `now_s`. `move` is the actuator of the gap; without one, the carriages."""
         position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s = now_s
         "Of the newest step."
@@ -121,8 +126,11 @@ class Stepper:
         return self.measure.measured
 
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
-        """One control period. With no measurement the link is lost, and the device is told nothing but OFF. A number
-        that is not finite is the fault NOT_FINITE; where `now_s` is none, raises DomainError."""
+        """Return the duties of one control period, for the newest `plan`.
+
+        `measurement` is None when the link is lost: the device is told OFF, and a driven device gives the fault
+        LINK_LOST. A number that is not finite is the fault NOT_FINITE. Raises DomainError where `now_s` is not finite.
+        """
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
@@ -150,7 +158,10 @@ class Stepper:
         return self._drive(now_s, dt_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
-        """Takes an operator's command. Raises RefusedError, and nothing has changed then."""
+        """Take an operator's command. Enabling also begins the motion from the measured gap.
+
+        Raises RefusedError, and nothing has changed then.
+        """
         measured, before = self.measured, self.safety
         self.safety = command(before, name, now_s, self.watch.known(conditions, measured))
         is_enabled = self.safety.operating_state is OperatingState.ENABLED
@@ -160,11 +171,11 @@ class Stepper:
             self.watch.begin(now_s)
 
     def latch(self, fault: Fault) -> None:
-        """Latches a fault that was found elsewhere."""
+        """Latch a fault that was found outside the core."""
         self.safety = latch(self.safety, (fault,))
 
     def lose_link(self) -> None:
-        """The link broke: the device is forgotten; where it was driven, that is a fault."""
+        """Forget the device, as the link broke. A device that was driven gives the fault LINK_LOST."""
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
         self.opening.rest(self.safety.request_number)

@@ -1,4 +1,4 @@
-"""Straight lines between tabulated points, on floats: NumPy takes longer than this for one point."""
+"""Linear interpolation between tabulated points, on floats: for one point NumPy takes longer."""
 
 from itertools import accumulate
 from typing import Final, final
@@ -15,8 +15,11 @@ LEAST_STEP: Final = 1e-200
 
 @final
 class Rising:
-    """A list (n) of finite numbers that rises, and the places in it. Raises DomainError for other numbers, and for two
-    that are closer than LEAST_STEP and not the same: no slope is between them."""
+    """A list (n) of finite numbers that rises, with a fast search for places in it.
+
+    Raises DomainError for numbers that are not finite, and for two that differ by less than LEAST_STEP: no slope is
+    between them. Equal numbers are allowed.
+    """
 
     def __init__(self, values: list[float]) -> None:
         for place, value in enumerate(values):
@@ -32,8 +35,7 @@ class Rising:
         self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     def after(self, value: float) -> int:
-        """How many are not above `value`, as `bisect_right` says: a plan asks up to thirty times, and takes a tenth of
-        its time less so where it is compiled."""
+        """Return how many numbers are not above `value`, as `bisect_right` does. Raises DomainError for NaN."""
         values = self.values
         stretch = (value - values[0]) * self._per_unit
         if not stretch >= 0.0:
@@ -47,12 +49,13 @@ class Rising:
 
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
-    """Linear between the points (n, n), and the outermost `ys` beyond them. Raises DomainError for NaN."""
+    """Return y at `x`, linear between the points (n, n), and the outermost `ys` beyond them. Raises DomainError for
+    NaN."""
     return interpolated_before(xs.after(x), x, xs, ys)
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """`interpolated` where it is known that `after` of `xs` are not above `x`."""
+    """Return `interpolated` where `after` of `xs` are known to be not above `x`."""
     if after == 0:
         return ys[0]
     if after == len(ys):
@@ -63,7 +66,7 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """Linear between evenly spaced `ys` (n), at so many steps, 0 or more, from the first; the last beyond them. Raises
+    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n), linear, and the last beyond. Raises
     DomainError for NaN."""
     if not steps < len(ys) - 1:
         if steps != steps:

@@ -1,4 +1,4 @@
-"""The nominal device: the model's force over the field, for the handle as it moves or is planned for."""
+"""The nominal device: the model's force over the field, for the handle's present or planned motion."""
 
 from typing import Final, final
 
@@ -11,8 +11,11 @@ from tormagd.model.model_file import ForceModel
 
 @final
 class Nominal:
-    """One element's force as one model has it. It changes nothing, and asks the model about nothing that this was not
-    trained on. Without `has_rate` the handle is always taken to move as the portrait is drawn for: `only`."""
+    """The force of one element as one model has it. It has no state, and asks the model only about what it was trained
+    on.
+
+    Without `has_rate`, the handle always moves as in the portrait: `only`.
+    """
 
     def __init__(self, model: ForceModel, contact: Contact, cip_percent: float, has_rate: bool) -> None:
         self._network: Final = model.network
@@ -28,7 +31,7 @@ class Nominal:
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        """The force over the field, of the handle as it moves now."""
+        """Return the force over the field for the handle's present motion."""
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.present(measured)
@@ -37,8 +40,11 @@ class Nominal:
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
     ) -> tuple[ForceCurve, tuple[Outside, ...]]:
-        """The force over the field, of the handle as a setpoint is planned for; and what of that the model does not
-        know, with what it was asked about instead."""
+        """Return the force over the field for the handle of a setpoint, and what of it the model does not know.
+
+        `setpoint` is None without a publisher, `measured` before a measurement. An `Outside` tells what was asked, and
+        what the model was asked instead.
+        """
         if not self._has_rate:
             return self.only, ()
         displacement_mm, rate_mm_s = self.contact.planned(setpoint, measured)
@@ -51,6 +57,6 @@ class Nominal:
         return curve, outside
 
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
-        """Of a handle with this displacement and rate, or what of them the model knows."""
+        """Return the force over the field at this displacement and rate, each held within what the model knows."""
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

@@ -1,4 +1,4 @@
-"""What passes between the stages, in the order in which it flows. Every record is immutable.
+"""The records between the stages, in the order in which they flow. Every record is immutable.
 
 Forces are in N against the motion of the handle, gaps and positions in mm, and opening is positive.
 """
@@ -16,9 +16,14 @@ from tormagd.safety.operating_state import DeviceRequest
 
 @final
 class TimedSetpoint(Value):
-    """The newest valid setpoint. `stamp_s` is when the publisher meant it, on the clock of `now_s`; `preview_N` are the
-    forces that follow it, `preview_dt_s` apart. `holder` numbers the publishers that have held the brake, one after the
-    other; with `is_contested` somebody else sends setpoints too.
+    """The newest valid setpoint.
+
+    stamp_s                      when the publisher meant it, on the clock of `now_s`
+    valid_for_s                  how long after the stamp it is followed
+    displacement_mm, rate_mm_s   the handle's, planned for; None where the publisher states none
+    preview_N                    the forces that follow it, `preview_dt_s` apart
+    holder                       numbers the publishers that have held the brake, one after the other
+    is_contested                 somebody else sends setpoints too
     """
 
     def __init__(
@@ -56,9 +61,11 @@ class TimedSetpoint(Value):
 
 @final
 class Handle(Value):
-    """The handle's motion. `displacement_mm` is its travel since `turn`, or how deep a finger is in a pad. `rate_mm_s`
-    is positive the way the handle went last, or inwards. `sliding_mm_s` >= 0 is the rate at which friction slides: the
-    rate over the last travel, so that a handle that stops keeps it.
+    """The motion of a handle or a finger.
+
+    displacement_mm   travel since `turn`, or how deep a finger is in a pad
+    rate_mm_s         positive the way the handle went last, or inwards
+    sliding_mm_s      >= 0, the rate at which friction slides: over the last travel, so that a stopped handle keeps it
     """
 
     def __init__(self, displacement_mm: float, rate_mm_s: float, turn: Turn, sliding_mm_s: float = MOVING_MM_S) -> None:
@@ -70,10 +77,11 @@ class Handle(Value):
 
 @final
 class Measured(Value):
-    """Carriages in mm from the centre plane and in mm/s, and the force that the sensor reads.
+    """What is measured of the carriages and the handle.
 
-    Where the device is not homed, positions mean nothing. Force and handle came at `sensed_s` on the host's clock, and
-    at `handle_time_s` on the device's. `number` is the measurement's.
+    Carriage places are in mm from the centre plane, and meaningless unless homed. `force_N` is the sensor's, against
+    the handle's motion. Force and handle came at `sensed_s` on the host's clock, and at `handle_time_s` on the
+    device's. `handle_mm` is the encoder's place. `number` is the measurement's.
     """
 
     def __init__(
@@ -154,9 +162,15 @@ class Belief(Value):
 
 @final
 class Ask(Value):
-    """The force to render now, the forces (7) at `path.PATH_S` after the moment that is planned for, the setpoint's
-    age, and what holds the force back. `foresight`, 0..1, is how well what comes is known: 1 from a preview, less where
-    the force repeats itself, 0 where it is extrapolated. `is_meant`: a publisher wants it, nothing decays."""
+    """The force to render.
+
+    force_N     now
+    path_N      (7) at `path.PATH_S` after the moment that is planned for
+    age_s       the setpoint's age, None without one
+    limits      what holds the force back
+    foresight   0..1, how well what comes is known: 1 from a preview, less where the force repeats, 0 where extrapolated
+    is_meant    a publisher wants it, nothing decays
+    """
 
     def __init__(
         self,
@@ -177,7 +191,7 @@ class Ask(Value):
 
 @final
 class Outside(Value):
-    """A quantity that the model was not asked about as it was, because that lies outside what the model knows."""
+    """A quantity outside what the model knows: the value asked for, and the one used instead."""
 
     def __init__(self, quantity: str, asked: float, used: float) -> None:
         self.quantity: Final = quantity
@@ -193,10 +207,11 @@ class Plan(Value):
     setpoint_N        the publisher's force, None without a setpoint, and its age `setpoint_age_s`
     stamp_s           of the setpoint that the force follows; -inf where it follows none
     governed_N        the force to render now
-    predicted_N       the force that the device is expected to show now
-    gap_mm            with its speed and acceleration; never closer than `min_gap_mm`
+    predicted_N       the force that the device is expected to show now; None where the model does not know
+    field_mT          the gap's field for the force
+    gap_mm            with its speed and acceleration, opening positive; never closer than `min_gap_mm`
     confidence        0..1, of the model's in `field_mT`
-    trim              the device's force over the model's, where the plan leads
+    trim              the device's force over the model's at `governed_N`
     outside           what the limit MODEL_RANGE is about
     search_age_s      how long ago the search for `field_mT` began; 0 where it is part of the plan
     """
@@ -246,7 +261,10 @@ class Plan(Value):
 
 @final
 class Duty(Value):
-    """What goes to the device: duties in -limit..limit, its mode and the newest request; and what holds it back."""
+    """What goes to the device: a duty for each motor, within -position.duty_limit..position.duty_limit, and its mode.
+
+    `request` is the newest, numbered `request_number`. `limits` are what holds the force back.
+    """
 
     def __init__(
         self,
