@@ -290,7 +290,7 @@ class ClosedLoop:
         """The search beside the plans, if there is one, as if it ran in a process of its own."""
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
-            planner.answered(planner.aim.found(asked))
+            planner.answered(planner.aim.answer_to(asked))
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:

@@ -49,7 +49,7 @@ def test_a_plan_uses_the_newest_answer_asks_anew_and_says_how_old_it_is(core: Co
     for step in range(1, 100):
         question = planner.question
         assert question is not None
-        planner.answered(planner.aim.found(question))
+        planner.answered(planner.aim.answer_to(question))
         plan = planner.plan(1.01 + 0.02 * step, setpoint(1.5, 1.01), None)
         assert plan.search_age_s == pytest.approx(0.02)
         assert planner.question != question
@@ -96,7 +96,7 @@ def test_the_process_answers_what_the_search_would_and_one_question_at_a_time(
     question = Question(7.0, 2.0, 42.0, 1.5, 300.0)
     process.ask(question)
     process.ask(Question(8.0, 2.0, 42.0, 3.0, 300.0))
-    assert answered(process) == core.planner().aim.found(question)
+    assert answered(process) == core.planner().aim.answer_to(question)
     assert process.timing.runs == 1
     assert process.answer() is None
     # a period later: what it cannot search for it says, and goes on

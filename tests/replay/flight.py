@@ -84,7 +84,7 @@ class Flight:
         if question is None or self.loop.now_s - question.time_s < SEARCH_S:
             return None
         self._question = None
-        return self.planner.aim.found(question)
+        return self.planner.aim.answer_to(question)
 
     def ask(self, question: Question) -> None:
         """What that is asked, where it is idle."""

@@ -239,7 +239,7 @@ def believing(stage: Believe, draw: Draw) -> object:
     now_s, before_s = draw.step(PLAN_S), draw.now_s
     seen = measured(draw, now_s)
     belief = stage.update(now_s, seen)
-    stage.expect(now_s - before_s, seen, draw(1.0), draw(80.0))
+    stage.learn_lag(now_s - before_s, seen, draw(1.0), draw(80.0))
     return [belief, stage.learned(), stage.min_N]
 
 
@@ -273,7 +273,7 @@ def freshness(stage: Freshness, draw: Draw) -> object:
 def sensor(stage: SensorTrust, draw: Draw) -> object:
     dt_s = draw.positive(PLAN_S)
     stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), 1.0, draw(1.1), abs(draw(0.02)), dt_s)
-    stage.learned(draw(0.0), draw(1.1), dt_s)
+    stage.fit_moved(draw(0.0), draw(1.1), dt_s)
     return stage.lead_N, stage.back_N
 
 
@@ -483,7 +483,7 @@ def fields(_: object, draw: Draw) -> object:
 def contact(stages: list[Any], draw: Draw) -> object:
     now_s = draw.step(PLAN_S)
     seen, asked = measured(draw, now_s), setpoint(draw, now_s)
-    return [[*each.planned(asked, seen), *each.present(seen), each.is_known(seen)] for each in stages]
+    return [[*each.planned(asked, seen), *each.motion_now(seen), each.is_known(seen)] for each in stages]
 
 
 def curve(_: object, draw: Draw) -> object:

@@ -35,7 +35,7 @@ class Contact:
         """
         raise NotImplementedError
 
-    def present(self, measured: Measured) -> tuple[float, float]:
+    def motion_now(self, measured: Measured) -> tuple[float, float]:
         """Return the displacement, mm, and the rate, mm/s, to ask the model for now's force."""
         raise NotImplementedError
 
@@ -66,7 +66,7 @@ class Sliding(Contact):
                 rate_mm_s = abs(setpoint.rate_mm_s)
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
-    def present(self, measured: Measured) -> tuple[float, float]:
+    def motion_now(self, measured: Measured) -> tuple[float, float]:
         """See `Contact.present`: the mobilised displacement and the handle's rate without its sign."""
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
@@ -93,7 +93,7 @@ class Pressing(Contact):
         scene's."""
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
-            depth_mm, rate_mm_s = self.present(measured)
+            depth_mm, rate_mm_s = self.motion_now(measured)
         if setpoint is not None:
             if setpoint.displacement_mm is not None:
                 depth_mm = setpoint.displacement_mm
@@ -101,7 +101,7 @@ class Pressing(Contact):
                 rate_mm_s = setpoint.rate_mm_s
         return depth_mm, rate_mm_s
 
-    def present(self, measured: Measured) -> tuple[float, float]:
+    def motion_now(self, measured: Measured) -> tuple[float, float]:
         """See `Contact.present`: the measured depth and its rate."""
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 

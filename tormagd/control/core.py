@@ -64,7 +64,7 @@ class Planner:
         ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s)
         plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
         # how late the carriages are is learned from this plan's gap, and acts in the next one
-        self.believe.expect(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
+        self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan
         return plan
 
@@ -163,7 +163,7 @@ class Stepper:
         Raises RefusedError, and nothing has changed then.
         """
         measured, before = self.measured, self.safety
-        self.safety = command(before, name, now_s, self.watch.known(conditions, measured))
+        self.safety = command(before, name, now_s, self.watch.command_conditions(conditions, measured))
         is_enabled = self.safety.operating_state is OperatingState.ENABLED
         if is_enabled and before.operating_state is OperatingState.DISABLED:
             assert measured is not None, "nothing is fresh without one"
@@ -200,7 +200,7 @@ class Stepper:
         if not self.safety.needs_homing:
             return measured
         self.safety = homed_again(self.safety, measurement.is_homed)
-        return measure.lose_position(measured)
+        return measure.without_position(measured)
 
     def _hold(self, now_s: float) -> Duty:
         """Asks the device for an answer without moving anything: friction holds the gap. Nothing is learned from it."""

@@ -61,7 +61,7 @@ class Measure:
             self.leap = leap_between(last, measured, self._full_speed_mm_s, now_s, seen_s)
         return measured
 
-    def lose_position(self, measured: Measured) -> Measured:
+    def without_position(self, measured: Measured) -> Measured:
         """Return `measured` marked as not homed, and keep it. The next new measurement brings the device's own word
         again."""
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured

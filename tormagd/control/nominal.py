@@ -34,7 +34,7 @@ class Nominal:
         """Return the force over the field for the handle's present motion."""
         if not self._has_rate:
             return self.only
-        displacement_mm, rate_mm_s = self.contact.present(measured)
+        displacement_mm, rate_mm_s = self.contact.motion_now(measured)
         return self.curve(displacement_mm, rate_mm_s)
 
     def planned(

@@ -104,7 +104,7 @@ def main() -> None:
         asked.send(b"ready")
         while data := asked.recv(MOST_PACKET):
             try:
-                found: Answer | ValueError = aim.found(pickle.loads(data))
+                found: Answer | ValueError = aim.answer_to(pickle.loads(data))
             except ValueError as error:
                 found = error
             asked.send(pickle.dumps(found))

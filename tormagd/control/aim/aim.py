@@ -130,7 +130,7 @@ class Aim:
         gap_mm, confidence = max(wanted_mm, min_mm), solution.confidence
         return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
 
-    def found(self, question: Question) -> Answer:
+    def answer_to(self, question: Question) -> Answer:
         """Return the answer of the search to `question`, for a search beside the plans. Changes nothing; raises
         DomainError."""
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)

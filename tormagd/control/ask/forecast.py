@@ -176,8 +176,8 @@ class Forecast:
         self.awaited = (*self.awaited[:-1], said)
         return True
 
-    def forces_N(self, begins_s: float, after_s: list[float]) -> list[float]:
-        """Return the forces (n) at `begins_s` + `after_s` (n), seconds >= 0 after the newest setpoint's stamp.
+    def forces_N(self, begins_after_s: float, after_s: list[float]) -> list[float]:
+        """Return the forces (n) at `begins_after_s` + `after_s` (n), seconds >= 0 after the newest setpoint's stamp.
 
         Beyond the forecast's end its last force holds. `trust` must be above 0.
         """
@@ -185,7 +185,7 @@ class Forecast:
         # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
         since_s = self.stamp_s - self.from_s
         base_N = self.force_N - at_step(since_s / GRID_S, changes)
-        return [base_N + at_step((since_s + begins_s + later_s) / GRID_S, changes) for later_s in after_s]
+        return [base_N + at_step((since_s + begins_after_s + later_s) / GRID_S, changes) for later_s in after_s]
 
     def _begin(self, stamp_s: float, force_N: float, time_s: float, history: bytes) -> None:
         self.stamp_s, self.force_N, self.time_s, self.history = stamp_s, force_N, time_s, history

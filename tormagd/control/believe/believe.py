@@ -168,7 +168,7 @@ class Believe:
                 self._hear(now_s, measured, model_N)
         return self._belief(measured, model_N)
 
-    def expect(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
+    def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan.
 
         `foresight`, 0..1, is the plan's. Below MIN_FORESIGHT, or without a homed device, nothing is learned and the
@@ -242,7 +242,7 @@ class Believe:
         if self.learns and zero.update(
             now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd
         ):
-            self.strength.shift(sensor.told_zero(zero.zero_N - known_N))
+            self.strength.shift(sensor.zero_moved(zero.zero_N - known_N))
         was_disputed = sensor.is_disputed
         sensor.update(fit, model_N, rate_mm_s, direction, reading_N, zero_sd_N, dt_s)
         self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
@@ -284,18 +284,20 @@ class Believe:
             self.is_prior, self.is_contradicted = False, True
             self.strength.forget()
         self.strength.update(model_N, reading_N, dt_s)
-        self.sensor.learned(self.strength.fit.force_N(model_N) - before_N, model_N, dt_s)
+        self.sensor.fit_moved(self.strength.fit.force_N(model_N) - before_N, model_N, dt_s)
         # what is known of a creep stays what it is while the rest is learned
         self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
         if self.strength.is_held:
             self.limits = (Limit.TRIM, *self.limits)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute of device and sensor.
+        """Take the operator's word in a dispute of device and sensor; without one do nothing.
 
         `device`: the dispute ends, and scale and offset are as uncertain as an unseen device's. `sensor`: it is not
         believed until its readings agree again.
         """
+        if not self.sensor.is_disputed:
+            return
         self.sensor.confirm(wrong)
         if wrong == "device":
             self.zero.trust()

@@ -130,7 +130,7 @@ class SensorTrust:
         self._allow(fit, model_N, rate_mm_s, direction, zero_sd_N, dt_s)
         self._judge(self.measured_N - fit.force_N(model_N), self._is_strange(model_N, zero_sd_N), dt_s)
 
-    def learned(self, learned_N: float, model_N: float, dt_s: float) -> None:
+    def fit_moved(self, learned_N: float, model_N: float, dt_s: float) -> None:
         """Take the change `learned_N` that one reading made to the fit's force, where the model's force is `model_N`.
 
         Begins a dispute when recent changes exceed what a device changes by itself. Nothing happens before LEARNS_S of
@@ -151,7 +151,7 @@ class SensorTrust:
         if self.has_slid and abs(over_N) > MOVED_N + self.slack_N + SURE * fit.deviation_N(model_N):
             self._begin(over_N)
 
-    def told_zero(self, found_N: float) -> float:
+    def zero_moved(self, found_N: float) -> float:
         """Take a change `found_N` of the sensor's zero, which a reversal of the handle has shown. Return a shift of the
         fit, N.
 

@@ -97,7 +97,7 @@ class Watch:
         """Whether the force has been over the ceiling for so long that the gap opens."""
         return self.over_s > OVER_HELD_S
 
-    def known(self, conditions: Conditions, measured: Measured | None) -> Conditions:
+    def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
         """Return the `conditions` of a command, with the skew of the carriages and the greatest values that a command
         may find.
 
