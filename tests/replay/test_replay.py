@@ -83,6 +83,12 @@ def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fl
 
 def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> None:
     flown = fly(until_s=4.0)
+    for _ in range(1_000):
+        flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
+    forces = flown.loop.simulated.plant.element._force._values
+    forces[:] = [0.7 * force_N for force_N in forces]
+    while not flown.planner.believe.sensor.is_disputed:
+        flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
     flown.confirm("device")
     for _ in range(500):
         flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))

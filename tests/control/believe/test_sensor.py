@@ -85,7 +85,6 @@ def test_an_operator_says_that_the_sensor_is_wrong(known, hear, moving) -> None:
     assert force_N(known.believe) == pytest.approx(MODEL_N, abs=0.03)
 
 
-@pytest.mark.parametrize(("share", "is_learned"), [(0.65, True), (1.7, True), (0.3, False), (2.6, False)])
 def test_without_a_dispute_there_is_nothing_to_confirm(known) -> None:
     before = known.believe.device
     for wrong in ("sensor", "device"):
@@ -93,6 +92,7 @@ def test_without_a_dispute_there_is_nothing_to_confirm(known) -> None:
     assert (known.believe.device, known.believe.sensor.is_doubted) == (before, False)
 
 
+@pytest.mark.parametrize(("share", "is_learned"), [(0.65, True), (1.7, True), (0.3, False), (2.6, False)])
 def test_a_device_that_has_not_slid_is_learned_within_the_bounds(
     planner, hear, moving, share: float, is_learned: bool
 ) -> None:

@@ -46,7 +46,9 @@ class SlowFriction:
 
     def __init__(self, bounds: DeviceBounds) -> None:
         self._bounds: Final = bounds
-        self._least, self._most = factor_bounds(bounds)
+        least, most = factor_bounds(bounds)
+        self._least: Final = least
+        self._most: Final = most
 
     def factor_at(self, rate_mm_s: float) -> float:
         """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
