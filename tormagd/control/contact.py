@@ -10,13 +10,13 @@ ROLLER_RATE_MM_S: Final = 42.0
 CREEP_MM_S: Final = 0.5
 "A slower handle is planned for as if it crept: its friction is static."
 GONE_BACK_MM: Final = 0.01
-"A handle that has gone back by more, just over a count of its encoder, may be turning: its friction falls already."
+"A handle that has gone back by more, just over a count of its encoder, may be turning."
 PRESSED: Final = 0.9
 "A finger that is less deep than this share of the scene's depth is on its way there, or gone."
 
 
 class Contact:
-    """How a scene's element is touched.
+    """How a scene's element is touched. The methods raise NotImplementedError; each kind of contact gives its own.
 
     displacement_mm, rate_mm_s   those of the portrait, for a model that knows no others
     slides                       friction makes the force
@@ -30,8 +30,7 @@ class Contact:
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         """Return the displacement, mm, and the rate, mm/s, that the force is planned for.
 
-        A setpoint that states them decides. A sliding handle keeps its measured rate once friction is mobilised.
-        `setpoint` is None without a publisher, `measured` before a measurement: the contact's own values then stand in.
+        `setpoint` is None without a publisher, `measured` before a measurement.
         """
         raise NotImplementedError
 
@@ -55,7 +54,12 @@ class Sliding(Contact):
         super().__init__(MOBILISED_MM, ROLLER_RATE_MM_S, slides=True)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """See `Contact.planned`. The rate is CREEP_MM_S at least, and MOVING_MM_S before a measurement."""
+        """Return the displacement and the rate that the force is planned for, as `Contact.planned`.
+
+        The displacement is the setpoint's, or MOBILISED_MM where it states none. Until friction is mobilised the rate
+        is the setpoint's, without its sign. Otherwise it is the measured `sliding_mm_s`, or MOVING_MM_S before a
+        measurement. The rate is CREEP_MM_S at least.
+        """
         displacement_mm = MOBILISED_MM
         rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
         if setpoint is not None:
@@ -67,11 +71,12 @@ class Sliding(Contact):
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """See `Contact.present`: the mobilised displacement and the handle's rate without its sign."""
+        """Return MOBILISED_MM and the handle's rate without its sign, as `Contact.motion_now`."""
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether friction is mobilised: the handle has gone far enough one way, and not begun to come back."""
+        """Tell whether friction is mobilised: the handle went MOBILISED_MM one way, and is at most GONE_BACK_MM from
+        its furthest place."""
         handle = measured.handle
         gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
         return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
@@ -79,18 +84,17 @@ class Sliding(Contact):
 
 @final
 class Pressing(Contact):
-    """A finger in a pad.
-
-    Until the finger is nearly as deep as the scene says, the force is planned for the scene's depth. Before, no field
-    changes the pad's force much, and carriages that moved for it would be late later.
-    """
+    """A finger in a pad. Until `is_known`, the force is planned for the scene's depth."""
 
     def __init__(self, depth_mm: float) -> None:
         super().__init__(depth_mm, 0.0, slides=False)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """See `Contact.planned`. Without a setpoint's, the depth is the measured one once deep enough, else the
-        scene's."""
+        """Return the depth and the rate that the force is planned for, as `Contact.planned`.
+
+        Each is the setpoint's where it states one. Otherwise both are measured once the finger `is_known`; before, they
+        are the scene's depth and 0.
+        """
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
             depth_mm, rate_mm_s = self.motion_now(measured)
@@ -102,7 +106,7 @@ class Pressing(Contact):
         return depth_mm, rate_mm_s
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """See `Contact.present`: the measured depth and its rate."""
+        """Return the measured depth and its rate, as `Contact.motion_now`."""
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
     def is_known(self, measured: Measured) -> bool:

@@ -89,7 +89,7 @@ class Planner:
         self.believe.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute of device and sensor."""
+        """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
         self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
@@ -126,7 +126,8 @@ class Stepper:
         return self.measure.measured
 
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
-        """Return the duties of one control period, for the newest `plan`.
+        """Return the duties of one control period, for the newest `plan`; both 0 while the device is not driven or not
+        seen.
 
         `measurement` is None when the link is lost: the device is told OFF, and a driven device gives the fault
         LINK_LOST. A number that is not finite is the fault NOT_FINITE. Raises DomainError where `now_s` is not finite.
@@ -158,7 +159,8 @@ class Stepper:
         return self._drive(now_s, dt_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
-        """Take an operator's command. Enabling also begins the motion from the measured gap.
+        """Take an operator's command, one of `operating_state.COMMANDS`. Enabling also begins the motion from the
+        measured gap.
 
         Raises RefusedError, and nothing has changed then.
         """

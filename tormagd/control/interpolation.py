@@ -1,4 +1,4 @@
-"""Linear interpolation between tabulated points, on floats: for one point NumPy takes longer."""
+"""Linear interpolation between tabulated points, on floats."""
 
 from itertools import accumulate
 from typing import Final, final

@@ -13,9 +13,9 @@ RATE_FILTER_S: Final = 0.05
 SLIDING_MM: Final = 0.3
 "Friction takes on the level of another rate over some such travel; without travel it does not change."
 FAST_MM_S: Final = 2.0 * MOVING_MM_S
-"From here on friction hardly depends on the rate: what Stribeck's part there is has faded."
+"From here on friction hardly depends on the rate."
 MIN_DT_S: Final = 5e-6
-"Half a step of the device's clock; positions over less time than that would give speeds without bound."
+"Half a step of the device's clock: less time gives no speed."
 
 
 @final
@@ -32,9 +32,9 @@ class Measure:
     ) -> None:
         """Take the constants of one device.
 
-        `home_mm` is a carriage's distance from the centre plane on its home switch. `full_speed_mm_s` is one
-        carriage's. With `turns` the element is a handle that turns round. Without it a finger presses, whose force
-        always has the same sign.
+        `home_mm` is a carriage's distance from the centre plane on its home switch. `derivative_filter_s` is the time
+        constant of carriage speeds, `full_speed_mm_s` one carriage's speed. With `turns` the element is a handle that
+        turns round. Without it a finger presses, whose force always has the same sign.
         """
         self.sight = Sight(period_s)
         self._home_mm: Final = home_mm

@@ -55,8 +55,7 @@ def leap_between(
 ) -> Leap | None:
     """Return the leap from `last`, found at `seen_s`, to `measured`, found at `now_s`. None: carriages can do this.
 
-    The step took the longer of two times, the device's clock and the host's. The device's clock may run over in a long
-    silence.
+    The step took the longer of two times, the device's clock and the host's.
     """
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)

@@ -10,11 +10,11 @@ from typing import Final, final
 BLIND_S: Final = 0.005
 BLIND_PERIODS: Final = 5.0
 """Without a new state for longer than both, where the carriages are is not known well enough to drive them. The answer
-to the first Drive after a stall may take twice as long: a wire that needs more is slow for a loop."""
+to the first Drive after a stall may take twice as long."""
 UNSENSED_S: Final = 0.02
 "Without a new Sense for longer than this and BLIND_PERIODS, force and handle are not measured."
 SHOWN_S: Final = 0.1
-"A stall is shown for this long after it, or nobody would see it: telemetry comes every 20 ms."
+"A stall is shown for this long after its end."
 
 
 @final
@@ -41,11 +41,14 @@ class Sight:
         self.is_blind = self.was_blind = False
 
     def has_stalled(self, now_s: float) -> bool:
-        """Whether a stall ended within the last SHOWN_S."""
+        """Tell whether a stall ended within SHOWN_S before `now_s`."""
         return now_s - self.stalled_s < SHOWN_S
 
     def is_waiting(self, now_s: float) -> bool:
-        """Whether the answer to the first Drive after a stall may still be on its way."""
+        """Tell whether the answer to the first Drive after a stall may still be on its way.
+
+        The loop is then blind, and the stall ended less than twice its time to blindness ago.
+        """
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 
     def update(self, last_s: float, now_s: float, is_new: bool) -> None:

@@ -32,7 +32,7 @@ from tormagd.scenes.scene import Scene
 _INSIDE: Final = Reach.INSIDE
 
 OLDEST_ANSWER_S: Final = 0.5
-"Of a search beside the plans, which takes a hundredth of this. With an older one planning fails, and the gap opens."
+"An older answer of a search beside the plans makes planning fail, and the gap opens."
 
 _PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
 _TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
@@ -109,9 +109,9 @@ class Aim:
     ) -> Plan:
         """Return the next plan, for the force in `ask` and the device in `belief`.
 
-        `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent. A
-        search beside the plans finds its `question` updated. Raises DomainError where no gap gives the field, or the
-        newest answer is older than OLDEST_ANSWER_S.
+        `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent.
+        Updates `number` and `element_mT`, and `question` where a search runs beside the plans. Raises DomainError where
+        no gap gives the field, or the newest answer is older than OLDEST_ANSWER_S.
         """
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)

@@ -9,30 +9,29 @@ from tormagd.control.records import Belief
 CEILING: Final = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
 LAW_SHARE: Final = 0.12
-"""The search's field may differ by this share from the force law's. On sample 1 it does by 1 to 11%: the law knows
-neither Stribeck nor viscous friction."""
+"Greatest share by which the search's field may differ from the force law's; on sample 1 it differs by 1 to 11%."
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap that is allowed: the greater of `ceiling_mm` and `unseen_mm`."""
+    """Return the least gap allowed, mm: the greater of `ceiling_mm` and `unseen_mm`."""
     return max(ceiling_mm(portrait, belief.device, ceiling_N, bounds), unseen_mm(portrait, belief, ceiling_N, bounds))
 
 
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap at which the device surely gives no more than `ceiling_N`."""
+    """Return the least gap, mm, at which the device gives no more than `ceiling_N`, taken SURE deviations stronger."""
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
 
 
 def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return `ceiling_mm` for an unseen device, where `belief` may rest on another device's profile. Else the closed
-    gap."""
+    """Return `ceiling_mm` of the device `belief.unseen`, which the real one may be; the closed gap, mm, where that is
+    None."""
     if belief.unseen is None:
         return portrait.gap_mm[-1]
     return ceiling_mm(portrait, belief.unseen, ceiling_N, bounds)
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
-    """Return the search's `field_mT`, at most LAW_SHARE off the force law's field for the model's force `wanted_N`.
+    """Return `field_mT`, held within a share LAW_SHARE of the law's field for the model's force `wanted_N`.
 
     `law` is None where no law is known: the field stays as it is.
     """

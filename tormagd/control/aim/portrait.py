@@ -32,7 +32,7 @@ class Portrait:
 
     @property
     def min_N(self) -> float:
-        """F_min: what the open gap gives. A passive device gives no less."""
+        """F_min: what the open gap gives."""
         return self.force_N[0]
 
     @property
@@ -41,7 +41,7 @@ class Portrait:
         return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
-        """Return |dF/dgap| at the gap that gives this force."""
+        """Return |dF/dgap| at the gap that gives this force; at the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
@@ -59,7 +59,7 @@ class Portrait:
         return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
-        """Return the fastest change of force that this gap speed makes at this force."""
+        """Return the rate of force, N/s, that this gap speed makes at the gap of this force."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 

@@ -1,8 +1,8 @@
 """Forecast of a force that repeats itself, as a pulse does, where the setpoints bring no preview.
 
-No period is assumed, for heart beats vary. The newest stretch of force, as a delay embedding, is compared with those
-remembered. What followed those tells what will follow the newest (analogue forecasting, Lorenz, J. Atmos. Sci. 26,
-1969; locally weighted linear regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988).
+The newest stretch of force, as a delay embedding, is compared with those remembered. What followed those tells what
+will follow the newest (analogue forecasting, Lorenz, J. Atmos. Sci. 26, 1969; locally weighted linear regression,
+Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988).
 
 One embedding is as long as the rise of a pulse, another as half its beat; the one with less recent error counts more.
 The forecast has to earn trust by its skill over the slope, which is extrapolated otherwise.
@@ -22,39 +22,38 @@ from tormagd.control.interpolation import at_step
 Array = npt.NDArray[np.float64]
 
 GRID_S: Final = 0.01
-"Forces are remembered on a grid of time, whose points everything below counts; a pulse rises in ten of them."
+"Step of the grid of time that forces are remembered on; counts below are of its points."
 HISTORY: Final = 1_000
-"Ten seconds: a dozen heart beats at rest, and twice a breath, which modulates them."
+"Ten seconds: a dozen heart beats at rest, and two breaths."
 MIN_HISTORY: Final = 100
-"With less, which is less than a heart beat, nothing is forecast."
+"With less nothing is forecast."
 RISE_DELAYS: Final = (1, 2, 4, 7, 11)
 BEAT_DELAYS: Final = (1, 3, 8, 18, 38)
-"""Of the embeddings: a stretch is compared at these points before its end, as changes from there. They are close where
-slope and curvature show, and reach back to the rise of a pulse, or to what came before it. The second foresee the rise,
-but fewer stretches are alike for so long; they were chosen on sample 1."""
+"""Of the embeddings: a stretch is compared at these points before its end, as changes from there. They reach back to
+the rise of a pulse, or to what came before it."""
 TAPS: Final = 5
 "As many as there are delays in each."
 STRIDE: Final = 3
-"Every third stretch is looked at: the regression makes up for most of what lies between them."
+"Every third stretch is looked at."
 HORIZON: Final = 8
-"Points that are forecast; a plan looks 30 ms ahead, from as far ahead as the carriages are late."
+"Points that are forecast: a plan looks 30 ms ahead, and further by the carriages' lag."
 HORIZON_S: Final = HORIZON * GRID_S
 JUDGED: Final = 4
-"The point ahead that forecasts are judged at: as far as the middle of what a plan looks at, with usual carriages."
+"The point ahead that forecasts are judged at: the middle of what a plan looks at."
 MAX_STEP_S: Final = 0.1
 "Setpoints further apart than this are no stream: nothing that was learned outlives the gap."
 SAME_N: Final = 1e-4
 "Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
 UNLIKE_N: Final = 0.05
-"Where every stretch differs by more, none is like the newest. Chosen on sample 1."
+"Where every stretch differs by more, none is like the newest."
 RIDGE: Final = 0.01
-"Share by which the regression's variances are raised: from stretches that hardly differ no dependence is learned."
+"Share by which the regression's variances are raised."
 MAX_LEVERAGE: Final = 100.0
 """Nothing is forecast from a stretch of more leverage, as after a jump: 1 and its squared distance from the mean of
 those most like it, in their standard deviations."""
 LONG_S: Final = 2.0
 SHORT_S: Final = 0.2
-"Skill is earned over the long time, a few beats, and lost over the short: a rhythm that breaks breaks at once."
+"Skill is earned over the long time, a few beats, and lost over the short."
 _LONG_SHARE: Final = GRID_S / (LONG_S + GRID_S)
 _SHORT_SHARE: Final = GRID_S / (SHORT_S + GRID_S)
 _MIN_BYTES: Final = MIN_HISTORY * array("d").itemsize
@@ -103,7 +102,7 @@ class Forecast:
     time_s: float
     "Of the newest point of the grid, not after the newest setpoint."
     history: bytes
-    "The forces on the grid, float64: bytes do not change, and NumPy reads them where they are."
+    "The forces on the grid, float64."
     from_s: float
     "The point of the grid that `changes_N` are from,"
     changes_N: list[float]
@@ -131,7 +130,7 @@ class Forecast:
         return min(max(earned, 0.0), 1.0) * min(max(1.0 - lost, 0.0), 1.0)
 
     def forget(self) -> None:
-        """Begins anew, with nothing learned."""
+        """Begin anew, with nothing learned."""
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     def update(self, stamp_s: float, force_N: float) -> None:

@@ -31,7 +31,7 @@ MIN_TIMES: Final = 9
 "So many of TIMES_S are looked at even where a preview ends before, and of a forecast."
 _FORECAST_S: Final = TIMES_S[:MIN_TIMES]
 OUTRUN_N: Final = 0.02
-"Of what is known ahead no more is missed without a word: further from it, the carriages are too slow, which is RATE."
+"Where the path misses what is known ahead by more, the carriages are too slow: the limit RATE."
 
 Bounds = tuple[float, float]
 "The least and the greatest force that the scene allows and the device gives."
@@ -80,7 +80,7 @@ class Governor:
         self.begin(now_s)
 
     def begin(self, now_s: float) -> None:
-        """Begins at `now_s` with the gap open and no publisher."""
+        """Begin at `now_s` with the gap open and no publisher."""
         self.time_s, self.asked_N, self.above_N = now_s, self._portrait.min_N, 0.0
         self.holder, self.is_passing = 0, False
         self._forget()

@@ -4,8 +4,7 @@
 
 The sum is over TIMES_S. A weight is a point's share of the time, times the square of |dF/dgap|, so newtons are missed
 least. A dynamic programme solves this exactly, backwards over the points (Johnson, J. Comput. Graph. Stat. 22, 2013,
-for the fused lasso, the dual). The least cost of the rest is a convex function of the gap, with a piecewise linear
-derivative. A step of the gap shifts its two sides apart, and a point adds a line.
+for the fused lasso, the dual).
 """
 
 import math
@@ -19,8 +18,7 @@ PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
 "The times, from the moment that is planned for, at which a plan looks at the force to come."
 PATH_STEP_S: Final = 0.005
 TIMES_S: Final = [*PATH_S, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25, 0.33, 0.4]
-"""The times at which what is known ahead is looked at: the sparser, the less they matter to the gap's next moves. By
-the last the gap crosses a third of its stroke, and what comes later can wait."""
+"The times at which what is known ahead is looked at. By the last the gap crosses a third of its stroke."
 LASTS_S: Final = [
     0.5 * (after_s - before_s)
     for before_s, after_s in zip([0.0, *TIMES_S[:-1]], [*TIMES_S[1:], TIMES_S[-1]], strict=True)
@@ -29,10 +27,9 @@ LASTS_S: Final = [
 CHANGES_PER_S: Final = [1.0 / (after_s - before_s) for before_s, after_s in pairwise(TIMES_S)]
 "From how much the gap wanted changes to the next point to its speed."
 SPEEDING_UP_S: Final = 0.025
-"""Time constant with which the gap comes to another speed where its carriages are not late. Chosen on sample 1 with its
-inertia, 1.7 and 2.5 times of it; 20 to 30 ms miss pulses and palpation by the same, to 0.5 mN."""
+"Time constant with which the gap comes to another speed where its carriages are not late; 20 to 30 ms serve as well."
 NEAR_S: Final = 0.18
-"What the gap gets to in this time is near. Chosen on sample 1, for a finger's pulse and for palpation."
+"What the gap gets to in this time is near."
 FLATTEST_N_MM: Final = 1e-3
 "A force that hardly depends on the gap counts as if it did by this much."
 
@@ -46,10 +43,7 @@ class Path:
         self._gap_speed_mm_s: Final = gap_speed_mm_s
 
     def is_near(self, from_N: float, to_N: float, device: DeviceFit) -> bool:
-        """Tell whether this device's gap gets from one force to the other within NEAR_S.
-
-        Where it does not, looking ahead gains nothing, and the gap sets out at once.
-        """
+        """Tell whether this device's gap, at its top speed, gets from one force to the other within NEAR_S."""
         portrait = self._portrait
         away_mm = portrait.gap_mm_at(device.model_N(from_N)) - portrait.gap_mm_at(device.model_N(to_N))
         return abs(away_mm) < NEAR_S * self._gap_speed_mm_s
@@ -98,7 +92,8 @@ def nearest_path_mm(
 ) -> list[float]:
     """Return the first `count` gaps of the best path for `wanted_mm` (n), with `weights` (n) > 0.
 
-    The points are the first n of the rising `times_s`. The first is `elapsed_s` after the gap was at `start_mm`.
+    The points are the first n of the rising `times_s`; the path goes no faster than `speed_mm_s`. The first point is
+    `elapsed_s` after the gap was at `start_mm`.
     """
     best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
     path_mm: list[float] = []
@@ -114,6 +109,8 @@ def nearest_path_mm(
 def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
     """The gap that is best at each point (n) for it and all that comes after, if it can be reached in time."""
     best_mm = wanted_mm[:]
+    # the least cost of the rest is convex in the gap, with a piecewise linear derivative: a step of the gap shifts its
+    # two sides apart, and a point adds a line
     # the kinks beside the flat piece, nearest last, each less the distance that its side is shifted from its point back
     # to time 0; and by how much the slope of the derivative grows where one is passed on the way out
     below_mm: list[float] = []

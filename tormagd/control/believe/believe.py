@@ -1,9 +1,8 @@
 """What is believed of one device: its estimators, and which of them may learn from a reading of the force sensor.
 
 The force teaches only while friction is mobilised and the handle slides: only there the model knows the force. A
-reading is compared with the model at the *measured* gap. So the estimators learn the model's error, not the tracking
-error, and cannot fight the position loop. A sensor that is not believed teaches nothing, and what is known of the
-device is kept.
+reading is compared with the model at the *measured* gap, so no tracking error is learned. A sensor that is not believed
+teaches nothing.
 """
 
 import math
@@ -34,7 +33,7 @@ COMES_TO_REST: Final = 3.0
 MIN_EXPECTED_N: Final = 0.1
 "Of less force no share is told."
 UNTARED_N: Final = 0.15
-"A sensor that is off by more is worth a word: it is half an hour's drift."
+"A zero that is further off is the limit SENSOR_ZERO: half an hour's drift."
 CONTRADICTED_N: Final = 0.4
 "A profile whose force is further off than rest, warmth and another zero explain is another device's."
 MIN_FORESIGHT: Final = 0.5
@@ -82,15 +81,15 @@ class Believe:
     taught: DeviceFit = UNSEEN
     "What is known of the device from another day."
     is_prior: bool = False
-    "That is what is believed of it,"
+    "What is known from another day is believed of the device."
     is_contradicted: bool = False
-    "or was: its first slide has shown another one."
+    "The first slide has shown another device than `taught`."
 
     def __init__(
         self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory, min_model_N: float
     ) -> None:
-        """Begin with an unseen device. `min_model_N` is the model's force with the gap open; `memory` is updated from
-        here."""
+        """Begin with an unseen device. `min_model_N` is the model's force with the gap open, for `min_N`. `update`
+        advances `memory`."""
         terms = terms_of(scene)
         trim = config.trim
         self._min_model_N: Final = min_model_N
@@ -126,11 +125,12 @@ class Believe:
         return self.device.force_N(self._min_model_N)
 
     def knows_zero(self, now_s: float) -> bool:
-        """Whether the sensor's zero is known to within what the scene tolerates: else readings teach nothing."""
+        """Tell whether the sensor's zero is known to within what the scene tolerates: else readings teach nothing."""
         return self.zero.sd_N(now_s) <= self._unknown_sd_N
 
     def learned(self) -> Learned:
-        """Return what is worth keeping of this device."""
+        """Return what is known of this device, for `teach` on another day; in a dispute, scale and offset from before
+        it."""
         slow = self.slow
         return Learned(self.strength.fit, slow.factor, slow.learned, self.zero.zero_N, self.carriages.lag_s)
 

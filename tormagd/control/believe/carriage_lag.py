@@ -5,19 +5,17 @@
     update   dM = (v^2 - M / tau) dt   recursive least squares with forgetting: since de/dT = -v, v is the regressor
              dT = y v dt / (P + M)     M is the information so far, P the prior's: T = 0 at the start
 
-An error counts with the speed: slow stretches, where nothing is late, do not hide the steep ones. T is learned only
-from plans that know what comes. After a jump all carriages are behind.
+T is learned only from plans that know what comes, and not while the carriages are behind a jump.
 """
 
 from typing import Final, final
 
 MAX_LAG_S: Final = 0.06
-"The latest of the plant card's carriages, sample 2's in palpation, are 50 ms late."
+"The plant card's carriages are 50 ms late at most."
 FORGETTING_S: Final = 3.0
-"tau. With 2 to 5 s the tuning pulses are missed by the same, to 0.5 mN."
+"tau; 2 to 5 s serve as well."
 PRIOR_MM2_S: Final = 50.0
-"""P: 35 ms at full speed count as much as the prior. Chosen on sample 1 with its inertia, 1.7 and 2.5 times of it; with
-25 to 150 the pulses are missed by the same, to 0.5 mN."""
+"P: 35 ms at full speed count as much as the prior; 25 to 150 serve as well."
 SETTLED_MM: Final = 0.1
 "After a jump the error is of use again once it is this small."
 MAX_DT_S: Final = 0.02
@@ -44,7 +42,7 @@ class CarriageLag:
     ) -> None:
         """Take one plan, made `dt_s` after the last, with the gap measured AGE_S before it.
 
-        `planned_mm` is None where the plan did not know what comes: the expected gap then starts again.
+        `planned_mm` is None where the plan did not know what comes: the expected gap begins again at the next plan's.
         `top_speed_mm_s` bounds the measured speed, which a new filter may overstate.
         """
         if planned_mm is None:

@@ -71,7 +71,7 @@ class Freshness:
 
     def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> None:
         """Take one reading, which stands for `dt_s` > 0. The model's force is `model_N`, the device's force over it
-        `scale`.
+        `scale`. Updates `is_stale` and `is_frozen`.
 
         With `learns` a change of the reading also teaches the sensor's noise and resolution.
         """

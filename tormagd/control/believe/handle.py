@@ -1,8 +1,7 @@
 """Whether the handle's encoder is believed: a force that grows with the gap's force needs a shaft that moves.
 
-At rest, friction holds what the hand gives, through elastomer that bends. The force may fall when the gap opens. The
-force returns only with a motion of the shaft, by the force over the stiffness. So a force that rises with the gap's,
-while the encoder stands, shows a lost encoder, or a sensor that reads what nobody feels.
+At rest, friction holds what the hand gives, and more force only comes with a motion of the shaft. So a force that rises
+with the gap's, while the encoder stands, shows a lost encoder, or a sensor that reads what nobody feels.
 """
 
 import math
@@ -17,7 +16,7 @@ SETTLES_S: Final = 0.3
 RISES_N: Final = 0.15
 "More than STANDS_MM bends of the stiffest elastomer, 12 N/mm, and noise."
 MODEL_RISES_N: Final = 0.1
-"By so much the gap has to have moved, in the model's force: the strongest believable device makes 1.53 times as much."
+"Least change of the model's force that shows a moved gap."
 FILTER_S: Final = 0.01
 UNHEARD_S: Final = 0.1
 "After so long without a reading it is watched anew."
@@ -46,17 +45,18 @@ class HandleWatch:
     "The encoder is not believed until it moves."
 
     def moved_gap_at_rest(self, model_N: float) -> bool:
-        """Tell whether the gap's force has changed to `model_N` by more than MODEL_RISES_N while the handle stood.
+        """Tell whether the model's force has changed to `model_N` by more than MODEL_RISES_N since the handle came to
+        stand.
 
-        Friction at rest does not follow a changing gap. The handle's filtered rate may still show a motion then.
+        Friction at rest does not follow a changing gap.
         """
         return abs(model_N - self.rested_N) > MODEL_RISES_N
 
     def update(self, sensed_s: float, handle_mm: float, reading_N: float, model_N: float) -> None:
-        """Take one reading of handle and force, with the model's force `model_N` at the measured gap. May set
-        `is_lost`.
+        """Take one reading of handle and force, with the model's force `model_N` at the measured gap.
 
-        A `sensed_s` (host time) that is not newer changes nothing.
+        May set `is_lost`; a motion, or a pause of more than UNHEARD_S, clears it. A `sensed_s` (host time) that is not
+        newer changes nothing.
         """
         dt_s = sensed_s - self.heard_s
         if not dt_s > 0.0:

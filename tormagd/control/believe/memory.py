@@ -4,8 +4,8 @@
     lag      l goes to +-width along a rising or falling field, over a change by `turn`
     relaxed  r is what Prony series of two parts leave: of the force without field, and of what the field adds
 
-Both follow the measured gaps and hold for every device, so neither is learned. What has relaxed is the same for all
-fields, a shift of the force, and any search still finds the field.
+Both follow the measured gaps and hold for every device, so neither is learned. What has relaxed shifts the force alike
+at all fields.
 """
 
 import math

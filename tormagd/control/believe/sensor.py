@@ -5,9 +5,8 @@
     lead     l    by how much the readings are over the fit's force, N: the device is taken for that much stronger
     agreed   the readings come back to the fit: it learns again
 
-While the handle slides with mobilised friction, two explanations may fit the readings. The sensor is wrong, or the
-device has changed. The gap follows the explanation with more force. So a rising reading opens the gap, and a falling
-one moves nothing. A sensor that shows what no device gives is wrong, and opens nothing.
+In a dispute the gap follows the explanation with more force. So a rising reading opens the gap, and a falling one moves
+nothing. A sensor that shows what no device gives is wrong, and opens nothing.
 """
 
 from typing import Final, Literal, final
@@ -44,9 +43,9 @@ AGREES_S: Final = 0.2
 NAMED_S: Final = 0.1
 "A dispute that is settled sooner is not worth a word."
 RISES_N_S: Final = 2.0
-"A reading that rises for 80 ms costs 0.2 N at most; a device that is 20% stronger at once is followed in 0.2 s."
+"Greatest rate of `lead_N`: a device that is 20% stronger at once is followed in 0.2 s."
 LEADS_S: Final = 0.03
-"Noise opens no gap."
+"Time constant of `lead_N`."
 NOISE_N: Final = 0.05
 "What noise, a creep and the model's shape leave of a device at one of its bounds."
 WRONG_S: Final = 0.05
@@ -152,10 +151,10 @@ class SensorTrust:
             self._begin(over_N)
 
     def zero_moved(self, found_N: float) -> float:
-        """Take a change `found_N` of the sensor's zero, which a reversal of the handle has shown. Return a shift of the
-        fit, N.
+        """Take a change `found_N` of the sensor's zero that a reversal of the handle has shown. Return the shift, N,
+        that this makes in the fit's force.
 
-        The shift is 0 except in a dispute that began since the reversal: the fit was learned with the old zero. The
+        The shift is `found_N` times the handle's `direction` in a dispute that began since the reversal, else 0. The
         share of RELAXED that is used up returns to 0.
         """
         self.relaxed_N = 0.0

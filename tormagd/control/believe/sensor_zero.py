@@ -18,14 +18,13 @@ TARED_VARIANCE_N2: Final = TARED_SD_N * TARED_SD_N
 "Of a sensor that begins: it is taken for tared."
 WANDERS_S: Final = 600.0
 DRIFT_N2_S: Final = 0.05**2 / WANDERS_S
-"""A sensor that drifts by 5 mN a minute is off by 50 mN after ten (plant card). For so long it may wander to and fro;
-in an hour it may have gone one way."""
+"5 mN a minute (plant card). For WANDERS_S the zero may wander to and fro; in an hour it may have gone one way."
 MAX_SD_N: Final = 0.3
-"An hour of that. However long nothing was heard, no more is believed possible."
+"Greatest deviation of the zero, however long nothing was heard."
 UNKNOWN_SD_N: Final = 0.05
-"With more than this a force is better left to what was learned before: ten minutes without a reversal."
+"With more than this, and than the scene tolerates, readings teach nothing: ten minutes without a reversal."
 MAX_ZERO_N: Final = 0.4
-"A sensor that is further off did not drift, it is broken, or was never tared: that is no zero to go on with."
+"A sensor further off did not drift: such a zero is not taken."
 LEVEL_S: Final = 0.15
 "A level is a mean over this much sliding, in which noise leaves 2 mN."
 READ_SD_N: Final = 0.025
@@ -102,7 +101,8 @@ class SensorZero:
         self.undoubted_N2, self.variance_N2 = self.variance_N2, MAX_SD_N * MAX_SD_N
 
     def trust(self) -> None:
-        """Take back a doubt: the variance returns, unless a reversal has made it smaller."""
+        """Take back the last `doubt`: the variance from before returns, unless a reversal has made it smaller. Call it
+        only after a `doubt`."""
         self.variance_N2 = min(self.variance_N2, self.undoubted_N2)
 
     def update(

@@ -5,7 +5,7 @@
     update   k by that times e(v) dt / (LEARNED_S + dt)
 
 The factor is learned, and acts, at creep only. It is bounded by how much static friction differs from device to device,
-and by how uncertain the fit (s, o) is. A device never seen at speed shows nearly all in a creep.
+and by how uncertain the fit (s, o) is.
 """
 
 import math
@@ -18,15 +18,13 @@ STRIBECK_MM_S: Final = 5.0
 SLOWEST_MM_S: Final = 0.3
 "A slower handle may stand."
 REACH_MM: Final = 0.35
-"Over this travel friction follows a field that rises: 2.5 N bend the bristles so far before they slide."
+"Over this travel friction follows a field that rises."
 LEARNED_S: Final = 0.3
 MIN_STATIC: Final = 0.9
 MAX_STATIC: Final = 1.15
-"""Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model; and the speeds at which it fades
-differ."""
+"Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model."
 BELIEVED_SD: Final = 3.0
-"""Standard deviations of the fit within which a creep is believed. Chosen on draws 0 to 39; two hold seven of
-them at this bound."""
+"Standard deviations of the fit within which a creep is believed."
 NOISE_N: Final = 0.03
 "A sensor that reads less than the weakest device's force, which has relaxed, and this noise, teaches nothing."
 
@@ -64,8 +62,10 @@ class SlowFriction:
         self.handle_mm = handle_mm
 
     def rescale(self, before_N: float, after_N: float) -> None:
-        """Change k so that the force at a creep stays, though the fit's force at speed went from `before_N` to
-        `after_N`. Only the share `learned` at a creep counts."""
+        """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N` to `after_N`.
+
+        Only the share `learned` at a creep counts, and `factor_bounds` hold k. A force of 0 or less changes nothing.
+        """
         if before_N > 0.0 and after_N > 0.0:
             self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), self._least), self._most)
 
@@ -86,7 +86,7 @@ class SlowFriction:
 
 
 def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
-    """Return the least and the greatest k of any device."""
+    """Return the least and the greatest k of any device: MIN_STATIC at its least scale, MAX_STATIC at its greatest."""
     return bounds.min_scale * MIN_STATIC, bounds.max_scale * MAX_STATIC
 
 

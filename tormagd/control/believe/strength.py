@@ -4,8 +4,7 @@
     predict  s, o forget towards their spread with time constants SCALE_LASTS_S and one that gives `adapts_in_s`
     update   Kalman filter of (s, o), with v of density ERROR_N2_S; what is not learned keeps its value (Schmidt)
 
-Friction, field and elastomer differ from device to device by a factor. A relaxed elastomer shifts the force. A low
-force tells little of a high one: the variances say how little.
+Friction, field and elastomer differ from device to device by a factor. A relaxed elastomer shifts the force.
 """
 
 import math
@@ -23,7 +22,7 @@ OFFSET_SD_N: Final = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."
 ERROR_N2_S: Final = 3e-4
 """Density of what the model does not follow, N^2 s: with these spreads a new device is learned in some hundredths of a
-second. Chosen on sample 1 and draws 0 to 11, for their steps."""
+second."""
 SCALE_LASTS_S: Final = 600.0
 "In which what was learned of the scale is forgotten: the device has warmed, by a kelvin or less."
 SCALE_VARIANCE: Final = SCALE_SD * SCALE_SD
@@ -32,8 +31,8 @@ SURE: Final = 2.0
 "Standard deviations within which a force is taken to lie."
 SURPRISE_S: Final = 0.03
 SURPRISE_N: Final = 0.01
-"""A mean over that time, in which noise leaves 2 to 5 mN, of more than this is the device's own: then its offset is
-learned sooner, in a fifth of its time at twice as much. So noise alone hardly moves the gap, and a step settles."""
+"""A mean error over SURPRISE_S of more than SURPRISE_N is the device's own. Its offset is then learned sooner, in a
+fifth of its time at twice as much."""
 MIN_ADAPTS_IN_S: Final = 0.04
 
 
@@ -49,7 +48,7 @@ class DeviceBounds(Value):
 
 
 def device_bounds(trim: Trim) -> DeviceBounds:
-    """The bounds that the configuration states."""
+    """Return the bounds that the configuration states."""
     return DeviceBounds(trim.least, trim.most, trim.least_offset_N, trim.most_offset_N)
 
 
@@ -82,7 +81,7 @@ class DeviceFit(Value):
         return math.sqrt(max(self.offset_variance_N2, 0.0))
 
     def force_N(self, model_N: float) -> float:
-        """Return the device's force where the model's is `model_N`."""
+        """Return the device's force where the model's is `model_N`; it may be below 0."""
         return self.scale * model_N + self.offset_N
 
     def model_N(self, force_N: float) -> float:
@@ -116,8 +115,7 @@ class DeviceFit(Value):
         return DeviceFit(self.scale, self.offset_N)
 
     def relaxed(self, relaxed_N: float) -> "DeviceFit":
-        """Return the fit over the model's memoryless force m of a device that gives this fit's force at m less
-        `relaxed_N`."""
+        """Return the fit that gives, for a model's force m, what this fit gives for m - `relaxed_N`."""
         by_scale_N = relaxed_N * self.scale_variance
         return DeviceFit(
             self.scale,
@@ -240,7 +238,7 @@ class Strength:
             self.fit, self.is_held = self.fit.shifted(offset_N - self.fit.offset_N), True
 
     def settle(self) -> None:
-        """Forget the surprise, and that a bound held scale or offset: no reading teaches now."""
+        """Set `surprise_N` to 0 and `is_held` to False, while no reading teaches."""
         self.surprise_N, self.is_held = 0.0, False
 
     def shift(self, by_N: float) -> None:

@@ -12,11 +12,7 @@ from tormagd.safety.codes import Limit
 
 @final
 class Acted:
-    """Number of ticks in which each limit of the output has acted.
-
-    Duties have no slew limit. The reference's acceleration bounds what is asked of the motors, and the windings smooth
-    the rest. A limit between them would only take phase from the position loop.
-    """
+    """Number of ticks in which each limit of the output has acted. Duties have no slew limit."""
 
     rate: int = 0
     "The speed of the gap's reference,"
@@ -47,7 +43,8 @@ class Drive(Value):
 
 
 class Actuator:
-    """A follower of a plan's gap. Another actuator than the carriages gives the methods that raise here."""
+    """A follower of a plan's gap. `begin`, `resume` and `update` raise NotImplementedError; each actuator gives its
+    own."""
 
     reference: Reference | None = None
     "Where the gap is driven; None while nothing is driven."

@@ -20,18 +20,18 @@ from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene, terms_of
 
 WEAK_MM: Final = 1.0
-"Carriages further behind than this have reached the top speed of motors that are weaker than they are believed to be."
+"Carriages further behind than this have weaker motors than believed."
 EXCHANGE_S: Final = 0.0015
 "From a duty to its effect as the encoders report it: a period in the exchange, half a period that it is held."
 COULOMB_SPEED_MM_S: Final = 0.5
-"Below this reference speed the friction feed-forward fades, so that a resting carriage is not pushed to and fro."
+"Below this reference speed the friction feed-forward fades."
 RESTING_MM_S: Final = 0.02
-"A slower reference has arrived: it comes in exponentially, and what a second of it moves is a few encoder counts."
+"A slower reference has arrived."
 MAX_ACCELERATION_SCALE: Final = 2.0
 "No more is asked of lively motors; the liveliest of the plant card do 2.4 times as much."
 SCALE_PER_MM_S: Final = 100.0
-"""For each mm that carriages are ahead of what is expected while they gain speed as fast as they are let, so much more
-is asked of them in a second of it: two or three beats of a pulse show what a device can."""
+"""Growth of `acceleration_scale` a second, for each mm that carriages are ahead of what is expected while acceleration
+limits them."""
 LAGGING_MM: Final = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
 
@@ -41,7 +41,7 @@ class Carriages(Actuator):
     """The two carriages of one device.
 
     Carriages whose motors are livelier than believed get ahead of what is expected, and `acceleration_scale` grows.
-    Weaker ones are asked for no less: they would turn too late.
+    Weaker ones are asked for no less.
     """
 
     def __init__(self, config: Config, scene: Scene) -> None:

@@ -21,7 +21,7 @@ STATUS_S: Final = 0.1
 "Status says that the device homes still; it comes every 20 ms."
 OVER_S: Final = 0.04
 RISES: Final = 1.25
-"An opening gap brakes less and less; what the sensor shows may be this many times what it showed when homing began."
+"The sensor may show this many times what it showed when homing began."
 
 _HOMING: Final = DeviceMode.HOMING
 _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)

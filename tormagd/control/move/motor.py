@@ -49,9 +49,10 @@ def full_speed_mm_s(motor: Motor) -> float:
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:
-    """Return the voltage that the magnets' pull takes of either motor to open a gap of 0 or more.
+    """Return the voltage that either motor needs against the magnets' pull, to open from `gap_mm` >= 0.
 
-    `stated_V` is that at PULL_STATED_MM (`motor.pull_V`). Dipoles attract with the fourth power of their distance.
+    `stated_V` is that at PULL_STATED_MM (`motor.pull_V`). The pull falls with the fourth power of `gap_mm` +
+    PULL_DEPTH_MM.
     """
     nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
     nearness *= nearness
@@ -109,7 +110,8 @@ def _exponential(matrix: Array) -> Array:
 
 
 def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
-    """Return the delay, s, beyond that of one exchange, which the position loop bears before it swings."""
+    """Return the delay, s, beyond one exchange's, that the position loop bears before it swings; 0 where it swings
+    already."""
     known = margins(motor, position, period_s)
     return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
 

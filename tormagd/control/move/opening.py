@@ -2,8 +2,7 @@
 
     late  <-  max(late + dt - way / v, 0)        way: opened by since the last State; v: the device's own speed
 
-A carriage that stands loses a second in each second, a slow one what it is slower by, one that goes back more. A fault
-comes LATE_S after it should have moved or arrived, from wherever it began. Opening is the firmware's own routine.
+A carriage that is later than LATE_S is a fault. Opening is the firmware's own routine.
 
 Without known positions (not homed, or no State comes) the device's word is judged. Once asked to open, it must show
 both open switches, or that it failed. Or it says that it opens, for no longer than a search of the switches takes.
@@ -19,14 +18,13 @@ from tormagd.safety.operating_state import DeviceRequest, SafetyState
 from tormagd.scenes.scene import Scene
 
 LATE_S: Final = 0.35
-"""Carriages that close at full speed turn round in 0.1 s, a bad line loses a request twice in 0.1 s, and weak motors of
-the plant card lose 0.1 s over the whole stroke beyond what a low supply explains."""
+"Turning round, a request that a bad line loses twice, and weak motors take 0.1 s each."
 OPEN_MM: Final = 0.5
-"A carriage that is so near its switch is open: the force is within 2 % of the open gap's, and the device creeps there."
+"A carriage that is so near its switch is open: the force is within 2 % of the open gap's."
 SEARCH_SHARE: Final = 0.5
-"Without a zero a device opens at half of its speed or more, for it does not know where its switches are."
+"Without a zero a device opens at half of its speed or more."
 REPORT_S: Final = 0.1
-"Status comes every 20 ms: more than this between two was no time in which the device was heard."
+"A longer pause between two Status counts as this."
 LOWEST_SUPPLY: Final = 0.5
 "Of the nominal voltage: what reads less gives no speed, and the device says so itself."
 
@@ -82,11 +80,12 @@ class Opening:
         )
 
     def rest(self, request_number: int) -> None:
-        """Stop watching: the device is driven, homes or has gone. Requests up to `request_number` are not judged."""
+        """Stop watching, and clear `faults`: the device is driven, homes or has gone. Requests up to `request_number`
+        are not judged."""
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
-        """Take one look at the device, and set `faults`.
+        """Take one look at the device, and set `faults`, each told once. A device that homes is not judged.
 
         With `is_placed` the carriages' places are known; `is_blind` says not at present. `safety` gives the newest
         request.

@@ -3,8 +3,8 @@
     asked  u = Kp (e + Td e' + integral of e / Ti) + f        e position error, e' speed error, f feed-forward
     limit  back-calculation: the integral also takes (duty - u) / Tb
 
-The speed error carries the derivative action. One half is the filtered derivative of the measured position, the other
-the expected speed. So a moving reference gives no derivative kick and no lag.
+The speed error carries the derivative action: the expected speed, less the filtered derivative of the measured
+position.
 """
 
 from typing import Final, final
@@ -20,10 +20,7 @@ ON_TARGET_MM: Final = 0.001
 
 @final
 class Pid:
-    """The position loop of one carriage.
-
-    Its integral starts at 0, which is bumpless: holding takes no duty, because friction holds.
-    """
+    """The position loop of one carriage. Its integral starts at 0: friction holds a resting carriage."""
 
     integral: float = 0.0
     "Duty."
@@ -42,10 +39,8 @@ class Pid:
         self.integral, self.is_saturated = 0.0, False
 
     def rest(self, error_mm: float, dt_s: float) -> None:
-        """Let the integral forget, in its time constant, while the reference rests and the carriage is on target.
-
-        Friction holds the carriage then. What the integral learned on the way in would be wrong on the way back.
-        """
+        """Let the integral decay, in its time constant, where |`error_mm`| is at most ON_TARGET_MM. Call it while the
+        reference rests."""
         if abs(error_mm) <= ON_TARGET_MM:
             self.integral = self.integral * self._integral_time_s / (self._integral_time_s + dt_s)
 

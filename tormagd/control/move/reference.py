@@ -99,8 +99,7 @@ def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> flo
 class Expected:
     """The expected gap, for a gap that follows its reference: the reference with its jerk limited.
 
-    The windings take the acceleration with a lag, and the exchange adds a delay. A lag has a positive kernel: it adds
-    no overshoot.
+    The windings take the acceleration with a lag, and the exchange adds a delay.
     """
 
     gap_mm: float = 0.0

@@ -38,7 +38,7 @@ WENT_AGAINST_S: Final = 0.015
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
 """Of the delay that the position loop bears besides its own period: from the first on a round trip is a limit, from the
-second on a fault, and no enabling: carriages swing from about the whole on."""
+second on a fault, and no enabling."""
 CLOCK_OFF: Final = 0.01
 CLOCK_FAULT: Final = 0.1
 "A clock that is off by a greater share is a limit, and a fault."
@@ -49,7 +49,8 @@ _DEVICE_RUN: Final = DeviceMode.RUN
 
 
 def ceiling_N(scene: Scene) -> float:
-    """Return the greatest force that the sensor may show in a scene."""
+    """Return the greatest force, N, that the sensor may show in a scene: STARTS_OVER times the scene's greatest, plus
+    OVER_N."""
     return STARTS_OVER * scene.force.most_N + OVER_N
 
 
@@ -126,7 +127,7 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        """Return all faults that show now; `latch` sorts them.
+        """Return all faults that show now, and change nothing; `latch` sorts them.
 
         `leap` is an encoder step that no carriage makes, None without one. `sensor_doubted_s` is how long the force
         sensor has not been believed.
@@ -150,7 +151,7 @@ class Watch:
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """Return what is not as it should be and no fault."""
+        """Return what is not as it should be and no fault, and change nothing."""
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
@@ -166,8 +167,10 @@ class Watch:
         return limits
 
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
-        """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap
-        `reference_mm`."""
+        """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`.
+
+        Counts for how long a gap strays, a carriage stands or goes against its duty, and the force is over the ceiling.
+        """
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
@@ -177,7 +180,7 @@ class Watch:
         self.left_duty, self.right_duty = left_duty, right_duty
 
     def rest(self) -> None:
-        """Take one tick without duties. The counted times stand."""
+        """Take one tick without duties: the newest duties become 0, and the counted times stand."""
         self.left_duty = self.right_duty = 0.0
 
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
