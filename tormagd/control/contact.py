@@ -84,7 +84,7 @@ class Sliding(Contact):
 
 @final
 class Pressing(Contact):
-    """A finger in a pad. Until `is_known`, the force is planned for the scene's depth."""
+    """A finger in a pad. Until `is_known`, the force is planned for the scene's depth, at rest."""
 
     def __init__(self, depth_mm: float) -> None:
         super().__init__(depth_mm, 0.0, slides=False)

@@ -55,7 +55,7 @@ def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """Return `interpolated` where `after` of `xs` are known to be not above `x`."""
+    """Return `interpolated` where `after` is `xs.after(x)`. Does not look for NaN."""
     if after == 0:
         return ys[0]
     if after == len(ys):

@@ -14,12 +14,12 @@ to the first Drive after a stall may take twice as long."""
 UNSENSED_S: Final = 0.02
 "Without a new Sense for longer than this and BLIND_PERIODS, force and handle are not measured."
 SHOWN_S: Final = 0.1
-"A stall is shown for this long after its end."
+"A stall is shown for this long after."
 
 
 @final
 class Sight:
-    """The times of new states and of steps, and whether the loop is blind."""
+    """The times of new states and of steps, and whether the loop is blind; at first it is not."""
 
     seen_s: float = math.inf
     "When a new state was last found."

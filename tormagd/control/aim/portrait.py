@@ -65,7 +65,7 @@ class Portrait:
 
 @final
 class PortraitSearch:
-    """The search for a model without the handle's rate: it interpolates the portrait, without the network."""
+    """The search for a model without the handle's rate: the gap of a force in `shown`, and its field."""
 
     def __init__(self, shown: Portrait, field: FieldOfGap) -> None:
         self._portrait: Final = shown

@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 GRID_S: Final = 0.01
 "Step of the grid of time that forces are remembered on; counts below are of its points."
 HISTORY: Final = 1_000
-"Ten seconds: a dozen heart beats at rest, and two breaths."
+"Ten seconds: a dozen heart beats, two breaths."
 MIN_HISTORY: Final = 100
 "With less nothing is forecast."
 RISE_DELAYS: Final = (1, 2, 4, 7, 11)
@@ -77,7 +77,7 @@ BEAT: Final = embedding(BEAT_DELAYS)
 
 @final
 class Guess(Value):
-    """What was said of the force at one point of the grid, N: by each embedding, by their mixture and by the slope."""
+    """What was said of the force at one point of the grid, N: by each embedding, their mixture and the slope."""
 
     def __init__(self, rise_N: float, beat_N: float, forecast_N: float, slope_N: float) -> None:
         self.rise_N: Final = rise_N

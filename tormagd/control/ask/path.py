@@ -36,7 +36,7 @@ FLATTEST_N_MM: Final = 1e-3
 
 @final
 class Path:
-    """The best path for one portrait (force over gap) and one top speed of the gap."""
+    """The best path for one portrait (force over gap) and one top speed of the gap; without state."""
 
     def __init__(self, portrait: Portrait, gap_speed_mm_s: float) -> None:
         self._portrait: Final = portrait

@@ -20,7 +20,7 @@ from tormagd.scenes.scene import Scene
 LATE_S: Final = 0.35
 "Turning round, a request that a bad line loses twice, and weak motors take 0.1 s each."
 OPEN_MM: Final = 0.5
-"A carriage that is so near its switch is open: the force is within 2 % of the open gap's."
+"A carriage so near its switch is open: the force is within 2 % of the open gap's."
 SEARCH_SHARE: Final = 0.5
 "Without a zero a device opens at half of its speed or more."
 REPORT_S: Final = 0.1
