@@ -45,9 +45,9 @@ MAX_STEP_S: Final = 0.1
 SAME_N: Final = 1e-4
 "Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
 UNLIKE_N: Final = 0.05
-"Where every stretch differs by more, none is like the newest."
+"Where every stretch differs by more, none is like the newest. On sample 1 30 mN do as well, 80 a little worse."
 RIDGE: Final = 0.01
-"Share by which the regression's variances are raised."
+"Share by which the regression's variances are raised: stretches that hardly differ teach no dependence."
 MAX_LEVERAGE: Final = 100.0
 """Nothing is forecast from a stretch of more leverage, as after a jump: 1 and its squared distance from the mean of
 those most like it, in their standard deviations."""

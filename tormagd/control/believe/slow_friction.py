@@ -24,7 +24,7 @@ MIN_STATIC: Final = 0.9
 MAX_STATIC: Final = 1.15
 "Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model."
 BELIEVED_SD: Final = 3.0
-"Standard deviations of the fit within which a creep is believed."
+"Standard deviations of the fit within which a creep is believed; with two, seven of draws 0 to 39 stand at the bound."
 NOISE_N: Final = 0.03
 "A sensor that reads less than the weakest device's force, which has relaxed, and this noise, teaches nothing."
 
