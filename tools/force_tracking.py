@@ -1,16 +1,14 @@
 """How well a force is followed: the true force of simulated devices less what was asked, in virtual time.
 
-    force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--hours H] [--json] [--picture FILE.png]
+    force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--json] [--picture FILE.png]
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
-another, and of draws of the plant card; and of those, `doubts`: lies of the sensor, friction that changes, and honest
-sensors. `drift` of the force sensor, and the `pulse` of `make run` as more is known, of samples and second plant. A
-`day` of pulses, by the hour, of sample 1: only where it is named. How well signals are followed: that pulse on the
-`samples` and the second plant, and on random `draws`, 500 setpoints a second, with a preview of 70 ms and without; a
-`staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a
-file, and live. Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does
-with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are
-synthetic.
+another, and of draws of the plant card. `drift` of the force sensor, and the `pulse` of `make run` as more is known, of
+samples and second plant. How well signals are followed: that pulse on the `samples` and the second plant, and on random
+`draws`, 500 setpoints a second, with a preview of 70 ms and without; a `staircase`; recorded `signals` from the folder
+that TORMAG_DATA names, with 400 ms, as a publisher can that plays a file, and live. Beside them stands what ideal
+carriages miss (`bound.py`), and beside `samples` what the same core does with carriages that lose no time. Draws 40 to
+79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
 """
 
 import argparse
@@ -25,8 +23,7 @@ from typing import Any
 
 import numpy as np
 from rendering import cases
-from rendering.device_draws import SAMPLES, judging
-from rendering.doubts import doubts
+from rendering.device_draws import judging
 from tqdm import tqdm
 
 from tormagd.lab.arrays import Json
@@ -38,7 +35,6 @@ OF_DEVICES = {
     "creep": cases.creep,
     "speeds": cases.speeds,
     "pulse": cases.pulse,
-    "doubts": doubts,
 }
 OF_SIGNALS: dict[str, Callable[[Executor, cases.Kept], Any]] = {
     "samples": cases.samples,
@@ -46,17 +42,13 @@ OF_SIGNALS: dict[str, Callable[[Executor, cases.Kept], Any]] = {
     "staircase": cases.staircase,
     "signals": cases.signals,
 }
-DAY = "day"
 CASES = (*OF_DEVICES, "drift", *OF_SIGNALS)
-"What is measured where no case is named."
 
 
 def measure(case: str, options: argparse.Namespace, pool: Executor, kept: cases.Kept) -> Any:
     """One case; runs for the picture are added to `kept`."""
     if case in OF_SIGNALS:
         return OF_SIGNALS[case](pool, kept)
-    if case == DAY:
-        return {SAMPLES[0]: pool.submit(cases.day, SAMPLES[0], options.hours).result()}
     names = judging(options.draws)
     if case in ("drift", "pulse"):
         names = judging(0)
@@ -89,17 +81,16 @@ def _sizes(found: object, name: str = "") -> Iterator[tuple[str, float]]:
 def main() -> int:
     """Measures and prints; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"any of {', '.join(CASES)}; default: all. And {DAY}")
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"any of {', '.join(CASES)}; default: all")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
     parser.add_argument("--drift-s", type=float, default=cases.DRIFT_S, help="how long a sensor drifts (%(default)g)")
-    parser.add_argument("--hours", type=float, default=cases.DAY_H, help="of a day (%(default)g)")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--picture", type=Path, help="PNG of samples, staircase and draws, or of a day alone")
+    parser.add_argument("--picture", type=Path, help="PNG of samples, staircase and draws")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()
-    unknown = [case for case in options.cases if case not in (*CASES, DAY)]
+    unknown = [case for case in options.cases if case not in CASES]
     if unknown:
-        parser.error(f"{unknown[0]}: allowed are {', '.join((*CASES, DAY))}")
+        parser.error(f"{unknown[0]}: allowed are {', '.join(CASES)}")
     result: Json = {}
     kept: cases.Kept = {}
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
@@ -108,12 +99,9 @@ def main() -> int:
     told = {case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}
     print(json.dumps(result) if options.json else "\n".join(lines(told)))
     if options.picture is not None:
-        from rendering.pictures import day_picture, tracking_picture
+        from rendering.pictures import tracking_picture
 
-        if options.cases == [DAY]:
-            day_picture(options.picture, result[DAY])
-        else:
-            tracking_picture(options.picture, kept, result)
+        tracking_picture(options.picture, kept, result)
     return 0
 
 

@@ -2,12 +2,10 @@
 
 import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from force_tracking import worst
-from rendering import cases
 from rendering.cases import (
     ARRIVES_S,
     LATER_S,
@@ -23,7 +21,6 @@ from rendering.cases import (
 )
 from rendering.device_draws import DRAWN, SPREAD, drawn_device, evenly_drawn
 from rendering.following import Followed, publisher, tracking
-from rendering.pictures import day_picture
 from rendering.signals import (
     SCALED_N,
     TRIM_S,
@@ -98,26 +95,6 @@ def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:
     found = track(load_plant("sample_2"), pulse_signal(10.0), "pulse", 0.0)
     assert found.since(5.0).rms_N <= 0.02
     assert found.shown.lag_s > 0.005
-
-
-def test_a_day_is_told_by_the_hour(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Of hours as long as two turns of the handle."""
-    monkeypatch.setattr(cases, "HOUR_S", 20.0)
-    found = cases.day("sample_1", hours=2.0)
-    assert len(found["rms_N"]) == 2
-    assert 0.0 < max(found["rms_N"]) <= 0.05
-    assert found["last_less_first_N"] == found["rms_N"][1] - found["rms_N"][0]
-    assert found["faults"] == ()
-    day_picture(tmp_path / "day.png", {"sample_1": found})
-    assert (tmp_path / "day.png").stat().st_size > 0
-
-
-def test_a_days_pulse_goes_there_and_back_without_a_leap() -> None:
-    force_N = cases.there_and_back()
-    over_two = [force_N(0.25 * place) for place in range(2 * 4 * 800)]
-    assert np.abs(np.diff(over_two)).max() < 0.035  # 0.12 N between two points, at the pulse's rise
-    assert over_two[: 4 * 800] == over_two[4 * 800 :]
-    assert (min(over_two), max(over_two)) == pytest.approx((1.4, 1.7), abs=0.02)
 
 
 def test_nothing_is_removed_from_the_error() -> None:

@@ -7,17 +7,13 @@ would have brought the force.
 
 import itertools
 import math
-from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import Executor
 
 import msgspec
 import numpy as np
-from tqdm import tqdm
 
 from rendering.device_draws import SAMPLES, device, evenly_drawn, judging
 from rendering.following import (
-    CORNER_SCENE,
     FILE_PREVIEW_S,
     PREVIEW_S,
     RATE_HZ,
@@ -31,7 +27,7 @@ from rendering.following import (
     follow,
     publisher,
 )
-from rendering.hands import Legs, WaitingHand
+from rendering.hands import Legs
 from rendering.signals import (
     STAIR_S,
     TRIM_S,
@@ -46,7 +42,7 @@ from rendering.signals import (
 )
 from tormagd.assembly.build import build_core
 from tormagd.assembly.profile import profile_of
-from tormagd.config import Config, Rates
+from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array, Json
@@ -86,14 +82,6 @@ ALLOWED_WEAK_N = 0.015
 EVEN_DRAWS = 32
 WITHIN_N = 0.018
 LEVEL_S = 0.5
-DAY_H, HOUR_S, DAY_HZ = 24.0, 3600.0, 20
-"How long a day is, and its setpoints a second, each with FILE_PREVIEW_S."
-DAY_TICKS_HZ, DAY_PLANS_HZ = 500, 100
-"Half of what the daemon does: so a day takes half an hour of a processor."
-DAY_DRIFT_MN_MIN = 0.2
-"In a day 0.29 N, within the zero that is believed; the plant card's 2 leave that after 200 minutes."
-TURNED_S, TURNS_S = 1.0, 0.1
-"After a turn, and before the next, the error does not count: friction is not mobilised."
 
 
 # -- how soon and how well a device is known ------------------------------------------------------------------------
@@ -231,56 +219,6 @@ def drift(name: str, lasts_s: float = DRIFT_S) -> Json:
             "drifted_on_N": float(np.abs(errors_N[len(known_N) :] - known_N[-1]).max(initial=0.0)),
         }
     return result
-
-
-def day(name: str, hours: float = DAY_H, drift_mN_min: float = DAY_DRIFT_MN_MIN) -> Json:
-    """The pulse for hours on end, there and back, with a handle that turns back every TURN_S and a sensor that drifts:
-    of every hour the RMS error while the handle slides, N, and by how much the last is more than the first. A fault
-    ends it."""
-    plant, lasts_s = device(name), hours * HOUR_S
-    sensor = msgspec.structs.replace(plant.force_sensor, drift_mN_min=drift_mN_min)
-    hand, stated = WaitingHand(), load_scene(CORNER_SCENE)
-    bandwidth = msgspec.structs.replace(stated.bandwidth, control_hz=DAY_TICKS_HZ)
-    config = Config(scene=CORNER_SCENE, rates=Rates(control_hz=DAY_TICKS_HZ, inference_hz=DAY_PLANS_HZ))
-    scene = msgspec.structs.replace(stated, bandwidth=bandwidth)
-    loop = armed(config, msgspec.structs.replace(plant, force_sensor=sensor), hand, scene)
-    begins_s, force_N = loop.now_s, there_and_back()
-    hand.begin([(TURN_S, TURNED_MM_S), (TURN_S, -TURNED_MM_S)] * math.ceil(lasts_s / TURN_S / 2.0), begins_s)
-    squares_N2, counts, faults = Counter[int](), Counter[int](), tuple[str, ...]()
-    ahead = round(FILE_PREVIEW_S * DAY_HZ)
-
-    def setpoint(now_s: float) -> TimedSetpoint:
-        sent = math.floor((now_s - begins_s) * DAY_HZ + 1e-6)
-        preview_N = tuple([force_N(sent + place) for place in range(1, ahead + 1)])
-        stamp_s = begins_s + sent / DAY_HZ
-        return TimedSetpoint(force_N(sent), stamp_s, VALID_S, preview_N=preview_N, preview_dt_s=1.0 / DAY_HZ)
-
-    samples = tqdm(
-        loop.run(lasts_s, setpoint), desc=name, total=round(lasts_s * DAY_TICKS_HZ), miniters=10_000, disable=None
-    )
-    for sample in samples:
-        since_s = sample.truth.time_s - begins_s
-        if faults := tuple(map(str, sample.safety.faults)):
-            break
-        if since_s > TURN_S and TURNED_S < since_s % TURN_S < TURN_S - TURNS_S:
-            error_N = abs(sample.truth.force_N) - force_N(since_s * DAY_HZ)
-            squares_N2[int(since_s / HOUR_S)] += error_N * error_N
-            counts[int(since_s / HOUR_S)] += 1
-    rms_N = [math.sqrt(squares_N2[hour] / counts[hour]) for hour in sorted(counts)]
-    return {"rms_N": rms_N, "last_less_first_N": rms_N[-1] - rms_N[0], "faults": faults}
-
-
-def there_and_back() -> Callable[[float], float]:
-    """The pulse of DAY_HZ points a second over their number, straight lines between, without an end."""
-    played: list[float] = pulse_signal(PULSE_S).force_N[:: RATE_HZ // DAY_HZ].tolist()
-    points = [*played, *played[::-1]]
-
-    def force_N(place: float) -> float:
-        whole = math.floor(place)
-        before_N = points[whole % len(points)]
-        return before_N + (place - whole) * (points[(whole + 1) % len(points)] - before_N)
-
-    return force_N
 
 
 def pulse(name: str) -> Json:

@@ -18,8 +18,6 @@ SAMPLE_COLOURS = {"sample_1": RENDERED, "sample_2": OTHER, "sample_3": THIRD, "s
 CLOSE_UP_S = 4.0
 SAMPLES_FROM_S = 12.0
 BAR_MN = 18.0
-MORE_MN = 2.0
-"The last hour of a day may be missed by so much more than the first."
 
 
 def show_picture(path: Path, scene: Scene, shown: Shown, rehearsals: Rehearsals, figures: list[str]) -> None:
@@ -117,19 +115,6 @@ def tracking_picture(path: Path, kept: dict[str, Followed], figures: dict[str, A
     _dress(axes[1, 1], "Random devices, after 10 s of trim", "RMS error, mN", "draws, each row sorted")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=110, metadata=stamp(figures))
-
-
-def day_picture(path: Path, devices: dict[str, Any]) -> None:
-    """Writes a PNG of the RMS error of every hour, stamped with its figures."""
-    figure = Figure(figsize=(9, 3.5), layout="constrained")
-    axes = figure.subplots()
-    for name, found in devices.items():
-        rms_mN = [1e3 * rms_N for rms_N in found["rms_N"]]
-        axes.bar(np.arange(1, len(rms_mN) + 1), rms_mN, color=SAMPLE_COLOURS[name], width=0.7, label=name)
-        axes.axhline(rms_mN[0] + MORE_MN, color=QUIET, linestyle=":", label=f"first hour + {MORE_MN:g} mN")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
-    _dress(axes, "A pulse for a day, on a simulated device (synthetic)", "RMS error, mN", "hour")
-    figure.savefig(path, dpi=110, metadata=stamp(devices))
 
 
 def _dress(axes: Axes, title: str, quantity: str, horizontal: str = "time, s") -> None:
