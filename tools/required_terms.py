@@ -1,6 +1,6 @@
 """Which terms of the controller's model a scene requires: each is left out in turn, on the whole simulated device.
 
-    required_terms.py [SCENE ...] [--quick] [--recordings] [--wrong] [--json] [--store] [--dask ADDRESS]
+    required_terms.py [SCENE ...] [--quick] [--json] [--store] [--dask ADDRESS]
 
 First the rates: the lowest at which all terms do what they do at the usual. At these, sample 1 chooses: a term whose
 absence adds more than SHARE of the scene's tolerance to the RMS error of the force, with the device learned beforehand
@@ -8,31 +8,22 @@ and frozen or while it is learned, is in. All others are left out together. What
 1 (frozen, too), 2 and 3: it stays within JUDGED of the tolerance, or adds no more than SHARE of it; otherwise the rates
 are none, and the term that counts most is put back, until the rest may go; what was put back before that is tried
 again. A scene that the full model does not meet decides nothing. With the choice every search is tried. Costs are of
-this machine. Finished runs are kept, by what they depend on, in build/required_terms.json. `--store` puts every scene,
-as it is done, into the file that comes with the package. `--recordings` makes scenes of the public recordings in the
-folder that TORMAG_DATA names and measures these; `--wrong` measures two models that are wrong on purpose against what
-the stored decisions predict of them. All devices are synthetic.
+this machine. `--store` puts every scene, as it is done, into the file that comes with the package. All devices are
+synthetic.
 """
 
 import argparse
-import shutil
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from functools import partial
-from pathlib import Path
 
 import msgspec
-import numpy as np
 from rendering.device_draws import SAMPLES
-from rendering.scene_runs import ROOT, Case, costs, load_task, run, run_all
-from rendering.signals import Signal, data_folder, recorded_signals
+from rendering.scene_runs import ROOT, Case, costs, load_task, run_all
 
-from tormagd.ctl.scene_new import new_scene
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.lab import executors
-from tormagd.lab.arrays import Json
-from tormagd.lab.told import lines
 from tormagd.output import write_line
 from tormagd.scenes.measured import (
     FILE,
@@ -54,19 +45,7 @@ from tormagd_client.endpoints import ConfigError
 SHARE = 0.2
 SEARCHES = ("nearest", "newton")
 "Those that need no torch."
-KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
-FOLDER = ROOT / "build" / "recorded_scenes"
-RECORDED = {
-    "tool_torque": ("tool torque", False),
-    "arterial_pressure": ("arterial pressure", True),
-    "cataract": ("haptic scaled", True),
-}
-"Scenes of recordings: how the name of the signal begins, and whether it is played, and so known ahead."
-HOLD = "brain"
-PULSE = "pulse"
-WRONG_S = 60.0
-ALLOWED = 0.2
 SECONDS, QUICK_S = 5.0, 2.0
 LONGEST_S = 120.0
 "Of a hold that is measured to its end; `--quick` leaves out all after QUICK_S."
@@ -80,7 +59,7 @@ MODES = False, True
 "Frozen, and while the device is learned."
 NO_COST = Cost(0.0, 0.0)
 
-Runs = Callable[[Iterable[Case]], dict[Case, float]]
+Runs = Callable[[Collection[Case]], dict[Case, float]]
 
 
 def measure(
@@ -191,57 +170,10 @@ def is_good(item: Judged, tolerance_N: float) -> bool:
     return item.chosen_N <= max(JUDGED * tolerance_N, item.full_N + SHARE * tolerance_N)
 
 
-def wrong_models() -> Json:
-    """What a wrong model costs a scene, as the stored decisions predict it and as it is: HOLD without any term misses
-    more, predicted is the sum of what each term adds alone; PULSE with every term at the usual rates takes a multiple
-    of the chosen model's time."""
-    scenes = {scene.name: scene for scene in measured().scenes}
-    hold, pulse = scenes[HOLD], scenes[PULSE]
-    full_N, none_N = (run(Case(HOLD, SAMPLES[0], out, "", False, *hold.hz, WRONG_S)) for out in ((), TERMS))
-    added_N, predicted_N = none_N - full_N, sum(item.frozen_added_N for item in hold.terms)
-    priced = with_costs(pulse, PULSE)
-    times, predicted = (each.cost_full_us_s / each.cost_us_s - 1.0 for each in (priced, pulse))
-    return {
-        HOLD: {"predicted_N": predicted_N, "measured_N": added_N, "off": abs(predicted_N / added_N - 1.0)},
-        PULSE: {"predicted": predicted, "measured": times, "off": abs(predicted / times - 1.0)},
-    }
-
-
-def recorded(folder: Path) -> list[str]:
-    """The files of the scenes that `tormagctl scene new` proposes for public recordings. Raises ConfigError where
-    those are not there."""
-    data = data_folder()
-    signals = [] if data is None else recorded_signals(data)
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    files = []
-    for scene, (begins, is_known_ahead) in RECORDED.items():
-        signal = next((each for each in signals if each.name.startswith(begins)), None)
-        if signal is None:
-            raise ConfigError("TORMAG_DATA: allowed is the folder of the recordings")
-        files.append(str(written(folder / f"{scene}.toml", signal, is_known_ahead)))
-    return files
-
-
-def written(scene: Path, signal: Signal, is_known_ahead: bool) -> Path:
-    """The scene file, as step 1 and 2 of docs/guides/scene.md make it. Raises CommandError where none is taken."""
-    forces = scene.with_suffix(".csv")
-    rows = np.column_stack([signal.time_s, signal.force_N])
-    np.savetxt(forces, rows, fmt="%.6f", delimiter=",", header="t_s,force_N", comments="")
-    new_scene(scene, forces, None)
-    if is_known_ahead:
-        text = scene.read_text(encoding="utf-8")
-        scene.write_text(text.replace("[signal]\n", "[signal]\nis_known_ahead = true\n"), encoding="utf-8")
-    return scene
-
-
 def main(arguments: list[str] | None = None) -> int:
-    """Measures the scenes that are named, or all that are shipped; 0, 1 where `--wrong` shows a prediction to be off
-    by more than ALLOWED, or 2 for a scene that cannot be measured."""
+    """Measures the scenes that are named, or all that are shipped; 0, or 2 for a scene that cannot be measured."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="name or file; default: every shipped one")
-    parser.add_argument("--recordings", action="store_true", help="the scenes of recordings in TORMAG_DATA instead")
-    parser.add_argument("--wrong", action="store_true", help="what wrong models cost, against what is predicted")
     parser.add_argument("--quick", action="store_true", help=f"sample 1 alone, and {QUICK_S:g} s: a look, no figure")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
@@ -249,11 +181,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     seconds, longest_s, samples = (QUICK_S, QUICK_S, SAMPLES[:1]) if options.quick else (SECONDS, LONGEST_S, SAMPLES)
     found: list[MeasuredScene] = []
+    outcomes: dict[Case, float] = {}
     try:
-        names = recorded(FOLDER) if options.recordings else options.scenes or list(shipped_scenes())
         with executors.chosen(options) as executor:
-            for name in [] if options.wrong else names:
-                runs = partial(run_all, executor=executor, kept=KEPT)
+            for name in options.scenes or shipped_scenes():
+                runs = partial(run_all, executor=executor, known=outcomes)
                 found.append(measure(name, runs, samples, seconds, longest_s))
                 if options.store:
                     others = [scene for scene in measured().scenes if scene.name != found[-1].name]
@@ -262,10 +194,6 @@ def main(arguments: list[str] | None = None) -> int:
     except ConfigError as error:
         print(f"required_terms: {error}", file=sys.stderr)
         return 2
-    if options.wrong:
-        wrong = wrong_models()
-        write_line(_text(wrong) if options.json else "\n".join(lines(wrong)), sys.stdout)
-        return int(any(each["off"] > ALLOWED for each in wrong.values()))
     write_line(_text(_measured(found, seconds)) if options.json else "\n".join(map(table, found)), sys.stdout)
     return 0
 

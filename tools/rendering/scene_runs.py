@@ -1,16 +1,14 @@
 """One scene on the simulated device in virtual time, with any of its terms left out: how far the true force is off.
 
 The signal is played from its beginning; after LEARN_S the error counts. A frozen run learns until then, and no more.
-Every outcome is kept under a hash of all that it depends on; runs are spread over any `concurrent.futures.Executor`.
+Runs are spread over any `concurrent.futures.Executor`.
 """
 
-import hashlib
 import math
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import Executor, as_completed
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,18 +42,6 @@ OPEN_MM = 0.1
 "So near its open end a gap is open: too much force there is the device's, and no error of any model."
 TIMED_S, ROUNDS = 1.0, 7
 VALID_S = 0.1
-DEPENDS_ON = (
-    "tools/rendering/scene_runs.py",
-    "tools/rendering/following.py",
-    "tools/rendering/hands.py",
-    "tormagd/closed_loop.py",
-    *(
-        f"tormagd/{room}"
-        for room in ("control", "assembly", "hardware", "inverse", "model", "physics", "safety", "simulation")
-    ),
-    "firmware_protocol",
-    "tormagd/scenes/signal.py",
-)
 
 
 class Begun(NamedTuple):
@@ -234,49 +220,16 @@ def plant_of(scene: Scene, sample: str) -> PlantParameters:
     return with_insert(load_plant(sample), scene.insert.name)
 
 
-@cache
-def sources_hash() -> str:
-    """Of everything but the case that an outcome depends on."""
-    seen = hashlib.sha256()
-    for place in DEPENDS_ON:
-        path = ROOT / place
-        files = [path] if path.is_file() else sorted(path.rglob("*"))
-        for file in files:
-            if file.suffix in (".py", ".toml", ".json", ".safetensors", ".csv"):
-                seen.update(file.name.encode() + b"\0" + file.read_bytes())
-    return seen.hexdigest()
-
-
-def key(case: Case) -> str:
-    """The content hash under which a case's outcome is kept: sources, scene and case."""
-    scene = load_task(case.scene)
-    named = msgspec.structs.replace(case, scene=scene.fingerprint)
-    file = b""
-    if scene.signal is not None and scene.signal.file:
-        file = (Path(scene_path(case.scene)).parent / scene.signal.file).read_bytes()
-    return hashlib.sha256(sources_hash().encode() + msgspec.json.encode(named) + file).hexdigest()
-
-
-def run_all(cases: Iterable[Case], executor: Executor, kept: Path | None = None) -> dict[Case, float]:
-    """The outcome of every case, in their order. With `kept`, a JSON file, those that are in it are taken from there,
-    and new ones are added as they come: what was stopped goes on where it was."""
-    keys = {case: key(case) for case in cases}
-    known: dict[str, float] = {}
-    if kept is not None and kept.exists():
-        known = msgspec.json.decode(kept.read_bytes(), type=dict[str, float])
-    pending = {executor.submit(run, case): keys[case] for case in keys if keys[case] not in known}
+def run_all(cases: Collection[Case], executor: Executor, known: dict[Case, float]) -> dict[Case, float]:
+    """The outcome of every case, in their order. Those that are `known` are not run again; new ones are added there."""
+    pending = {executor.submit(run, case): case for case in dict.fromkeys(cases) if case not in known}
     try:
         for future in tqdm(as_completed(pending), total=len(pending), unit="run", disable=not sys.stderr.isatty()):
             known[pending[future]] = future.result()
-            if kept is not None:
-                partial_file = kept.with_name(kept.name + ".part")
-                partial_file.parent.mkdir(parents=True, exist_ok=True)
-                partial_file.write_bytes(msgspec.json.encode(known))
-                partial_file.replace(kept)
     finally:
         for future in pending:
             future.cancel()
-    return {case: known[keys[case]] for case in keys}
+    return {case: known[case] for case in cases}
 
 
 def load_task(name_or_path: str) -> Scene:
