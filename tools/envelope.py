@@ -24,9 +24,9 @@ from typing import NamedTuple
 
 import numpy as np
 from rendering.device_draws import SAMPLES, SECOND, device, judging
-from rendering.following import CORNER_SCENE, VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
+from rendering.following import VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
 from rendering.hands import HANDS
-from rendering.models import errors, models, models_picture, models_table
+from rendering.models import models, models_picture, models_table
 from tqdm import tqdm
 
 from tormagd.control.records import TimedSetpoint
@@ -34,13 +34,7 @@ from tormagd.lab.arrays import Array, Json, Mask
 from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
 from tormagd.lab.pages import stamp
 from tormagd.lab.told import lines
-from tormagd.lab.training.metrics import not_rising_share
-from tormagd.model.model_file import load_model
-from tormagd.model.shipped import model_path
-from tormagd.physics.inserts import insert
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import load_scene
-from tormagd.simulation.parameters import load_plant
 
 DRAWS, QUICK_DRAWS = 40, 2
 SETPOINT_S = 0.002
@@ -213,18 +207,8 @@ def low_hold(name: str, asked_N: float, lasts_s: float) -> tuple[str, ...]:
     return () if is_shown else ("F_MIN was not shown",)
 
 
-def model_on_plant() -> Json:
-    """The scene's model on sample 1 without memory, friction mobilised, over the gaps of the scene and 5..300 mm/s."""
-    stated = load_scene(CORNER_SCENE).insert
-    fitted = insert(stated.name)
-    model = load_model(model_path(stated.model, Path(), stated.name), element="torque", insert=stated.name)
-    return errors(model, fitted, load_plant("sample_1"), np.linspace(5.0, 300.0, 119)) | {
-        "not_rising_share": not_rising_share(model)
-    }
-
-
 def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures]]]:
-    """Everything; the keys are those of the public contract, and `model`, `peak_N`, `settled_N`, `rows`."""
+    """Everything; the keys are those of the public contract, and `peak_N`, `settled_N`, `rows`."""
     draws, lasts_s = (QUICK_DRAWS, QUICK_LOW_HOLD_S) if options.quick else (DRAWS, LOW_HOLD_S)
     asked = list(cases(draws))
     holds = [(name, force_N, lasts_s) for name in judging(min(draws, HELD_DRAWS)) for force_N in LOW_N]
@@ -258,7 +242,6 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
             "faults": faulted(second),
         },
         "low_holds": [f"{name} at {force} N: {', '.join(wrong)}" for name, force, _, wrong in faults if wrong],
-        "model": model_on_plant(),
         "draws": draws,
         "low_hold_s": lasts_s,
         "rows": list(starmap(row, every)),

@@ -1,5 +1,5 @@
 """Numbers at their extremes: the force law against 50 digits, every stage of the core fed with what is no number,
-configurations at their ends, clocks through their rollovers, the network in float32 beside float64.
+configurations at their ends, clocks through their rollovers.
 
 `stages` has a row for each stage of the core: `cases`, steps with NaN, infinities, denormals, zeros, largest floats,
 time that stands or goes back, tables that do not rise; of them `refused` by name; `stated`, those after which a limit
@@ -7,7 +7,7 @@ or a fault was told; `nonfinite`, numbers that came out; `swallowed`, steps with
 `unnamed`, errors that name nothing. Of a stage with a `border` the cases are those that pass that check.
 `configurations`: each end of what is accepted, alone and in pairs, is `refused`, or it `ran` for `--seconds` in virtual
 time, or a fault or a refusal to enable was `stated`. `counters`: by how much a duty differs where a clock rolls over.
-`networks`: the worst force over a model's box, mN. `travelled` is what must be 0: all `nonfinite`, `swallowed`,
+`travelled` is what must be 0: all `nonfinite`, `swallowed`,
 `unnamed` and `wrong`.
 
 `--json` prints one object. `cases` inputs are evaluated as arrays in float64 and float32; `reference_cases` of them are
@@ -35,7 +35,7 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 from extremes.cases import DIGITS, Batch, draw_batch, reference
-from extremes.runs import became, counters, drawn_ends, networks, summed
+from extremes.runs import became, counters, drawn_ends, summed
 from extremes.stages import Row, tried
 from extremes.steps import worst_step_errors
 from extremes.table import stages
@@ -198,8 +198,8 @@ def of_core(options: argparse.Namespace) -> dict[str, Any]:
     with _pool(options.workers) as pool:
         rows = [pool.submit(stage_row, place, options.episodes, options.seed) for place in range(len(stages()))]
         runs = [pool.submit(became, case, options.seconds) for case in cases]
-        clocks, models = pool.submit(counters), pool.submit(networks, options.networks, options.seed)
-        _wait([*rows, *runs, clocks, models], "core")
+        clocks = pool.submit(counters)
+        _wait([*rows, *runs, clocks], "core")
     told, ends, rolled = [row.result() for row in rows], summed([run.result() for run in runs]), clocks.result()
     travelled = sum(row.nonfinite + row.swallowed + row.unnamed for row in told) + ends["wrong"]
     return {
@@ -208,7 +208,6 @@ def of_core(options: argparse.Namespace) -> dict[str, Any]:
         "stages": [row._asdict() for row in told],
         "configurations": ends,
         "counters": rolled,
-        "networks": models.result(),
         "passed": travelled == 0 and rolled["passed"],
     }
 
@@ -255,7 +254,6 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=1_000, help="of hostile inputs to each stage (%(default)s)")
     parser.add_argument("--configurations", type=int, default=200, help="at their ends (%(default)s)")
     parser.add_argument("--seconds", type=float, default=10.0, help="that each of them runs (%(default)s)")
-    parser.add_argument("--networks", type=int, default=100_000, help="inputs of each model (%(default)s)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=WORKERS, help="processes")
     options = parser.parse_args()

@@ -11,8 +11,11 @@ from rendering import models
 from rendering.following import Followed
 from rendering.models import models_table
 
+from tormagd.lab.training.metrics import not_rising_share
+from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
-from tormagd.physics.inserts import INSERTS
+from tormagd.physics.inserts import INSERTS, insert
+from tormagd.simulation.parameters import load_plant
 
 ROOT = Path(__file__).parents[2]
 
@@ -83,10 +86,12 @@ def test_a_corner_keeps_the_bounds(case) -> None:
 
 
 def test_the_shipped_model_is_good_where_it_is_asked() -> None:
-    found = envelope.model_on_plant()
+    """By the scene's insert, on sample 1, where its handles go."""
+    model = load_model(model_path("torque_mre_50_40", Path()), element="torque", insert="MRE-50-40")
+    found = models.errors(model, insert("MRE-50-40"), load_plant("sample_1"), np.linspace(5.0, 300.0, 119))
     assert found["mean_N"] <= 0.03
     assert found["worst_N"] <= 0.15
-    assert found["not_rising_share"] == 0.0
+    assert not_rising_share(model) == 0.0
 
 
 def test_the_page_has_the_figures_of_every_model_and_none_falls_with_the_field() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from extremes.runs import SAME_DUTY, Became, End, became, counters, drawn_ends, ends, networks, summed
+from extremes.runs import SAME_DUTY, Became, End, became, counters, drawn_ends, ends, summed
 from extremes.stages import HOSTILE_STEPS, Draw, Row, Stage, leaves, tried
 from extremes.table import stages
 
@@ -151,11 +151,3 @@ def test_a_rollover_changes_no_duty() -> None:
     found = counters()
     assert found["passed"]
     assert 0.0 < max(found["duty"].values()) <= SAME_DUTY
-
-
-def test_float32_gives_every_model_the_same_force_to_a_hundredth_of_a_millinewton() -> None:
-    found = networks(2_000, seed=1)
-    assert "torque_mre_50_40" in found
-    for worst in found.values():
-        assert 0.0 < worst["float32_mN"] < 0.01
-        assert 0.0 < worst["plain_mN"] < 1e-9

@@ -30,7 +30,7 @@ TOOL = Path(__file__).parents[2] / "tools" / "numerics.py"
 
 def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
     command = [sys.executable, str(TOOL), "--json", "--cases", "20000", "--reference", "400", "--episodes", "1"]
-    command += ["--configurations", "1", "--seconds", "0.1", "--networks", "500", "--workers", "1"]
+    command += ["--configurations", "1", "--seconds", "0.1", "--workers", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)
@@ -38,7 +38,6 @@ def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
     assert found["stage_cases"] == sum(row["cases"] for row in found["stages"])
     assert found["configurations"]["cases"] == 1
     assert found["counters"]["passed"]
-    assert found["networks"]["torque_mre_50_40"]["float32_mN"] < 0.01
     assert found["cases"] >= 20_000
     assert found["reference_cases"] >= 400
     assert found["nonfinite"] == found["misjudged"] == 0

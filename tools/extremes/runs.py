@@ -1,5 +1,4 @@
-"""Whole runs for `numerics.py`: configurations at their ends, counters through where they roll over, the network in
-float32 beside float64.
+"""Whole runs for `numerics.py`: configurations at their ends, counters through where they roll over.
 
 A configuration is refused at the border, or it plans and steps the simulated device for a while. Times and counters are
 shifted to just before a rollover, and the core gives the same duties as without.
@@ -9,12 +8,9 @@ import math
 import random
 from collections import Counter
 from collections.abc import Iterator
-from importlib import resources
-from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
 import msgspec
-import numpy as np
 
 from extremes.stages import UNNAMED, leaves
 from tormagd.assembly.build import Core, build_core
@@ -23,8 +19,6 @@ from tormagd.config import Config
 from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.hardware.measurement import Measurement
-from tormagd.model.features import Element
-from tormagd.model.model_file import load_model
 from tormagd.safety.operating_state import Conditions, RefusedError
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
@@ -243,29 +237,3 @@ def _stamp_difference_s(at_ns: int) -> float:
         assert inbox.newest is not None, inbox.last_refusal
         stamps_s.append(inbox.newest.stamp_s)
     return abs(stamps_s[0] - stamps_s[1])
-
-
-# -- the network ---------------------------------------------------------------------------------------------------
-
-
-def networks(count: int, seed: int) -> dict[str, Any]:
-    """Of each shipped model the worst difference, mN, over its box: an array of float32, and one value in plain floats,
-    each from an array of float64; ends of the box, often."""
-    rng, found = np.random.default_rng(seed), {}
-    with resources.as_file(resources.files("tormagd.model") / "models") as folder:
-        for path in sorted(Path(folder).glob("*.safetensors")):
-            model = load_model(path, element=Element(path.stem.partition("_")[0]))
-            worst = {"float32_mN": 0.0, "plain_mN": 0.0}
-            for _ in range(max(count // 50, 1)):
-                displacement, rate, fields, cip = (
-                    low + (high - low) * np.clip(rng.uniform(-0.1, 1.1, 50), 0.0, 1.0)
-                    for low, high in model.feature_ranges
-                )
-                curve = model.curve(float(displacement[0]), float(rate[0]), float(cip[0]))
-                exact = curve.forces_N(fields)
-                single = curve.forces_N(fields.astype(np.float32)).astype(np.float64)
-                plain = [curve.force_N(each) for each in fields.tolist()]
-                for kind, forces in (("float32_mN", single), ("plain_mN", np.array(plain))):
-                    worst[kind] = max(worst[kind], float(np.abs(forces - exact).max()) * 1e3)
-            found[path.stem] = worst
-    return found
