@@ -34,7 +34,6 @@ class Case(NamedTuple):
 
 CASES = {
     "fuzz": Case("fuzz", 11_000_000, "damaged frames"),
-    "walk": Case("walk", 10_000_000, "steps"),
     "replug-serial": Case("replug", 200, "cycles", ("serial",)),
     "replug-can": Case("replug", 200, "cycles", ("can",)),
     "stalls": Case("stalls", 400, "stops", on_stand=True),

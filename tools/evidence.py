@@ -48,7 +48,6 @@ PARTS = {
         "{frames:,} damaged frames: {false_accepts} false accepts; {second_lost} of {runs_of_damage:,} runs of damage "
         "not over after two frames; C and Python differ {languages_differ} times",
     ),
-    "walk": Part("tools/endure.py walk --json", "{steps:,} steps, {driven:,} of them driven"),
     "replug-serial": Part(
         "tools/endure.py replug-serial --json", "{cycles} cycles; lost after {lost_after_ms} ms at most"
     ),

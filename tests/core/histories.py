@@ -25,13 +25,22 @@ from firmware_protocol.layouts import LAYOUTS  # noqa: E402
 from tormagd.assembly.build import Core, build_core  # noqa: E402
 from tormagd.closed_loop import ClosedLoop  # noqa: E402
 from tormagd.config import Config  # noqa: E402
-from tormagd.control.records import Plan, TimedSetpoint  # noqa: E402
+from tormagd.control.records import Duty, Plan, TimedSetpoint  # noqa: E402
 from tormagd.exact import packed, plain  # noqa: E402
 from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
 from tormagd.hardware.link import DeviceLink  # noqa: E402
 from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
 from tormagd.hardware.measurement import Measurement  # noqa: E402
-from tormagd.safety.operating_state import Conditions, OperatingState, RefusedError  # noqa: E402
+from tormagd.safety.codes import Fault  # noqa: E402
+from tormagd.safety.operating_state import (  # noqa: E402
+    ROWS,
+    Conditions,
+    Event,
+    OperatingState,
+    RefusedError,
+    SafetyState,
+    Transition,
+)
 from tormagd.simulation.device import SerialDevice, VirtualDevice  # noqa: E402
 from tormagd.simulation.faults import parse_fault  # noqa: E402
 from tormagd.simulation.hand import Hand, ReversingHand, SteadyHand  # noqa: E402
@@ -45,6 +54,8 @@ EPISODES, TICKS = 40, 150
 COMMANDS = ["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"]
 NEXT = {OperatingState.DISABLED: "enable", OperatingState.FAULT: "clear-fault"}
 "What leads back to where something is driven."
+DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
+WAYS = {(row.event, row.source): row.target for row in ROWS if isinstance(row, Transition)}
 
 
 class Digest:
@@ -69,10 +80,11 @@ class Digest:
 # -- step and plan, whatever is measured ---------------------------------------------------------------------------
 
 
-def hostile(core: Core, seen: Digest) -> None:
-    """Measurements, setpoints and commands at random; a tenth of all numbers is none that a device gives."""
+def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
+    """Measurements, setpoints and commands at random; a tenth of all numbers is none that a device gives. Raises
+    AssertionError where a step does what none may."""
     rng = random.Random(12)
-    for _ in range(EPISODES):
+    for _ in range(episodes):
         strangeness = rng.choice([0.0, 0.0, 0.01, 0.1])
         now_s, number, at_mm = rng.uniform(0.0, 1e5), 0, rng.uniform(-25.0, 0.0)
         stepper, planner = core.stepper(now_s), core.planner(now_s)
@@ -88,8 +100,13 @@ def hostile(core: Core, seen: Digest) -> None:
             plan = planner.planned
             if rng.random() < 0.5:
                 gap_mm, speed_mm_s = rng.uniform(40.0, 100.0), rng.uniform(-40.0, 40.0)
+                if rng.random() < strangeness:
+                    gap_mm = rng.choice(STRANGE)
                 plan = Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
-            seen.see([stepper.step(now_s, measured, plan), stepper])
+            before = stepper.safety
+            output = stepper.step(now_s, measured, plan)
+            seen.see([output, stepper])
+            check_step(output, before, stepper.safety)
             if rng.random() < 0.3:
                 setpoint = None if rng.random() < 0.1 else setpoint_at(rng, now_s)
                 try:
@@ -104,9 +121,34 @@ def hostile(core: Core, seen: Digest) -> None:
                 name = NEXT.get(stepper.safety.operating_state, "resume")
                 if rng.random() < 0.2:
                     name = rng.choice(COMMANDS)
+                before = stepper.safety
                 _attempted(seen, stepper.command, name, now_s, conditions(rng))
+                if stepper.safety is not before:
+                    check_way(Event(name), before, stepper.safety)
             if rng.random() < 0.003:
+                before = stepper.safety
                 stepper.lose_link()
+                check_way(Event.FAULT, before, stepper.safety)
+
+
+def check_step(output: Duty, before: SafetyState, after: SafetyState) -> None:
+    """Duties are within the limit, and finite; nothing is driven while it may not be."""
+    duties, limit = (output.left_duty, output.right_duty), CONFIG.position.duty_limit
+    assert all(abs(duty) <= limit for duty in duties), f"duties = {duties} in {after}"
+    is_off = output.mode is DriveMode.OFF and duties == (0.0, 0.0)
+    assert is_off or after.operating_state in DRIVEN, f"{output} in {after}"
+    check_way(Event.FAULT, before, after)
+
+
+def check_way(event: Event, before: SafetyState, after: SafetyState) -> None:
+    """The operating state changes only along a row of the table, and has faults in FAULT and there only."""
+    source, target = before.operating_state, after.operating_state
+    assert (after.faults != ()) == (target is OperatingState.FAULT), str(after)
+    if event is Event.FAULT and set(after.faults) <= set(before.faults):
+        assert target is source, f"{source} to {target} without an event"
+    elif event is not Event.STOP or Fault.STOPPED not in before.faults:
+        assert (event, source) in WAYS, f"{event} was taken in {source}"
+        assert target is WAYS[event, source], f"{event} in {source} led to {target}"
 
 
 def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, strangeness: float) -> Measurement:

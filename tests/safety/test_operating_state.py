@@ -233,7 +233,7 @@ def test_latching_twice_is_latching_once(present: tuple[Fault, ...], again: tupl
 
 class Operating(RuleBasedStateMachine):
     """Operators, faults and a device in any condition: what enabling wants and what is asked of the device. That every
-    way is a row of the table, `tools/endure.py walk` holds, which tests/tools runs for a moment."""
+    way is a row of the table, tests/core/test_rules.py holds."""
 
     def __init__(self) -> None:
         super().__init__()

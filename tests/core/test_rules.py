@@ -1,0 +1,47 @@
+"""What holds in every step of the core, whatever comes in: many more of the hostile histories that both builds run."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import msgspec
+import pytest
+
+from tormagd.assembly.build import build_core
+from tormagd.safety.operating_state import Event, OperatingState
+
+
+class Unseen:
+    """Takes no digest."""
+
+    def see(self, thing: object) -> None:
+        """Nothing."""
+
+
+@pytest.fixture
+def histories() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("histories", Path(__file__).parent / "histories.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_no_hostile_history_breaks_a_rule(histories: ModuleType) -> None:
+    histories.hostile(build_core(histories.CONFIG), Unseen(), episodes=270)
+
+
+def test_a_broken_rule_is_seen(histories: ModuleType) -> None:
+    core, config = build_core(histories.CONFIG), histories.CONFIG
+    weak = msgspec.structs.replace(config.position, duty_limit=0.01)
+    histories.CONFIG = msgspec.structs.replace(config, position=weak)
+    with pytest.raises(AssertionError, match="duties = "):
+        histories.hostile(core, Unseen())
+    histories.CONFIG, histories.DRIVEN = config, (OperatingState.PAUSED,)
+    with pytest.raises(AssertionError, match=r"mode=.* in "):
+        histories.hostile(core, Unseen())
+    histories.DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
+    del histories.WAYS[Event.ENABLE, OperatingState.DISABLED]
+    with pytest.raises(AssertionError, match="enable was taken in DISABLED"):
+        histories.hostile(core, Unseen())
