@@ -43,12 +43,13 @@ class Draw:
     """The inputs of one step: the usual ones, or some of `strange`."""
 
     def __init__(self, rng: random.Random, strange: tuple[float, ...]) -> None:
-        self._rng, self._strange, self.is_hostile, self.has_nan = rng, strange, False, False
-        self.now_s, self.steps = 10.0, 0
+        self._rng, self._strange, self.has_nan = rng, strange, False
+        self.begin()
 
     def begin(self) -> None:
         """Time and steps of an episode begin."""
-        self.now_s, self.steps, self.is_hostile = 10.0, 0, False
+        self.now_s = self.last_s = 10.0
+        self.steps, self.is_hostile = 0, False
 
     def turn(self, is_hostile: bool) -> None:
         """The next step of it begins."""
@@ -56,6 +57,7 @@ class Draw:
 
     def step(self, period_s: float) -> float:
         """The time of this step: a period on, or while it is hostile also the same again, earlier or much later."""
+        self.last_s = self.now_s
         self.now_s += self._rng.choice((0.0, -0.5, 5.0, period_s)) if self.is_hostile else period_s
         return self.now_s
 
@@ -83,12 +85,14 @@ class Draw:
 
 class Stage(NamedTuple):
     """One row of the table. `make` gives a fresh stage, or whatever `feed` is given; `feed` takes one step of it and
-    gives what came out. `border` names the check that stands before it; empty: its own."""
+    gives what came out. `border` names the check that stands before it; empty: its own. Time goes on by `period_s`
+    before each step; it stands where the stage asks for no time, or `feed` lets it go on."""
 
     name: str
     make: Callable[[], Any]
     feed: Callable[[Any, Draw], object]
     border: str = ""
+    period_s: float = 0.0
 
 
 class Row(NamedTuple):
@@ -120,6 +124,8 @@ def tried(stage: Stage, episodes: int, seed: int) -> Row:
         for step in range(USUAL_STEPS + HOSTILE_STEPS + AFTER_STEPS):
             draw.turn(USUAL_STEPS <= step < USUAL_STEPS + HOSTILE_STEPS)
             counts["cases"] += draw.is_hostile
+            if stage.period_s:
+                draw.step(stage.period_s)
             try:
                 came = stage.feed(fed, draw)
             except REFUSALS as error:

@@ -41,6 +41,7 @@ from tormagd.control.believe.slow_friction import SlowFriction
 from tormagd.control.believe.strength import UNSEEN, Strength, device_bounds
 from tormagd.control.contact import Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
+from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.filter import low_pass
 from tormagd.control.interpolation import Rising, at_step, interpolated
 from tormagd.control.measure import Measure
@@ -69,17 +70,20 @@ from tormagd_client.messages import Setpoint, decode as decode_message
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
 "Of a tick, of a plan, and of what `Stepper` lets a tick take."
+BEGINS_S = 9.9
+"A stage that begins at a time, just before the first step."
 CONFIG = Config(scene="coronary")
 BOUNDS = device_bounds(CONFIG.trim)
 READY = Conditions(True, True, True, False, False, None, 0.5)
-MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
+OWN, MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
+    "",
     "Stepper, of measurements",
     "ask/governor, of setpoints",
     "firmware_protocol: codec",
     "config",
     "Planner, of plans",
 )
-"Checks that stand before a stage."
+"Checks that stand before a stage, beside its own."
 
 
 @cache
@@ -88,36 +92,36 @@ def core() -> Core:
     return build_core(CONFIG)
 
 
-# -- inputs --------------------------------------------------------------------------------------------------------
+# -- inputs, all of them at the time of the draw -------------------------------------------------------------------
 
 
-def measurement(draw: Draw, now_s: float) -> Measurement:
+def measurement(draw: Draw) -> Measurement:
     """Of a healthy homed device at a gap of 80 mm, but for what is drawn."""
     return Measurement(
         number=draw.steps,
-        received_s=draw(now_s),
-        device_time_s=draw(now_s),
+        received_s=draw(draw.now_s),
+        device_time_s=draw(draw.now_s),
         left_mm=draw(-7.5),
         right_mm=draw(-7.5),
         left_current_A=draw(0.1),
         right_current_A=draw(0.1),
         force_N=draw(1.1),
-        handle_mm=draw(42.0 * now_s),
+        handle_mm=draw(42.0 * draw.now_s),
         mode=DeviceMode.RUN,
         switches=Switches.HOMED,
         faults=DeviceFault(0),
         temperature_C=draw(23.0),
         supply_V=draw(12.0),
-        sensed_s=draw(now_s),
-        reported_s=draw(now_s),
+        sensed_s=draw(draw.now_s),
+        reported_s=draw(draw.now_s),
         delay_s=draw(0.0),
         link=LinkQuality(0.0, 0.0, 0.0, draw(2e-3), draw(0.0)),
     )
 
 
-def measured(draw: Draw, now_s: float) -> Measured:
+def measured(draw: Draw) -> Measured:
     """What `measure` makes of it: never anything that has not passed `Stepper`'s border."""
-    some = draw.bounded
+    some, now_s = draw.bounded, draw.now_s
     turn = Turn(1.0 if some(1.0) >= 0.0 else -1.0, some(0.0), some(42.0 * now_s))
     handle = Handle(min(abs(some(MOBILISED_MM)), MOBILISED_MM), some(42.0), turn, abs(some(42.0)))
     return Measured(
@@ -136,47 +140,50 @@ def measured(draw: Draw, now_s: float) -> Measured:
     )
 
 
-def setpoint(draw: Draw, now_s: float) -> TimedSetpoint:
+def reading(draw: Draw) -> Measurement:
+    """A measurement as the border lets it pass."""
+    return measurement(usual(draw.now_s)).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
+
+
+def setpoint(draw: Draw) -> TimedSetpoint:
     """A force of about 1.2 N, in a third of the steps with a preview."""
     preview = tuple([draw(1.2) for _ in range(8)]) if draw.steps % 3 == 0 else ()
-    made = TimedSetpoint(draw(1.2), draw(now_s), draw(0.1), None, None, preview, draw(0.05) if preview else 0.0)
+    made = TimedSetpoint(draw(1.2), draw(draw.now_s), draw(0.1), None, None, preview, draw(0.05) if preview else 0.0)
     return made.replaced(displacement_mm=draw(MOBILISED_MM), rate_mm_s=draw(42.0)) if draw.steps % 2 else made
 
 
-def plan(draw: Draw, now_s: float) -> Plan:
+def plan(draw: Draw) -> Plan:
     """For a gap of 79 mm."""
-    at = Plan(1, draw(now_s), 1.2, draw(0.0), draw(1.2), draw(1.1), draw(200.0), draw(79.0), draw(-5.0), draw(1.0), ())
+    at_s = draw(draw.now_s)
+    at = Plan(1, at_s, 1.2, draw(0.0), draw(1.2), draw(1.1), draw(200.0), draw(79.0), draw(-5.0), draw(1.0), ())
     return at.replaced(gap_acceleration_mm_s2=draw(0.0), min_gap_mm=draw(45.0), sensor_doubted_s=draw(0.0))
+
+
+def usual(now_s: float) -> Draw:
+    """Draws nothing strange at that time."""
+    draw = Draw(random.Random(0), ())
+    draw.now_s = now_s
+    return draw
 
 
 # -- the core through its entries ----------------------------------------------------------------------------------
 
 
-def usual() -> Draw:
-    """Draws nothing strange."""
-    return Draw(random.Random(0), ())
-
-
-def hold(now_s: float) -> Plan:
-    """A plan that asks for a gap of 80 mm."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, 80.0, 0.0, 1.0, ())
-
-
 def stepper() -> Stepper:
-    """Enabled, at a gap of 80 mm."""
-    made, draw = core().stepper(9.9), usual()
+    """Enabled, at a gap of 80 mm, which its plans ask for."""
+    made = core().stepper(BEGINS_S)
     for tick in range(1, 4):
-        now_s = 9.9 + tick * PERIOD_S
+        draw = usual(BEGINS_S + tick * PERIOD_S)
         draw.steps = -tick
-        made.step(now_s, measurement(draw, now_s), hold(now_s))
-    made.command("enable", 9.91, READY)
+        hold = Plan(1, draw.now_s, None, None, 0.0, None, 0.0, 80.0, 0.0, 1.0, ())
+        made.step(draw.now_s, measurement(draw), hold)
+    made.command("enable", BEGINS_S + 0.01, READY)
     return made
 
 
 def step(stage: Stepper, draw: Draw) -> object:
     """One tick; a fault that it latches is what it says."""
-    now_s = draw.step(PERIOD_S)
-    duty = stage.step(draw(now_s), measurement(draw, now_s), plan(draw, now_s))
+    duty = stage.step(draw(draw.now_s), measurement(draw), plan(draw))
     faults = stage.safety.faults
     if Fault.NOT_FINITE in faults:
         raise DomainError("measurement or plan", Fault.NOT_FINITE, "finite numbers")
@@ -185,19 +192,18 @@ def step(stage: Stepper, draw: Draw) -> object:
 
 def planner() -> Planner:
     """Of a device of which nothing is known."""
-    return core().planner(9.9)
+    return core().planner(BEGINS_S)
 
 
 def planning(stage: Planner, draw: Draw) -> object:
     """One plan. Where it is refused its owner begins afresh, and the next is made."""
-    now_s = draw.step(PLAN_S)
-    told_s = draw(now_s)
+    now_s, told_s = draw.now_s, draw(draw.now_s)
     try:
-        made = stage.plan(now_s if math.isfinite(told_s) else told_s, setpoint(draw, now_s), measured(draw, now_s))
+        made = stage.plan(now_s if math.isfinite(told_s) else told_s, setpoint(draw), measured(draw))
     except DomainError as error:
         stage.afresh(now_s)
         try:
-            stage.plan(now_s, setpoint(usual(), now_s), measured(usual(), now_s))
+            stage.plan(now_s, setpoint(usual(now_s)), measured(usual(now_s)))
         except DomainError as again:
             raise AssertionError(f"afresh after {error}") from again
         raise
@@ -209,37 +215,28 @@ def planning(stage: Planner, draw: Draw) -> object:
 
 
 def measure(stage: Measure, draw: Draw) -> object:
-    last_s = draw.now_s
-    now_s = draw.step(PERIOD_S)
-    return stage.update(last_s, now_s, measurement(draw, now_s), False)
+    return stage.update(draw.last_s, draw.now_s, measurement(draw), False)
 
 
 def sight(stage: Sight, draw: Draw) -> object:
-    last_s = draw.now_s
-    stage.update(last_s, draw.step(PERIOD_S), draw(1.0) > 0.0)
+    stage.update(draw.last_s, draw.now_s, draw(1.0) > 0.0)
     return stage.is_blind
 
 
 def plausible(_: object, draw: Draw) -> object:
-    now_s = draw.step(PERIOD_S)
-    one, other = measured(draw, now_s), measured(draw, now_s)
-    leap = leap_between(one, other, 8.0, now_s, draw.bounded(now_s))
-    is_back = leap is not None and leap.has_come_back(one, 8.0, now_s)
+    one, other = measured(draw), measured(draw)
+    leap = leap_between(one, other, 8.0, draw.now_s, draw.bounded(draw.now_s))
+    is_back = leap is not None and leap.has_come_back(one, 8.0, draw.now_s)
     return [leap, is_back, is_outside(other, 45.0, 95.0, False, False)]
 
 
 # -- believe -------------------------------------------------------------------------------------------------------
 
 
-def believe() -> Believe:
-    return core().planner(9.9).believe
-
-
 def believing(stage: Believe, draw: Draw) -> object:
-    now_s, before_s = draw.step(PLAN_S), draw.now_s
-    seen = measured(draw, now_s)
-    belief = stage.update(now_s, seen)
-    stage.learn_lag(now_s - before_s, seen, draw(1.0), draw(80.0))
+    seen = measured(draw)
+    belief = stage.update(draw.now_s, seen)
+    stage.learn_lag(0.0, seen, draw(1.0), draw(80.0))
     return [belief, stage.learned(), stage.min_N]
 
 
@@ -258,11 +255,10 @@ def slow_friction(stage: SlowFriction, draw: Draw) -> object:
 
 
 def sensor_zero(stage: SensorZero, draw: Draw) -> object:
-    now_s = draw.step(PLAN_S)
-    stage.begin(now_s)
+    stage.begin(draw.now_s)
     direction = 1.0 if draw.steps // 4 % 2 else -1.0
-    stage.update(now_s, direction, draw(1.1), draw(1.1), abs(draw(42.0)), draw.positive(0.2), 1.0, 0.1)
-    return stage.sd_N(now_s)
+    stage.update(draw.now_s, direction, draw(1.1), draw(1.1), abs(draw(42.0)), draw.positive(0.2), 1.0, 0.1)
+    return stage.sd_N(draw.now_s)
 
 
 def freshness(stage: Freshness, draw: Draw) -> object:
@@ -283,30 +279,20 @@ def carriage_lag(stage: CarriageLag, draw: Draw) -> object:
 
 
 def handle_watch(stage: HandleWatch, draw: Draw) -> object:
-    stage.update(draw.step(PLAN_S), draw(10.0), draw(1.1), draw(1.1))
+    stage.update(draw.now_s, draw(10.0), draw(1.1), draw(1.1))
     return stage.moved_gap_at_rest(1.1)
 
 
-def memory() -> ElementMemory:
-    return core().planner(9.9).believe.memory
-
-
-def remembering(stage: ElementMemory, draw: Draw) -> object:
-    stage.update(draw.step(PLAN_S), measured(draw, draw.now_s))
+def memory(stage: ElementMemory, draw: Draw) -> object:
+    stage.update(draw.now_s, measured(draw))
     return [stage.lag_at_mT(draw(200.0)), stage.force_N(core().element.nominal.only)]
 
 
 # -- ask -----------------------------------------------------------------------------------------------------------
 
 
-def governor() -> Governor:
-    made = core()
-    return Governor(9.9, made.portrait, made.scene.force, made.gap_speed_mm_s)
-
-
-def governing(stage: Governor, draw: Draw) -> object:
-    now_s = draw.step(PLAN_S)
-    asked = stage.update(now_s, setpoint(draw, now_s), UNSEEN, abs(draw.bounded(0.02)))
+def governor(stage: Governor, draw: Draw) -> object:
+    asked = stage.update(draw.now_s, setpoint(draw), UNSEEN, abs(draw.bounded(0.02)))
     stage.foresee()
     return asked
 
@@ -337,17 +323,18 @@ def skill(stages: list[Skill], draw: Draw) -> object:
 
 
 def aim() -> list[Any]:
-    made = core()
-    planned, begun = made.planner(9.9), Aim(CONFIG, made.scene, made.element)
-    begun.begin(9.9, 0, 0.0)
-    return [begun, planned.believe.memory, planned.believe.update(9.9, None)]
+    """With what is remembered and believed."""
+    made, believe = core(), planner().believe
+    begun = Aim(CONFIG, made.scene, made.element)
+    begun.begin(BEGINS_S, 0, 0.0)
+    return [begun, believe.memory, believe.update(BEGINS_S, None)]
 
 
 def aiming(stage: list[Any], draw: Draw) -> object:
-    now_s = draw.step(PLAN_S)
+    begun, remembered, believed = stage
     asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), is_meant=True)
-    meant = setpoint(usual(), now_s)
-    return stage[0].update(now_s, meant, asked, stage[2], stage[1], measured(draw, now_s))
+    meant = setpoint(usual(draw.now_s))
+    return begun.update(draw.now_s, meant, asked, believed, remembered, measured(draw))
 
 
 def floors(_: object, draw: Draw) -> object:
@@ -372,85 +359,75 @@ def portrait(stage: Portrait, draw: Draw) -> object:
 
 
 def carriages() -> Carriages:
+    """At rest, 80 mm apart."""
     made = Carriages(CONFIG, core().scene)
     made.begin(80.0)
     return made
 
 
 def driving(stage: Carriages, draw: Draw) -> object:
-    now_s = draw.step(PERIOD_S)
-    seen = measured(draw, now_s)
-    dt_s = min(draw.positive(PERIOD_S), LONGEST_S)
-    drive = stage.update(now_s, dt_s, plan(draw, now_s), reading(draw, now_s), seen, False)
+    seen, dt_s = measured(draw), elapsed_s(draw)
+    drive = stage.update(draw.now_s, dt_s, plan(draw), reading(draw), seen, False)
     return [drive, stage.reference, stage.expected]
 
 
-def reading(draw: Draw, now_s: float) -> Measurement:
-    """A measurement as the border lets it pass."""
-    return measurement(usual(), now_s).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
+def elapsed_s(draw: Draw) -> float:
+    """A time between two ticks, as `Stepper` bounds it."""
+    return min(draw.positive(PERIOD_S), LONGEST_S)
 
 
 def pid(stage: Pid, draw: Draw) -> object:
     stage.rest(draw.bounded(0.1), PERIOD_S)
-    return stage.update(
-        draw(0.1), draw(1.0), draw(0.1), min(draw.positive(PERIOD_S), LONGEST_S), draw.bounded(0.0) > 0.0
-    )
+    return stage.update(draw(0.1), draw(1.0), draw(0.1), elapsed_s(draw), draw.bounded(0.0) > 0.0)
 
 
 def reference(stages: list[Reference], draw: Draw) -> object:
-    now_s = draw.step(PERIOD_S)
-    to = target_of(plan(draw, now_s), now_s, 2e-3, 45.0, 95.0)
-    dt_s = min(draw.positive(PERIOD_S), LONGEST_S)
-    stages[0], *_ = follow(1600.0, stages[0], to, dt_s, Speeds(40.0, 38.0, 38.0), 45.0)
+    to = target_of(plan(draw), draw.now_s, 2e-3, 45.0, 95.0)
+    stages[0], *_ = follow(1600.0, stages[0], to, elapsed_s(draw), Speeds(40.0, 38.0, 38.0), 45.0)
     return stages[0]
 
 
 def motor(_: object, draw: Draw) -> object:
-    """Of what a configuration accepts."""
+    """Of what a configuration accepts: some of the keys are at an end of it."""
     if not draw.is_hostile:
         return []
-    ends: dict[str, Any] = {}
-    for name, least, usual_is, most in MOTORS:
-        if draw(1.0) != 1.0:
-            ends[name] = least if draw.steps % 2 else most
-        else:
-            ends[name] = usual_is
-    made = Motor(**ends)
+    ends = [
+        usual_is if draw(1.0) == 1.0 else (least if draw.steps % 2 else most)
+        for least, usual_is, most in MOTORS.values()
+    ]
+    made = Motor(**dict(zip(MOTORS, ends, strict=True)))
     return [*margins(made, Position(), PERIOD_S), full_speed_mm_s(made)]
 
 
-MOTORS = (
-    ("supply_V", 3.0, 12.0, 60.0),
-    ("resistance_ohm", 0.05, 2.2, 100.0),
-    ("inductance_mH", 0.01, 1.5, 100.0),
-    ("back_emf_V_s", 1e-4, 0.011, 1.0),
-    ("inertia_kg_m2", 1e-9, 8e-7, 1e-2),
-    ("gear_ratio", 1.0, 70.0, 1_000.0),
-    ("screw_lead_mm", 0.2, 8.0, 50.0),
-)
+MOTORS = {
+    "supply_V": (3.0, 12.0, 60.0),
+    "resistance_ohm": (0.05, 2.2, 100.0),
+    "inductance_mH": (0.01, 1.5, 100.0),
+    "back_emf_V_s": (1e-4, 0.011, 1.0),
+    "inertia_kg_m2": (1e-9, 8e-7, 1e-2),
+    "gear_ratio": (1.0, 70.0, 1_000.0),
+    "screw_lead_mm": (0.2, 8.0, 50.0),
+}
 
 
 def homing(stage: Homing, draw: Draw) -> object:
-    now_s = draw.step(PERIOD_S)
     mode = DeviceMode.HOMING if draw.steps % 8 else DeviceMode.IDLE
-    stage.update(now_s, measurement(draw, now_s).replaced(mode=mode))
+    stage.update(draw.now_s, measurement(draw).replaced(mode=mode))
     return [*stage.faults, *stage.went_back_mm]
 
 
 def opening(stage: Opening, draw: Draw) -> object:
-    now_s = draw.step(PERIOD_S)
     mode = DeviceMode.RETRACTING if draw.steps % 4 else DeviceMode.IDLE
-    seen = measurement(draw, now_s).replaced(mode=mode)
+    seen = measurement(draw).replaced(mode=mode)
     stage.update(seen, draw.steps % 3 > 0, draw.steps % 5 == 0, SafetyState().ask(DeviceRequest.RETRACT))
     return [*stage.faults, stage.left_late_s, stage.right_late_s, stage.waits_s]
 
 
 def watch(stage: Watch, draw: Draw) -> object:
-    now_s = draw.step(PERIOD_S)
-    seen, said, seeing = measured(draw, now_s), measurement(draw, now_s), Sight(PERIOD_S)
+    seen, said, seeing = measured(draw), measurement(draw), Sight(PERIOD_S)
     stage.update(PERIOD_S, seen, draw(80.0), draw(0.1), draw(0.1))
-    faults = stage.faults(now_s, SafetyState(), said, seen, seeing, None, draw(0.0))
-    return [*faults, *stage.limits(now_s, said, seen, seeing)]
+    faults = stage.faults(draw.now_s, SafetyState(), said, seen, seeing, None, draw(0.0))
+    return [*faults, *stage.limits(draw.now_s, said, seen, seeing)]
 
 
 # -- what several stages use ---------------------------------------------------------------------------------------
@@ -475,14 +452,12 @@ def tables(_: object, draw: Draw) -> object:
     ]
 
 
-def fields(_: object, draw: Draw) -> object:
-    field = core().element.field
-    return [field.field_mT(draw(80.0)), field.gap_mm(draw(200.0))]
+def field(stage: FieldOfGap, draw: Draw) -> object:
+    return [stage.field_mT(draw(80.0)), stage.gap_mm(draw(200.0))]
 
 
 def contact(stages: list[Any], draw: Draw) -> object:
-    now_s = draw.step(PLAN_S)
-    seen, asked = measured(draw, now_s), setpoint(draw, now_s)
+    seen, asked = measured(draw), setpoint(draw)
     return [[*each.planned(asked, seen), *each.motion_now(seen), each.is_known(seen)] for each in stages]
 
 
@@ -501,18 +476,16 @@ def search(stage: Any, draw: Draw) -> object:
 
 
 def link() -> DeviceLink:
-    made = DeviceLink(9.9)
-    made.receive(9.9, STATUS)
-    made.receive(9.9, Sense(0.1, 0.1, 0.6, 0.0))
+    """That runs."""
+    made = DeviceLink(BEGINS_S)
+    made.receive(BEGINS_S, Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, 1))
+    made.receive(BEGINS_S, Sense(0.1, 0.1, 0.6, 0.0))
     return made
-
-
-STATUS = Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, 1)
 
 
 def linked(stage: DeviceLink, draw: Draw) -> object:
     """One exchange, with times that repeat themselves and go back."""
-    now_s = draw.step(PERIOD_S)
+    now_s = draw.now_s
     if draw.steps % 20 == 0:
         stage.receive(now_s, Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), draw(23.0), draw(12.0), 0, 1))
     stage.receive(now_s, State(draw(-7.5), draw(-7.5), draw(now_s % 0.65536), draw.steps % 256))
@@ -530,8 +503,7 @@ def wire(_: object, draw: Draw) -> object:
 
 
 def clock(stage: DeviceClock, draw: Draw) -> object:
-    now_s = draw.step(0.6)
-    stage.add(now_s, draw(now_s))
+    stage.add(draw.now_s, draw(draw.now_s))
     return [stage.drift, stage.fit()]
 
 
@@ -567,41 +539,41 @@ def stages() -> list[Stage]:
     return [
         Stage("client: a setpoint's message", lambda: None, inbox),
         Stage("firmware_protocol: codec", lambda: None, wire),
-        Stage("hardware/link", link, linked, CODEC),
-        Stage("hardware/link_statistics", DeviceClock, clock, CODEC),
+        Stage("hardware/link", link, linked, CODEC, PERIOD_S),
+        Stage("hardware/link_statistics", DeviceClock, clock, CODEC, 0.6),
         Stage("safety/operating_state", lambda: [SafetyState()], safety),
-        Stage("Stepper", stepper, step),
-        Stage("Planner", planner, planning),
-        Stage("measure", lambda: Measure(47.5, 0.003, True, 8.0, PERIOD_S), measure, MEASUREMENT),
-        Stage("plausible", lambda: None, plausible, MEASUREMENT),
-        Stage("sight", lambda: Sight(PERIOD_S), sight, MEASUREMENT),
-        Stage("believe/believe", believe, believing, MEASUREMENT),
+        Stage("Stepper", stepper, step, OWN, PERIOD_S),
+        Stage("Planner", planner, planning, OWN, PLAN_S),
+        Stage("measure", lambda: Measure(47.5, 0.003, True, 8.0, PERIOD_S), measure, MEASUREMENT, PERIOD_S),
+        Stage("plausible", lambda: None, plausible, MEASUREMENT, PERIOD_S),
+        Stage("sight", lambda: Sight(PERIOD_S), sight, MEASUREMENT, PERIOD_S),
+        Stage("believe/believe", lambda: planner().believe, believing, MEASUREMENT, PLAN_S),
         Stage("believe/strength", lambda: Strength(0.5, BOUNDS, (True, True)), strength, MEASUREMENT),
         Stage("believe/slow_friction", partial(SlowFriction, BOUNDS), slow_friction, MEASUREMENT),
-        Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT),
+        Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT, PLAN_S),
         Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
         Stage("believe/sensor", partial(SensorTrust, BOUNDS), sensor, MEASUREMENT),
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
-        Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT),
-        Stage("believe/memory", memory, remembering, MEASUREMENT),
-        Stage("ask/governor", governor, governing),
+        Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT, PLAN_S),
+        Stage("believe/memory", lambda: planner().believe.memory, memory, MEASUREMENT, PLAN_S),
+        Stage("ask/governor", lambda: planner().governor, governor, OWN, PLAN_S),
         Stage("ask/forecast", Forecast, forecast, SETPOINT),
         Stage("ask/path", lambda: Path(made.portrait, 38.0), path),
         Stage("ask/skill", lambda: [Skill(0.0, 0.0)], skill, SETPOINT),
-        Stage("aim/aim", aim, aiming),
+        Stage("aim/aim", aim, aiming, OWN, PLAN_S),
         Stage("aim/floors", lambda: None, floors),
         Stage("aim/portrait", lambda: made.portrait, portrait),
-        Stage("move/carriages", carriages, driving),
+        Stage("move/carriages", carriages, driving, OWN, PERIOD_S),
         Stage("move/pid", lambda: Pid(position), pid),
-        Stage("move/reference", lambda: [Reference(80.0)], reference, PLANNED),
+        Stage("move/reference", lambda: [Reference(80.0)], reference, PLANNED, PERIOD_S),
         Stage("move/motor", lambda: None, motor, CONFIGURATION),
-        Stage("move/homing", lambda: Homing(2.6), homing, MEASUREMENT),
-        Stage("move/opening", lambda: Opening(CONFIG, made.scene), opening, MEASUREMENT),
-        Stage("move/watch", lambda: Watch(CONFIG, made.scene), watch, MEASUREMENT),
+        Stage("move/homing", lambda: Homing(2.6), homing, MEASUREMENT, PERIOD_S),
+        Stage("move/opening", lambda: Opening(CONFIG, made.scene), opening, MEASUREMENT, PERIOD_S),
+        Stage("move/watch", lambda: Watch(CONFIG, made.scene), watch, MEASUREMENT, PERIOD_S),
         Stage("filter", lambda: [0.0], filtered, MEASUREMENT),
         Stage("interpolation", lambda: None, tables),
-        Stage("field_of_gap", lambda: None, fields),
-        Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT),
+        Stage("field_of_gap", lambda: element.field, field),
+        Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT, PLAN_S),
         Stage("model/force_curve", lambda: None, curve),
         *[
             Stage(f"inverse: {name}", partial(build, named(name), range_mT, model, rises=True), search)
