@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from tormagd.assembly.build import build_core
+from tormagd.config import Config
 from tormagd.safety.operating_state import Event, OperatingState
 
 
@@ -29,19 +30,19 @@ def histories() -> ModuleType:
 
 
 def test_no_hostile_history_breaks_a_rule(histories: ModuleType) -> None:
-    histories.hostile(build_core(histories.CONFIG), Unseen(), episodes=270)
+    histories.hostile(build_core(Config()), Unseen(), episodes=270)
 
 
-def test_a_broken_rule_is_seen(histories: ModuleType) -> None:
-    core, config = build_core(histories.CONFIG), histories.CONFIG
+def test_a_broken_rule_is_seen(histories: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = Config()
+    core = build_core(config)
     weak = msgspec.structs.replace(config.position, duty_limit=0.01)
-    histories.CONFIG = msgspec.structs.replace(config, position=weak)
-    with pytest.raises(AssertionError, match="duties = "):
+    with monkeypatch.context() as patch, pytest.raises(AssertionError, match="duties = "):
+        patch.setattr(histories, "CONFIG", msgspec.structs.replace(config, position=weak))
         histories.hostile(core, Unseen())
-    histories.CONFIG, histories.DRIVEN = config, (OperatingState.PAUSED,)
-    with pytest.raises(AssertionError, match=r"mode=.* in "):
+    with monkeypatch.context() as patch, pytest.raises(AssertionError, match=r"mode=.* in "):
+        patch.setattr(histories, "DRIVEN", (OperatingState.PAUSED,))
         histories.hostile(core, Unseen())
-    histories.DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
-    del histories.WAYS[Event.ENABLE, OperatingState.DISABLED]
+    monkeypatch.delitem(histories.WAYS, (Event.ENABLE, OperatingState.DISABLED))
     with pytest.raises(AssertionError, match="enable was taken in DISABLED"):
         histories.hostile(core, Unseen())
