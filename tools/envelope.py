@@ -1,7 +1,7 @@
 """What the whole path does at the corners: handles x devices x forces x what setpoints may say, in virtual time.
 
     envelope.py [--quick] [--json] [--picture FILE.png]
-    envelope.py --models [--json] [--picture FILE.png]
+    envelope.py --models [--json]
 
 Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this
 device brakes with its gap open at this speed; *arrived* is 0.2 s after an ideal carriage would have. Devices are the
@@ -26,7 +26,7 @@ import numpy as np
 from rendering.device_draws import SAMPLES, SECOND, device, judging
 from rendering.following import VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
 from rendering.hands import HANDS
-from rendering.models import models, models_picture, models_table
+from rendering.models import models, models_table
 from tqdm import tqdm
 
 from tormagd.control.records import TimedSetpoint
@@ -298,8 +298,6 @@ def judge_models(options: argparse.Namespace) -> int:
     """The errors of every shipped model; 1 where one falls with the field anywhere in its box."""
     result = models()
     print(json.dumps(result) if options.json else models_table(result))
-    if options.picture is not None:
-        models_picture(options.picture, result)
     return 1 if any(row["not_rising_share"] > 0.0 for row in result["rows"]) else 0
 
 

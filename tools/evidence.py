@@ -77,7 +77,7 @@ PARTS = {
         "{peak_N:.2f} N at all, {settled_N:.3f} N off after 2 s of sliding, {low_hold_faults} faults below F_min",
     ),
     "models": Part(
-        "tools/envelope.py --models --json --picture docs/images/models.png",
+        "tools/envelope.py --models --json",
         "[every insert's model on devices](../guides/insert.md#the-shipped-models)",
         is_kept=True,
     ),
@@ -88,8 +88,9 @@ PARTS = {
         judges=False,
     ),
     "tracking": Part(
-        "tools/force_tracking.py samples draws staircase --json --picture docs/images/force_tracking.png",
-        "[the pulse, draws and staircase](../images/force_tracking.png)",
+        "tools/force_tracking.py samples draws staircase --json",
+        "the worst of {draws[0][count]} draws, RMS: {draws[0][worst_rms_N]:.4f} N with preview, "
+        "{draws[1][worst_rms_N]:.4f} N live; sample 1's staircase off by {staircase[rows][0][worst_N]:.4f} N at most",
         judges=False,
     ),
 }

@@ -1,6 +1,6 @@
 """How well a force is followed: the true force of simulated devices less what was asked, in virtual time.
 
-    force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--json] [--picture FILE.png]
+    force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--json]
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
 another, and of draws of the plant card. `drift` of the force sensor, and the `pulse` of `make run` as more is known, of
@@ -18,7 +18,6 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +35,7 @@ OF_DEVICES = {
     "speeds": cases.speeds,
     "pulse": cases.pulse,
 }
-OF_SIGNALS: dict[str, Callable[[Executor, cases.Kept], Any]] = {
+OF_SIGNALS: dict[str, Callable[[Executor], Any]] = {
     "samples": cases.samples,
     "draws": cases.draws,
     "staircase": cases.staircase,
@@ -45,10 +44,10 @@ OF_SIGNALS: dict[str, Callable[[Executor, cases.Kept], Any]] = {
 CASES = (*OF_DEVICES, "drift", *OF_SIGNALS)
 
 
-def measure(case: str, options: argparse.Namespace, pool: Executor, kept: cases.Kept) -> Any:
-    """One case; runs for the picture are added to `kept`."""
+def measure(case: str, options: argparse.Namespace, pool: Executor) -> Any:
+    """One case."""
     if case in OF_SIGNALS:
-        return OF_SIGNALS[case](pool, kept)
+        return OF_SIGNALS[case](pool)
     names = judging(options.draws)
     if case in ("drift", "pulse"):
         names = judging(0)
@@ -85,23 +84,17 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
     parser.add_argument("--drift-s", type=float, default=cases.DRIFT_S, help="how long a sensor drifts (%(default)g)")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--picture", type=Path, help="PNG of samples, staircase and draws")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()
     unknown = [case for case in options.cases if case not in CASES]
     if unknown:
         parser.error(f"{unknown[0]}: allowed are {', '.join(CASES)}")
     result: Json = {}
-    kept: cases.Kept = {}
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
         for case in options.cases or CASES:
-            result[case] = measure(case, options, pool, kept)
+            result[case] = measure(case, options, pool)
     told = {case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}
     print(json.dumps(result) if options.json else "\n".join(lines(told)))
-    if options.picture is not None:
-        from rendering.pictures import tracking_picture
-
-        tracking_picture(options.picture, kept, result)
     return 0
 
 

@@ -7,7 +7,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks.scenes import core_without, draw
+from benchmarks.scenes import core_without
 from matplotlib.figure import Figure
 from rendering.scene_runs import ROOT
 
@@ -16,7 +16,7 @@ from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_
 from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked
 
-PICTURE, TRADE = Path("images") / "scenes.png", Path("images") / "scene_trade.png"
+PICTURE = Path("images") / "scenes.png"
 DRAWN_S, DRAWN_HZ = 12.0, 100
 COLOURS = 10
 "Of Matplotlib, which then begins with them anew."
@@ -30,7 +30,6 @@ def main() -> int:
     (options.out / PICTURE).parent.mkdir(parents=True, exist_ok=True)
     (options.out / "scenes.md").write_text(page(), encoding="utf-8")
     draw_asked(options.out / PICTURE)
-    draw(measured().scenes, options.out / TRADE)
     return 0
 
 
@@ -46,10 +45,10 @@ def page() -> str:
         ),
         "*RMS* is of the true force on sample 1 while the device is learned, mN; **bold** where a scene is not met. "
         f"*Cost* is processor time of steps and plans, {file.build} core, beside a `machine_us` of "
-        f"{file.machine_us:g}: with all terms at 1,000 ticks and 500 plans a second, and with what was chosen.",
+        f"{file.machine_us:g}: with all terms at 1,000 ticks and 500 plans a second, and with what was chosen. "
+        "`tools/benchmark.py scenes --json` prints it.",
         f"![what the scenes ask for over time](<{PICTURE.as_posix()}>)",
         _terms(file.scenes),
-        _trade(file.scenes),
         _rates(file.scenes),
         _search(file.scenes),
     ]
@@ -125,24 +124,6 @@ def _terms(scenes: tuple[MeasuredScene, ...]) -> str:
         f"All terms run, whatever is required, in {', '.join(whole)}: they say so. What was asked once about single "
         "terms is answered in [a decision](decisions/0009-what-a-scene-requires.md).\n\n"
         + table(["scene", *(f"`{term}`" for term in TERMS)], rows)
-    )
-
-
-def _trade(scenes: tuple[MeasuredScene, ...]) -> str:
-    saved = {scene.name: scene.cost_full_us_s / scene.cost_us_s for scene in scenes if scene.left_out}
-    least = min(saved, key=lambda name: saved[name])
-    return (
-        "## The trade\n\n"
-        f"![error over processor time, a panel for each scene](<{TRADE.as_posix()}>)\n\n"
-        "A panel is a scene, a point one model of it: every term left out alone, every rate and every search, on "
-        "sample 1 while the device is learned. Left is cheaper, low is nearer to what was asked; the line joins the "
-        "models that no cheaper one equals, the green area is what rates and terms may be chosen within. The stars are "
-        "the thesis's search of 4 ms, 83 times a second, at 33 % of a core: with its network's 1.26 N on the tactile "
-        "element, and with its field error of 1.14 mT as force of the torque brake. `tools/benchmark.py scenes "
-        "[--json] [--plot FILE.png]` prints and draws it.\n\n"
-        f"The time falls {saved[least]:.1f} to {max(saved.values()):.1f} times, least for `{least}`: by slower rates, "
-        "and without `rate` and `forecast`, which works 100 times a second whatever the rates are. What the other "
-        "terms take is within the noise of a busy machine; they are out because the scene does not require them."
     )
 
 

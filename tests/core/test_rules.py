@@ -37,12 +37,14 @@ def test_a_broken_rule_is_seen(histories: ModuleType, monkeypatch: pytest.Monkey
     config = Config()
     core = build_core(config)
     weak = msgspec.structs.replace(config.position, duty_limit=0.01)
-    with monkeypatch.context() as patch, pytest.raises(AssertionError, match="duties = "):
+    with monkeypatch.context() as patch:
         patch.setattr(histories, "CONFIG", msgspec.structs.replace(config, position=weak))
-        histories.hostile(core, Unseen())
-    with monkeypatch.context() as patch, pytest.raises(AssertionError, match=r"mode=.* in "):
+        with pytest.raises(AssertionError, match="duties = "):
+            histories.hostile(core, Unseen())
+    with monkeypatch.context() as patch:
         patch.setattr(histories, "DRIVEN", (OperatingState.PAUSED,))
-        histories.hostile(core, Unseen())
+        with pytest.raises(AssertionError, match=r"mode=.* in "):
+            histories.hostile(core, Unseen())
     monkeypatch.delitem(histories.WAYS, (Event.ENABLE, OperatingState.DISABLED))
     with pytest.raises(AssertionError, match="enable was taken in DISABLED"):
         histories.hostile(core, Unseen())

@@ -19,9 +19,7 @@ DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 
 def drawn():
     """Every picture that is drawn from committed figures, and these."""
-    scenes = measured().scenes
-    yield "images/scenes.png", scenes
-    yield "images/scene_trade.png", scenes
+    yield "images/scenes.png", measured().scenes
     for path in sorted(DOCS.glob("evidence/*.json")):
         evidence = json.loads(path.read_text(encoding="utf-8"))
         for picture in DRAWN.findall(evidence["command"]):

@@ -52,9 +52,6 @@ from tormagd.scenes.scene import load_scene, terms_of
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-Kept = dict[str, Followed]
-"Runs that the picture shows, by part and device."
-
 STAIR_SCENE = "coronary"
 HIGH_N, LOW_N, ABOVE_N = 2.0, 0.7, 0.1
 "Steps begin at LOW_N, or ABOVE_N over what the open gap brakes where that is more."
@@ -290,7 +287,7 @@ def compared(found: Followed, best: Bound, start_s: float) -> Json:
     return figures(found.since(start_s)) | {name: least[name] for name in ("no_delay_rms_N", "foresight_rms_N")}
 
 
-def samples(pool: Executor, kept: Kept) -> Json:
+def samples(pool: Executor) -> Json:
     """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S;
     and the RMS error of the same core with carriages that lose no time."""
     rows, played, names = [], pulse_signal(PULSE_S), judging(0)
@@ -317,12 +314,10 @@ def samples(pool: Executor, kept: Kept) -> Json:
                 "limits": found.limits,
             }
         )
-        if preview_s:
-            kept[f"samples {name}"] = found
     return {"rows": rows}
 
 
-def draws(pool: Executor, _kept: Kept, count: int = EVEN_DRAWS) -> list[Json]:
+def draws(pool: Executor, count: int = EVEN_DRAWS) -> list[Json]:
     """The pulse on random devices, after TRIM_S: with preview, then live."""
     drawn, played = evenly_drawn(count), pulse_signal(DRAWN_PULSE_S)
     result = []
@@ -346,13 +341,12 @@ def draws(pool: Executor, _kept: Kept, count: int = EVEN_DRAWS) -> list[Json]:
     return result
 
 
-def staircase(pool: Executor, kept: Kept) -> Json:
+def staircase(pool: Executor) -> Json:
     """The coronary scene's staircase on the three samples: the level of each step over its last LEVEL_S."""
     rows = []
     signal = staircase_signal(build_core(Config(scene=STAIR_SCENE)).portrait.min_N)
     runs = [pool.submit(track, device(name), signal, STAIR_SCENE, 0.0) for name in SAMPLES]
     for name, run in zip(SAMPLES, runs, strict=True):
-        kept[f"staircase {name}"] = run.result()
         asked, levels = stair_levels(run.result())
         rows.append(
             {
@@ -378,7 +372,7 @@ def stair_levels(found: Followed) -> tuple[Array, Array]:
     return np.array(asked), np.array(levels)
 
 
-def signals(pool: Executor, _kept: Kept) -> Json:
+def signals(pool: Executor) -> Json:
     """The recorded signals and palpation on the three samples: those known ahead with preview, and all of them live."""
     folder = data_folder()
     if folder is None:

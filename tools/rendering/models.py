@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from rendering.device_draws import SAMPLES, device
-from rendering.pictures import OTHER, QUIET, RENDERED, THIRD
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.lab.arrays import Array, Json
-from tormagd.lab.pages import stamp, table
+from tormagd.lab.pages import table
 from tormagd.lab.training.metrics import force_metrics, not_rising_share
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.model_file import ForceModel, load_model
@@ -96,34 +95,3 @@ def brake_N(plant: PlantParameters, rates_mm_s: Array, gaps_mm: Array) -> Array:
     kinetic_N = brake_force_N(radial_moment_Tm(gaps_mm, plant), law, TORMAG)
     found: Array = kinetic_N * (1.0 + stribeck) + friction.viscous_N_s_mm * rates
     return found
-
-
-def models_picture(path: Path, result: Json) -> None:
-    """A line for each insert: the model's error on sample 1, and its bias on each device that judges, as a share of the
-    full force."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 6.5), layout="constrained")
-    axes, rows = figure.subplots(), result["rows"]
-    axes.axvline(0.0, color=QUIET, linewidth=0.8)
-    for place, row in enumerate(rows):
-        full = row["full_N"] / 100.0
-        worst = row["sample_1"]["worst_N"] / full
-        axes.barh(place, 2.0 * worst, left=-worst, height=0.6, color=RENDERED, alpha=0.8)
-        biases = {name: found["bias_N"] / full for name, found in row["devices"].items()}
-        for name, bias in biases.items():
-            colour = {"sample_2": OTHER, "sample_3": THIRD}.get(name, QUIET)
-            axes.plot(bias, place, "|", color=colour, markersize=11, markeredgewidth=2.0)
-    axes.set_yticks(range(len(rows)), [f"{row['insert']}, {row['full_N']:.1f} N: {row['model']}" for row in rows])
-    axes.invert_yaxis()
-    for label, colour in (
-        ("sample 1, worst", RENDERED),
-        ("sample 2, bias", OTHER),
-        ("sample 3", THIRD),
-        ("draws 100 to 119", QUIET),
-    ):
-        axes.plot([], [], "s", color=colour, label=label)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.1), ncols=4, frameon=False)
-    axes.set_xlabel("model less device, % of the full force: what devices differ by is learned from each in use")
-    axes.grid(axis="x", alpha=0.3)
-    figure.savefig(path, dpi=110, metadata=stamp(result))

@@ -1,9 +1,7 @@
-"""The pictures of forces that were followed: that of `make run`, and that of `force_tracking.py`."""
+"""The picture of `make run`."""
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -13,11 +11,8 @@ from tormagd.lab.arrays import Array
 from tormagd.lab.pages import stamp
 from tormagd.scenes.scene import Scene
 
-ASKED, RENDERED, OTHER, THIRD, QUIET = "#222222", "#d1495b", "#2a6f97", "#6a994e", "#8d99ae"
-SAMPLE_COLOURS = {"sample_1": RENDERED, "sample_2": OTHER, "sample_3": THIRD, "second": QUIET}
+ASKED, RENDERED, OTHER, QUIET = "#222222", "#d1495b", "#2a6f97", "#8d99ae"
 CLOSE_UP_S = 4.0
-SAMPLES_FROM_S = 12.0
-BAR_MN = 18.0
 
 
 def show_picture(path: Path, scene: Scene, shown: Shown, rehearsals: Rehearsals, figures: list[str]) -> None:
@@ -84,37 +79,6 @@ def _reversals(axes: Axes, moving: Followed) -> None:
     second = axes.twinx()
     second.fill_between(time_s, moving.handle_mm_s[part], color=QUIET, alpha=0.25, linewidth=0)
     second.set_ylabel("handle speed, mm/s (grey)", color=QUIET)
-
-
-def tracking_picture(path: Path, kept: dict[str, Followed], figures: dict[str, Any]) -> None:
-    """Writes a PNG of what was measured, stamped with its figures: the pulse on the samples, its error, the staircase,
-    the random devices; a part that was not measured is left empty."""
-    figure = Figure(figsize=(12, 7.5), layout="constrained")
-    axes = figure.subplots(2, 2)
-    figure.suptitle("Forces asked and truly rendered by simulated devices (synthetic)", fontsize=13)
-    for name, found in kept.items():
-        part, sample = name.split()
-        is_pulse, colour = part == "samples", SAMPLE_COLOURS[sample]
-        near = (found.time_s >= SAMPLES_FROM_S) & (found.time_s < SAMPLES_FROM_S + CLOSE_UP_S) | (not is_pulse)
-        forces = axes[0 if is_pulse else 1, 0]
-        if colour == RENDERED:
-            forces.plot(found.time_s[near], found.asked_N[near], color=ASKED, linewidth=2.2, label="asked")
-        forces.plot(found.time_s[near], found.rendered_N[near], color=colour, linewidth=1.0, label=sample)
-        if is_pulse:
-            axes[0, 1].plot(found.time_s[near], found.error_N[near] * 1e3, color=colour, linewidth=1.0)
-    _dress(axes[0, 0], "Measured human pulse, with preview, after 12 s of trim", "force at the roller, N")
-    _dress(axes[0, 1], "Its error", "rendered - asked, mN")
-    _dress(axes[1, 0], "Staircase of 0.1 N, coronary scene", "force at the roller, N")
-    for found in figures.get("draws", []):
-        rms_mN = np.sort([1e3 * row["rms_N"] for row in found["rows"]])
-        label = "with preview" if found["preview"] else "live"
-        axes[1, 1].plot(np.arange(1, len(rms_mN) + 1), rms_mN, "o", markersize=4, label=label)
-    axes[1, 1].axhline(BAR_MN, color=QUIET, linestyle=":", label=f"{BAR_MN:g} mN")
-    axes[1, 1].set_ylim(bottom=0.0)
-    axes[1, 1].legend(frameon=False, fontsize=8, loc="lower right")
-    _dress(axes[1, 1], "Random devices, after 10 s of trim", "RMS error, mN", "draws, each row sorted")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    figure.savefig(path, dpi=110, metadata=stamp(figures))
 
 
 def _dress(axes: Axes, title: str, quantity: str, horizontal: str = "time, s") -> None:
