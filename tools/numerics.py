@@ -37,7 +37,6 @@ import numpy as np
 from extremes.cases import DIGITS, Batch, draw_batch, reference
 from extremes.runs import became, counters, drawn_ends, summed
 from extremes.stages import Row, tried
-from extremes.steps import worst_step_errors
 from extremes.table import stages
 from extremes.tally import COUNTS, Tally
 from numpy.typing import NDArray
@@ -230,8 +229,7 @@ def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
     each = -(-references // devices)
     tally = Tally()
     with _pool(workers) as pool:
-        tasks = [pool.submit(worst_step_errors, seed, max(50, references // 10))]
-        tasks += [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
+        tasks = [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
         _wait(tasks, "physics")
     for task in tasks:
         tally.add(task.result())

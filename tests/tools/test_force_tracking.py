@@ -193,7 +193,7 @@ def test_levels_are_those_of_the_steps() -> None:
 
 def test_recorded_signals_are_in_the_devices_range(recordings) -> None:
     found = recorded_signals(recordings)
-    assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "tool", "haptic"}
+    assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "haptic"}
     for signal in found:
         assert np.all(np.diff(signal.time_s) > 0.0)
         assert 0.55 <= signal.force_N.min() <= signal.force_N.max() <= (2.0 if signal.kind is Kind.HAND else 1.75)
@@ -210,7 +210,7 @@ def test_a_palpation_touches_at_random_and_again_alike() -> None:
 
 def test_what_is_allowed_grows_with_what_the_ideal_carriages_miss() -> None:
     row = {"sd_N": 0.3, "no_delay_rms_N": 0.2, "foresight_rms_N": 0.1}
-    assert allowed_N(Kind.OTHER, "sample_1", True, row) is None
+    assert allowed_N(None, "sample_1", True, row) is None
     assert allowed_N(Kind.PULSE, "sample_1", False, row) == pytest.approx(math.hypot(0.26, 0.006))
     assert allowed_N(Kind.PULSE, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.015))
     assert allowed_N(Kind.HAND, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.01))

@@ -29,15 +29,14 @@ class Tally:
         """Errors of some cases; allowed is `plain`, or `well`, what rounding makes of the case, if that is more."""
         allowed = np.maximum(plain, well)
         worst = float(errors[allowed == plain].max(initial=0.0)), float((errors / allowed).max(initial=0.0))
-        self.raise_to((precision, quantity), Worst(*worst))
-
-    def raise_to(self, kind: tuple[str, str], worst: Worst) -> None:
-        """At least as much as this."""
-        mine = self.worst.get(kind, Worst())
-        self.worst[kind] = Worst(max(mine.error, worst.error), max(mine.over_allowed, worst.over_allowed))
+        self._raise_to((precision, quantity), Worst(*worst))
 
     def add(self, other: "Tally") -> None:
         """Merge another tally into this one."""
         self.counts.update(other.counts)
         for kind, worst in other.worst.items():
-            self.raise_to(kind, worst)
+            self._raise_to(kind, worst)
+
+    def _raise_to(self, kind: tuple[str, str], worst: Worst) -> None:
+        mine = self.worst.get(kind, Worst())
+        self.worst[kind] = Worst(max(mine.error, worst.error), max(mine.over_allowed, worst.over_allowed))

@@ -16,6 +16,7 @@ from rendering.device_draws import SAMPLES, device, evenly_drawn, judging
 from rendering.following import (
     FILE_PREVIEW_S,
     PREVIEW_S,
+    PUBLISHED_VALID_S,
     RATE_HZ,
     VALID_S,
     Followed,
@@ -256,7 +257,7 @@ def track(
     lead_s, start_s = float(approach_s[-1]), loop.now_s
     times = np.concatenate([approach_s[:-1], lead_s + signal.time_s])
     forces = np.concatenate([approach_N[:-1], signal.force_N])
-    publish = publisher(times + start_s, forces, preview_s, signal.valid_for_s)
+    publish = publisher(times + start_s, forces, preview_s, PUBLISHED_VALID_S)
     found = follow(loop, publish, float(times[-1]), start_s, lead_s)
     if found.faults:
         raise RuntimeError(f"{signal.name}: {', '.join(found.faults)} at {loop.now_s:.3f} s")
@@ -398,10 +399,10 @@ def signals(pool: Executor) -> Json:
     return {"rows": rows}
 
 
-def allowed_N(kind: Kind, plant: str, has_preview: bool, row: Json) -> float | None:
-    """The RMS error that a signal may have, by what the ideal carriages miss; None of other kinds, and of a hand that
+def allowed_N(kind: Kind | None, plant: str, has_preview: bool, row: Json) -> float | None:
+    """The RMS error that a signal may have, by what the ideal carriages miss; None of no kind, and of a hand that
     nobody foresees."""
-    if kind is Kind.OTHER or (kind is Kind.HAND and not has_preview):
+    if kind is None or (kind is Kind.HAND and not has_preview):
         return None
     ideal_N = row["foresight_rms_N" if has_preview else "no_delay_rms_N"]
     is_weak = kind is Kind.PULSE and plant == "sample_2"

@@ -38,7 +38,7 @@ VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2
 "Time between enabling and the first setpoint of a rehearsal."
-REHEARSED_VALID_S = 0.1
+PUBLISHED_VALID_S = 0.1
 BOUNDS = device_bounds(Config().trim)
 
 
@@ -225,7 +225,7 @@ def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Fol
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
     loop = armed(config, device_of(case.plant), parse_hand(case.hand), scene)
     start_s = loop.now_s + LEAD_IN_S
-    publish = publisher(times_s + start_s, forces_N, 0.0, REHEARSED_VALID_S)
+    publish = publisher(times_s + start_s, forces_N, 0.0, PUBLISHED_VALID_S)
     found = follow(loop, publish, LEAD_IN_S + float(times_s[-1]), start_s)
     if found.faults:
         raise RuntimeError(f"{case.label}: {', '.join(found.faults)} at {loop.now_s:.3f} s")

@@ -21,12 +21,8 @@ RATE_HZ = 500
 PULSE_S = 16.0
 "A recorded pulse is repeated up to this; the loops of `aac_nibp_pulse` end where they begin."
 LOW_PASS_HZ = 20.0
-ROLLER_M = 0.020
-TOOL_NM_PER_COUNT = 0.000039811
 HAPTIC_S = 40.0
 "Of the 98 s recorded."
-SHIFT_N = 0.6
-"Above the device's least force."
 SCALED_N = (0.62, 2.0)
 "From the shipped model's least force to the scenes' greatest."
 RISE_S = 0.1
@@ -44,7 +40,6 @@ class Kind(StrEnum):
 
     PULSE = "pulse"
     HAND = "hand"
-    OTHER = "other"
 
 
 class Signal(NamedTuple):
@@ -55,8 +50,7 @@ class Signal(NamedTuple):
     time_s: Array
     force_N: Array
     is_known_ahead: bool = True
-    valid_for_s: float = 0.1
-    kind: Kind = Kind.OTHER
+    kind: Kind | None = None
 
 
 def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
@@ -88,9 +82,7 @@ def recorded_signals(folder: Path) -> list[Signal]:
     return [
         *(_pulse(path, "finger pressure") for path in sorted((folder / "aac_nibp_pulse").glob("*.csv"))),
         *(_pulse(path, "arterial pressure") for path in sorted((folder / "wfdb_mimicdb").glob("*_ABP.csv"))),
-        *(_tool(path) for path in sorted((folder / "umn_mis_tool").glob("*.TXT"))),
         *(_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
-        *(_scaled_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
     ]
 
 
@@ -137,37 +129,13 @@ def _pulse(path: Path, what: str) -> Signal:
     )
 
 
-def _tool(path: Path) -> Signal:
-    raw = np.loadtxt(path, delimiter=",", comments="%", usecols=(0, 5))
-    count = len(raw)
-    force = np.abs(raw[:, 1]) * TOOL_NM_PER_COUNT / ROLLER_M
-    smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1_000.0, output="sos"), force)
-    time_s = np.arange(0.0, count / 1_000.0 - 0.5, 1.0 / RATE_HZ)
-    forces = np.interp(time_s, np.arange(count) / 1_000.0, smooth)
-    return Signal(f"tool torque {path.stem}", f"over 20 mm, not scaled, {LOW_PASS_HZ:g} Hz", time_s, forces)
-
-
 def _haptic(path: Path) -> Signal:
-    time_s, forces = _commands(path)
-    # live: sent when it came, nothing of it known before; over the recording's pauses the last one goes stale
-    return Signal(
-        f"haptic commands {path.stem}", f"|F| + {SHIFT_N:g} N, at its own times", time_s, SHIFT_N + forces, False, 0.25
-    )
-
-
-def _scaled_haptic(path: Path) -> Signal:
-    """The same hand, as a force that somebody sends who plays the file: straight lines between the commands."""
-    sent_s, sent_N = _commands(path)
+    """The commands of the first HAPTIC_S, as a force that somebody sends who plays the file: straight lines between."""
+    raw = np.loadtxt(path, delimiter=",", skiprows=1)
+    sent_s, first = np.unique(raw[:, 0], return_index=True)
+    sent_s, sent_N = sent_s[sent_s <= HAPTIC_S], np.linalg.norm(raw[first, 1:4], axis=1)[sent_s <= HAPTIC_S]
     least_N, most_N = SCALED_N
     scaled = least_N + (sent_N - sent_N.min()) / np.ptp(sent_N) * (most_N - least_N)
     time_s = np.arange(0.0, sent_s[-1], 1.0 / RATE_HZ)
     forces = np.interp(time_s, sent_s, scaled)
     return Signal(f"haptic scaled {path.stem}", f"|F| to {least_N}..{most_N} N", time_s, forces, kind=Kind.HAND)
-
-
-def _commands(path: Path) -> tuple[Array, Array]:
-    """Times, s, and forces, N, of the commands of the first HAPTIC_S."""
-    raw = np.loadtxt(path, delimiter=",", skiprows=1)
-    time_s, first = np.unique(raw[:, 0], return_index=True)
-    inside = time_s <= HAPTIC_S
-    return time_s[inside], np.linalg.norm(raw[first, 1:4], axis=1)[inside]
