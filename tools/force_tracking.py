@@ -1,14 +1,13 @@
 """How well a force is followed: the true force of simulated devices less what was asked, in virtual time.
 
-    force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--json]
+    force_tracking.py [CASE ...] [--draws N] [--json]
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
-another, and of draws of the plant card. `drift` of the force sensor, and the `pulse` of `make run` as more is known, of
-samples and second plant. How well signals are followed: that pulse on the `samples` and the second plant, and on random
-`draws`, 500 setpoints a second, with a preview of 70 ms and without; a `staircase`; recorded `signals` from the folder
-that TORMAG_DATA names, with 400 ms, as a publisher can that plays a file, and live. Beside them stands what ideal
-carriages miss (`bound.py`), and beside `samples` what the same core does with carriages that lose no time. Draws 40 to
-79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
+another, and of draws of the plant card. How well signals are followed: the pulse of `make run` on the `samples` and the
+second plant, and on random `draws`, 500 setpoints a second, with a preview of 70 ms and without; a `staircase`;
+recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a file, and live.
+Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does with carriages
+that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
 """
 
 import argparse
@@ -17,7 +16,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,7 +31,6 @@ OF_DEVICES = {
     "steps": cases.steps,
     "creep": cases.creep,
     "speeds": cases.speeds,
-    "pulse": cases.pulse,
 }
 OF_SIGNALS: dict[str, Callable[[Executor], Any]] = {
     "samples": cases.samples,
@@ -41,7 +38,7 @@ OF_SIGNALS: dict[str, Callable[[Executor], Any]] = {
     "staircase": cases.staircase,
     "signals": cases.signals,
 }
-CASES = (*OF_DEVICES, "drift", *OF_SIGNALS)
+CASES = (*OF_DEVICES, *OF_SIGNALS)
 
 
 def measure(case: str, options: argparse.Namespace, pool: Executor) -> Any:
@@ -49,10 +46,7 @@ def measure(case: str, options: argparse.Namespace, pool: Executor) -> Any:
     if case in OF_SIGNALS:
         return OF_SIGNALS[case](pool)
     names = judging(options.draws)
-    if case in ("drift", "pulse"):
-        names = judging(0)
-    run = partial(cases.drift, lasts_s=options.drift_s) if case == "drift" else OF_DEVICES[case]
-    found = tqdm(pool.map(run, names), desc=case, total=len(names), disable=not sys.stderr.isatty())
+    found = tqdm(pool.map(OF_DEVICES[case], names), desc=case, total=len(names), disable=not sys.stderr.isatty())
     return dict(zip(names, found, strict=True))
 
 
@@ -82,7 +76,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"any of {', '.join(CASES)}; default: all")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
-    parser.add_argument("--drift-s", type=float, default=cases.DRIFT_S, help="how long a sensor drifts (%(default)g)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()

@@ -1,12 +1,12 @@
 """Numbers at their extremes: the force law against 50 digits, every stage of the core fed with what is no number,
-configurations at their ends, clocks through their rollovers.
+configurations at their ends.
 
 `stages` has a row for each stage of the core: `cases`, steps with NaN, infinities, denormals, zeros, largest floats,
 time that stands or goes back, tables that do not rise; of them `refused` by name; `stated`, those after which a limit
 or a fault was told; `nonfinite`, numbers that came out; `swallowed`, steps with NaN of which nothing was said;
 `unnamed`, errors that name nothing. Of a stage with a `border` the cases are those that pass that check.
 `configurations`: each end of what is accepted, alone and in pairs, is `refused`, or it `ran` for `--seconds` in virtual
-time, or a fault or a refusal to enable was `stated`. `counters`: by how much a duty differs where a clock rolls over.
+time, or a fault or a refusal to enable was `stated`.
 `travelled` is what must be 0: all `nonfinite`, `swallowed`,
 `unnamed` and `wrong`.
 
@@ -35,7 +35,7 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 from extremes.cases import DIGITS, Batch, draw_batch, reference
-from extremes.runs import became, counters, drawn_ends, summed
+from extremes.runs import became, drawn_ends, summed
 from extremes.stages import Row, tried
 from extremes.table import stages
 from extremes.tally import COUNTS, Tally
@@ -197,17 +197,15 @@ def of_core(options: argparse.Namespace) -> dict[str, Any]:
     with _pool(options.workers) as pool:
         rows = [pool.submit(stage_row, place, options.episodes, options.seed) for place in range(len(stages()))]
         runs = [pool.submit(became, case, options.seconds) for case in cases]
-        clocks = pool.submit(counters)
-        _wait([*rows, *runs, clocks], "core")
-    told, ends, rolled = [row.result() for row in rows], summed([run.result() for run in runs]), clocks.result()
+        _wait([*rows, *runs], "core")
+    told, ends = [row.result() for row in rows], summed([run.result() for run in runs])
     travelled = sum(row.nonfinite + row.swallowed + row.unnamed for row in told) + ends["wrong"]
     return {
         "stage_cases": sum(row.cases for row in told),
         "travelled": travelled,
         "stages": [row._asdict() for row in told],
         "configurations": ends,
-        "counters": rolled,
-        "passed": travelled == 0 and rolled["passed"],
+        "passed": travelled == 0,
     }
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from extremes.runs import SAME_DUTY, Became, End, became, counters, drawn_ends, ends, summed
+from extremes.runs import Became, End, became, drawn_ends, ends, summed
 from extremes.stages import HOSTILE_STEPS, Draw, Row, Stage, leaves, tried
 from extremes.table import stages
 
@@ -145,9 +145,3 @@ def test_configurations_are_summed() -> None:
         "gain_margin_dB": [7.0, 9.0],
         "told": ["wrong: d", "stated: e"],
     }
-
-
-def test_a_rollover_changes_no_duty() -> None:
-    found = counters()
-    assert found["passed"]
-    assert 0.0 < max(found["duty"].values()) <= SAME_DUTY

@@ -154,13 +154,13 @@ def test_figures_are_printed_with_the_worst_device() -> None:
 
 def test_a_publisher_sends_what_follows() -> None:
     times, forces = np.arange(100) / 500, np.linspace(1.0, 2.0, 100)
-    publish = publisher(times + 3.0, forces, 0.02, 0.1)
+    publish = publisher(times + 3.0, forces, 0.02)
     assert publish(2.999) is None
     setpoint = publish(3.0101)
     assert setpoint.force_N == pytest.approx(forces[5])
     assert setpoint.preview_N == pytest.approx(forces[6:16])
     assert setpoint.preview_dt_s == 0.002
-    silent = publisher(times, forces, 0.0, 0.1)(0.1)
+    silent = publisher(times, forces, 0.0)(0.1)
     assert silent.preview_N == ()
 
 

@@ -36,7 +36,6 @@ def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
     assert found["travelled"] == 0
     assert found["stage_cases"] == sum(row["cases"] for row in found["stages"])
     assert found["configurations"]["cases"] == 1
-    assert found["counters"]["passed"]
     assert found["cases"] >= 20_000
     assert found["reference_cases"] >= 400
     assert found["nonfinite"] == found["misjudged"] == 0

@@ -21,7 +21,7 @@ import msgpack
 import numpy as np
 import zmq
 
-from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
+from benchmarks.loop import CONTROL_HZ, Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
 from tormagd.config import Config, RealTime
 from tormagd.daemon.endpoint import context
 from tormagd.daemon.realtime import prepare, priority_of_threads
@@ -39,7 +39,7 @@ LOST_S = 10.0
 ALLOWED_US = 250.0
 """From a setpoint to its frame p99 is to take no longer than the bare hop's of the same run, a control period, which it
 may just have missed, and this: the plan, the tick and the write."""
-PERIOD_US = 1e6 / Stand(RealTime()).control_hz
+PERIOD_US = 1e6 / CONTROL_HZ
 BELOW = 10
 "The measurement's own processes are this far below the daemon's real-time priority."
 

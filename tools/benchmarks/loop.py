@@ -6,8 +6,7 @@ eight clients, each of which asks for status again as soon as it is answered; th
 
 Processor time is that of the daemon with its threads and children; recording is on: a subscriber reads every tick. A
 tick is fresh whose measurement came since the tick before it. With `--against` the daemon of another checkout takes its
-turn, on its own simulated device: the protocol changes, too. `--control-hz 4000 --baud 4000000` is the fastest that
-`tormagd` takes; the device then has a priority just below the daemon's, because it stands for a machine of its own.
+turn, on its own simulated device: the protocol changes, too.
 """
 
 import argparse
@@ -31,8 +30,8 @@ import numpy as np
 import uvloop
 import zmq
 from machines.host import processor_s
-from machines.own import end, own_machine
-from machines.wire import carried
+from machines.own import own_machine
+from machines.processes import begun, first_line, is_linked
 
 from tormagd.config import Config, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
@@ -42,7 +41,6 @@ from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
 from tormagd.headroom.bare_timer import beat
 from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
-from tormagd.simulation.device import DEFAULT_BAUD
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request
@@ -52,12 +50,12 @@ TOOLS = Path(__file__).parents[1]
 LOG = "tormagd.log"
 "What the daemon says, in its folder."
 CLIENTS = 8
-SETPOINT_HZ = 500
+SETPOINT_HZ, CONTROL_HZ = 500, 1_000
+"Plans come in every control period."
+PATIENCE_S = 60.0
 STARTS_MS = 20_000
 "Until the first tick, at most."
 WARM_UP_S = 1.0
-BELOW = 5
-"The device's priority on a faster line is this far below the daemon's."
 TELEMETRY_EVERY = 20
 PLAN_QUANTILES = ("p50", "p99")
 COLUMNS = ("t_ns", "lateness_us", "exec_us", "received_s")
@@ -90,16 +88,11 @@ class Pair(NamedTuple):
 
 
 class Stand(NamedTuple):
-    """What is measured: scheduling, rates, the serial line, how often setpoints come, and of which checkout daemon
-    and device are. `device_fifo` is the device's own priority; it stands for a machine of its own."""
+    """What is measured: scheduling, how often setpoints come, and of which checkout daemon and device are."""
 
     realtime: RealTime
-    control_hz: int = 1_000
-    inference_hz: int = 1_000
-    baud: int = DEFAULT_BAUD
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
-    device_fifo: int = 0
 
 
 Running = tuple[Config, int]
@@ -160,15 +153,14 @@ def block(started: Started, seconds: float) -> Block:
         started(Path(folder)) as (config, pid),
         recording(config.endpoints) as recorder,
     ):
-        rate_hz = config.rates.control_hz
         stop = multiprocessing.Event()
         load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
         load.start()
         try:
             recorder.poll(STARTS_MS)
-            collect(recorder, WARM_UP_S, rate_hz)
+            collect(recorder, WARM_UP_S)
             started_s, before_s = time.monotonic(), processor_s(pid)
-            ticks = collect(recorder, seconds, rate_hz)
+            ticks = collect(recorder, seconds)
             share = (processor_s(pid) - before_s) / (time.monotonic() - started_s)
             plan_us = planned(config.endpoints.control)
         finally:
@@ -184,7 +176,7 @@ def recording(endpoints: Endpoints) -> Iterator["zmq.Socket[bytes]"]:
         yield opened(socket, endpoints.recording, keys_of(endpoints.curve))
 
 
-def collect(socket: "zmq.Socket[bytes]", seconds: float, rate_hz: int) -> Block:
+def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Block:
     """Reads tick rows for a while. Raises RuntimeError where there are none."""
     until_s = time.monotonic() + seconds
     rows: list[list[Any]] = []
@@ -195,14 +187,14 @@ def collect(socket: "zmq.Socket[bytes]", seconds: float, rate_hz: int) -> Block:
             rows.extend([None if column is None else row[column] for column in columns] for row in batch.rows)
     if len(rows) < 2:
         raise RuntimeError(f"no ticks within {seconds:g} s")
-    return as_block(rows, rate_hz)
+    return as_block(rows)
 
 
-def as_block(rows: list[list[Any]], rate_hz: int) -> Block:
+def as_block(rows: list[list[Any]]) -> Block:
     """The ticks, rows of COLUMNS; how many periods had none, and how many ticks knew of a new state."""
     lateness_us, exec_us, received_s = np.array([row[1:] for row in rows], dtype=np.float64).T
     spanned_s = (rows[-1][0] - rows[0][0]) * 1e-9
-    merged = max(0, round(spanned_s * rate_hz) + 1 - len(rows))
+    merged = max(0, round(spanned_s * CONTROL_HZ) + 1 - len(rows))
     fresh = int(np.count_nonzero(np.diff(received_s) > 0.0))
     return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
 
@@ -253,11 +245,8 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
     path = folder / "tormagd.toml"
     sockets = "".join(f'{name} = "ipc://{folder}/{name}"\n' for name in ENDPOINTS)
     realtime = stand.realtime
-    # an older checkout knows no options, and only the other line's rate needs one
-    options = "" if stand.baud == DEFAULT_BAUD else f"[device.options]\nbaud = {stand.baud}\n"
     path.write_text(
-        f'[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
-        f"[rates]\ncontrol_hz = {stand.control_hz}\ninference_hz = {stand.inference_hz}\n"
+        f'[device]\nport = "{port}"\n[endpoints]\n{sockets}[rates]\ninference_hz = {CONTROL_HZ}\n'
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
         f"lock_memory = {str(realtime.lock_memory).lower()}\n"
         f"cpus = {list(realtime.cpus)}\n"
@@ -270,28 +259,18 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
     with contextlib.ExitStack() as stack:
         theirs = environment(stand.root, folder)
-
-        def started(*command: str, **streams: Any) -> "subprocess.Popen[str]":
-            process = subprocess.Popen(command, env=theirs, text=True, **streams)
-            stack.callback(end, process)
-            return process
-
-        if stand.device_fifo:
-            stack.enter_context(carried(stand.device_fifo))
-        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud))
-        simulator = started(sys.executable, *device, stdout=subprocess.PIPE)
-        assert simulator.stdout is not None
-        path = write_config(folder, simulator.stdout.readline().strip(), stand)
+        start = partial(begun, stack, folder / LOG, environment=theirs)
+        path = write_config(folder, first_line(start(*own_machine(0, "tormagd.simulation", "--pty"))), stand)
         config = load_config(path)
-        with (folder / LOG).open("w") as log:
-            process = started(sys.executable, "-P", "-m", "tormagd.daemon.main", "--config", str(path), stderr=log)
-        wait_for(config.endpoints)
-        ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
+        process = start("-P", "-m", "tormagd.daemon.main", "--config", str(path), is_read=False)
+        with contextlib.closing(Client(config.endpoints, 1.0)) as client:
+            if not is_linked(client, process, PATIENCE_S):
+                raise RuntimeError("the daemon did not reach its device")
+        ctl = ("-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20")
         for word in ("home", "enable"):
-            subprocess.run([*ctl, word], check=True, capture_output=True, env=theirs)
+            subprocess.run([sys.executable, *ctl, word], check=True, capture_output=True, env=theirs)
         if stand.setpoint_hz:
-            pulse = ["send", "pulse", "--rate", str(stand.setpoint_hz), "--duration", "3600"]
-            started(*ctl, *pulse, stdout=subprocess.DEVNULL)
+            start(*ctl, "send", "pulse", "--rate", str(stand.setpoint_hz), "--duration", "3600", is_read=False)
         yield config, process.pid
 
 
@@ -356,17 +335,6 @@ async def _bare(config: Config) -> None:
     await beat(1_000_000_000 // config.rates.control_hz, publish, asyncio.Event())
 
 
-def wait_for(endpoints: Endpoints) -> None:
-    """Until the daemon answers and its device does."""
-    until_s = time.monotonic() + 60.0
-    with contextlib.closing(Client(endpoints, 1.0)) as client:
-        while time.monotonic() < until_s:
-            with contextlib.suppress(ClientError):
-                if client.request("status").get("link", {}).get("state") == "RUNNING":
-                    return
-    raise RuntimeError("the daemon did not reach its device")
-
-
 def add_realtime_arguments(parser: argparse.ArgumentParser) -> None:
     """What the kernel is asked for."""
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of what is measured; 0 for none")
@@ -392,8 +360,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_realtime_arguments(parser)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a block (%(default)s)")
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind (%(default)s)")
-    parser.add_argument("--control-hz", type=int, default=1_000, metavar="HZ", help="(%(default)s)")
-    parser.add_argument("--baud", type=int, default=DEFAULT_BAUD, help="of the device's line (%(default)s)")
     parser.add_argument(
         "--against", type=checkout, metavar="FOLDER", help="root of another checkout, measured in turns with this one"
     )
@@ -401,9 +367,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
-    realtime = realtime_settings(options)
-    below = 0 if options.baud == DEFAULT_BAUD else max(realtime.fifo_priority - BELOW, 0)
-    ours = Stand(realtime, options.control_hz, baud=options.baud, device_fifo=below)
+    ours = Stand(realtime_settings(options))
     theirs = ours._replace(root=options.against)
     pairs = [
         Pair(
@@ -413,4 +377,4 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         )
         for _ in range(options.pairs)
     ]
-    return summary(pairs, realtime) | {"control_hz": options.control_hz, "baud": options.baud}
+    return summary(pairs, ours.realtime)

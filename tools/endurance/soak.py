@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from machines.own import end
+from machines.processes import end
 from mcap.reader import make_reader
 from tqdm import tqdm
 

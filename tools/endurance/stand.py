@@ -4,7 +4,6 @@ import contextlib
 import os
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
-from machines.own import end, own_machine
+from machines.own import own_machine
+from machines.processes import begun, end, first_line
 from machines.wire import carried
 
 from tormagd.config import load_config
@@ -78,20 +78,13 @@ class Stand:
 
     def begin(self, *arguments: str) -> "subprocess.Popen[str]":
         """A Python of ours, what it says kept in the folder."""
-        log = self._stack.enter_context((self.folder / "log").open("a"))
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
-        child = subprocess.Popen(
-            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=log, text=True, env=environment
-        )
-        self._stack.callback(end, child)
-        return child
+        return begun(self._stack, self.folder / "log", *arguments, environment=os.environ | {"OMP_NUM_THREADS": "1"})
 
     def plug_in(self, transport: str) -> None:
         """Begins a device; a symbolic link to its line stands for the stable name that udev gives a real one."""
         simulated = ("--seed", "1", "--truth", str(self.folder / "truth.csv"))
         self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], *simulated))
-        assert self.device.stdout is not None
-        line, port = self.device.stdout.readline().strip(), self.folder / "device"
+        line, port = first_line(self.device), self.folder / "device"
         port.unlink(missing_ok=True)
         port.symlink_to(line)
 

@@ -1,7 +1,6 @@
-"""Whole runs for `numerics.py`: configurations at their ends, counters through where they roll over.
+"""Whole runs for `numerics.py`: configurations at their ends.
 
-A configuration is refused at the border, or it plans and steps the simulated device for a while. Times and counters are
-shifted to just before a rollover, and the core gives the same duties as without.
+A configuration is refused at the border, or it plans and steps the simulated device for a while.
 """
 
 import math
@@ -16,27 +15,19 @@ from extremes.stages import UNNAMED, leaves
 from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control.records import Duty, TimedSetpoint
-from tormagd.daemon.inbox import SetpointInbox
-from tormagd.hardware.measurement import Measurement
+from tormagd.control.records import TimedSetpoint
 from tormagd.safety.operating_state import Conditions, RefusedError
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
-from tormagd_client.messages import Setpoint, encode
 
 SCENE, PLANT = "coronary", "sample_1"
 SECTIONS = ("motor", "position", "trim", "limits", "rates", "device")
 OF_PLANT = (("encoder_counts_per_rev", 16, 1_000_000), ("supply_V", 3.0, 25.0))
 MAX_TOLD = 8
-READY = Conditions(True, True, True, False, False, None, 0.5)
-SHIFTED_S, BEFORE_S = 1.5, 0.7
-"A run that is repeated, and how long before the rollover it begins."
 SENT_HZ = 137.3
-"Setpoints a second: not in step with the forecast's grid, where the last digit of a stamp would decide."
-SAME_DUTY = 1e-4
-"A step of the wire: what a clock of coarser floats may change."
+READY = Conditions(True, True, True, False, False, None, 0.5)
 
 
 class End(NamedTuple):
@@ -118,7 +109,7 @@ def _built(case: tuple[End, ...]) -> tuple[Core, PlantParameters]:
 def _ran(core: Core, plant: PlantParameters, seconds: float) -> tuple[str, str]:
     if not all(map(math.isfinite, core.margins)):
         return "wrong", str(core.margins)
-    loop = _loop(core, plant)
+    loop = ClosedLoop(core.config, core.stepper(), core.planner(), VirtualDevice(plant, SteadyHand(), seed=1))
     try:
         loop.arm()
     except (RuntimeError, RefusedError) as error:
@@ -130,10 +121,6 @@ def _ran(core: Core, plant: PlantParameters, seconds: float) -> tuple[str, str]:
         if sample.safety.faults:
             return "stated", ", ".join(sample.safety.faults)
     return "ran", ""
-
-
-def _loop(core: Core, plant: PlantParameters) -> ClosedLoop:
-    return ClosedLoop(core.config, core.stepper(), core.planner(), VirtualDevice(plant, SteadyHand(), seed=1))
 
 
 def summed(found: list[Became]) -> dict[str, Any]:
@@ -153,87 +140,3 @@ def summed(found: list[Became]) -> dict[str, Any]:
 def _swinging(now_s: float) -> TimedSetpoint:
     at_s = math.floor(now_s * SENT_HZ) / SENT_HZ
     return TimedSetpoint(1.3 + 0.4 * math.sin(3.0 * at_s), at_s, 0.1)
-
-
-# -- counters ------------------------------------------------------------------------------------------------------
-
-ROLLOVERS = {
-    "device clock through 2^32 us": (2.0**32 * 1e-6, 0.0),
-    "device clock through 2^32 ms": (2.0**32 * 1e-3, 0.0),
-    "host clock through 2^32 us": (0.0, 2.0**32 * 1e-6),
-    "host clock through 2^53 ns": (0.0, 2.0**53 * 1e-9),
-    "both through 2^53 ns": (2.0**53 * 1e-9, 2.0**53 * 1e-9),
-}
-"Where the device's clock, s, and the host's roll over."
-STAMPS_NS = (2**53, 2**62, 2**63 - 1)
-"The last is the greatest that a setpoint may have."
-
-Recorded = list[tuple[float, Measurement | None, TimedSetpoint]]
-
-
-def counters() -> dict[str, Any]:
-    """Of each rollover the greatest difference of a duty, and of a setpoint's time on the host's clock, s."""
-    core = build_core(Config(scene=SCENE))
-    recorded = _recorded(core)
-    usual = _duties(core, recorded, 0.0, 0.0)
-    differences = {
-        name: max(
-            abs(one - other)
-            for ours, duty in zip(_duties(core, recorded, *_begin(*at)), usual, strict=True)
-            for one, other in ((ours.left_duty, duty.left_duty), (ours.right_duty, duty.right_duty))
-        )
-        for name, at in ROLLOVERS.items()
-    }
-    stamps = {f"stamps about {at_ns} ns": _stamp_difference_s(at_ns) for at_ns in STAMPS_NS}
-    is_same = max(differences.values()) <= SAME_DUTY and max(stamps.values()) <= 1e-9
-    return {"duty": differences, "stamp_s": stamps, "passed": is_same}
-
-
-def _begin(device_s: float, host_s: float) -> tuple[float, float]:
-    return (max(device_s - BEFORE_S, 0.0), max(host_s - BEFORE_S, 0.0))
-
-
-def _recorded(core: Core) -> Recorded:
-    """What a core was given in a run of SHIFTED_S, armed and with a force that swings."""
-    loop = _loop(core, load_plant(PLANT))
-    loop.arm()
-    return [(each.time_s, each.measurement, _swinging(each.time_s)) for each in loop.run(SHIFTED_S, _swinging)]
-
-
-def _duties(core: Core, recorded: Recorded, device_s: float, host_s: float) -> list[Duty]:
-    """The duties of a core that is given the same at another time of either clock."""
-    first_s, *_ = recorded[0]
-    stepper, planner = core.stepper(host_s + first_s), core.planner(host_s + first_s)
-    found: list[Duty] = []
-    for tick, (time_s, measurement, setpoint) in enumerate(recorded):
-        now_s = host_s + time_s
-        assert measurement is not None, "the device was armed"
-        shifted = measurement.replaced(
-            received_s=host_s + measurement.received_s,
-            sensed_s=host_s + measurement.sensed_s,
-            reported_s=host_s + measurement.reported_s,
-            device_time_s=device_s + measurement.device_time_s,
-        )
-        found.append(stepper.step(now_s, shifted, planner.planned))
-        if tick == 3 and stepper.measured is not None:
-            stepper.command("enable", now_s, READY)
-        if tick % 4 == 0:
-            planner.plan(now_s, setpoint.replaced(stamp_s=host_s + setpoint.stamp_s), stepper.measured)
-            planner.foresee()
-    return found
-
-
-def _stamp_difference_s(at_ns: int) -> float:
-    """By how much a setpoint's time differs from the same one's with small stamps; its number is as large."""
-    stamps_s = []
-    for base_ns in (10**9, at_ns - 10**7):
-        inbox = SetpointInbox()
-        for number in range(4):
-            ago_ns = 10**6 * (4 - number)
-            message = Setpoint(
-                v=1, source="a", seq=base_ns - ago_ns, stamp_ns=base_ns - ago_ns, servo_cf=1.0, valid_for_ms=100.0
-            )
-            inbox.take(encode(message), 5.0 - ago_ns * 1e-9 + 1e-3, base_ns - ago_ns + 10**6)
-        assert inbox.newest is not None, inbox.last_refusal
-        stamps_s.append(inbox.newest.stamp_s)
-    return abs(stamps_s[0] - stamps_s[1])

@@ -6,30 +6,15 @@ returns from a disk is later than the 50 ms after which a state is stale.
 """
 
 import runpy
-import signal
-import subprocess
 import sys
-from typing import Any
 
 from tormagd.config import RealTime
 from tormagd.daemon.realtime import prepare
-
-PATIENCE_S = 20.0
 
 
 def own_machine(priority: int, module: str, *arguments: str) -> list[str]:
     """What the interpreter is given to run `module` so."""
     return ["-P", __file__, str(priority), module, *arguments]
-
-
-def end(child: "subprocess.Popen[Any]", number: signal.Signals = signal.SIGTERM) -> int:
-    """Asks a process that we began for its orderly end, and kills it where that does not come; its exit code."""
-    child.send_signal(number)
-    try:
-        return child.wait(PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        return child.wait()
 
 
 if __name__ == "__main__":

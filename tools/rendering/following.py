@@ -38,7 +38,6 @@ VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2
 "Time between enabling and the first setpoint of a rehearsal."
-PUBLISHED_VALID_S = 0.1
 BOUNDS = device_bounds(Config().trim)
 
 
@@ -185,9 +184,9 @@ def asked_at(levels: Levels) -> Callable[[float], float]:
     return force_N
 
 
-def publisher(times_s: Array, forces_N: Array, preview_s: float, valid_for_s: float) -> Publisher:
+def publisher(times_s: Array, forces_N: Array, preview_s: float) -> Publisher:
     """Each force at its time; with a preview, what follows it up to `preview_s` in even steps."""
-    live = stream(times_s, forces_N, valid_for_s)
+    live = stream(times_s, forces_N)
     period_s = 1.0 / RATE_HZ
     ahead_s = period_s * np.arange(1, round(preview_s / period_s) + 1)
     if not ahead_s.size:
@@ -225,7 +224,7 @@ def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Fol
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
     loop = armed(config, device_of(case.plant), parse_hand(case.hand), scene)
     start_s = loop.now_s + LEAD_IN_S
-    publish = publisher(times_s + start_s, forces_N, 0.0, PUBLISHED_VALID_S)
+    publish = publisher(times_s + start_s, forces_N, 0.0)
     found = follow(loop, publish, LEAD_IN_S + float(times_s[-1]), start_s)
     if found.faults:
         raise RuntimeError(f"{case.label}: {', '.join(found.faults)} at {loop.now_s:.3f} s")

@@ -41,7 +41,6 @@ APPROACH_S = 2.0
 OPEN_MM = 0.1
 "So near its open end a gap is open: too much force there is the device's, and no error of any model."
 TIMED_S, ROUNDS = 1.0, 7
-VALID_S = 0.1
 
 
 class Begun(NamedTuple):
@@ -170,7 +169,7 @@ class Play:
         if signal.setpoint_hz is not msgspec.UNSET and signal.setpoint_hz < case.inference_hz:
             sent_s = np.arange(times[0], times[-1], 1.0 / signal.setpoint_hz)
             times, forces = sent_s, np.interp(sent_s, times, forces)
-        self.publish = publisher(times, forces, FILE_PREVIEW_S if signal.is_known_ahead else 0.0, VALID_S)
+        self.publish = publisher(times, forces, FILE_PREVIEW_S if signal.is_known_ahead else 0.0)
 
     def ticks(self, seconds: float) -> Iterable[tuple[float, ClosedLoop]]:
         """The loop after each tick, with the time in the signal, from the approach to `seconds` after LEARN_S."""

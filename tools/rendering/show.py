@@ -13,13 +13,13 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from machines.host import Host, HostWatch, processor_s
-from machines.own import end, own_machine
+from machines.own import own_machine
+from machines.processes import begun, end, first_line, is_linked
 from machines.wire import carried
 
 from rendering.following import RATE_HZ, Tracking, tracking
@@ -189,26 +189,32 @@ def play(watched: HostWatch, duration_s: float, scene: str, plant: str) -> Cours
     codes: dict[str, int] = {}
     truth = str(RUN_DIR / "truth.csv")
     with contextlib.ExitStack() as stack:
+
+        def start(name: str, *arguments: str, is_read: bool = False) -> "subprocess.Popen[str]":
+            return begun(stack, RUN_DIR / f"{name}.log", *arguments, is_read=is_read)
+
         options = ("--pty", "--plant", plant, "--seed", "1", "--truth", truth)
-        device = own_machine(DEVICE_FIFO, "tormagd.simulation", *options)
-        simulator = stack.enter_context(process("simulator", *device, is_read=True))
-        assert simulator.stdout is not None
-        port = simulator.stdout.readline().strip()
+        simulator = start("simulator", *own_machine(DEVICE_FIFO, "tormagd.simulation", *options), is_read=True)
+        port = first_line(simulator)
         if not port:
             raise ended("simulator")
         watched.wait_for("simulated device", simulator.pid)
         config = RUN_DIR / "tormagd.toml"
         config.write_text(CONFIG.format(port=port, scene=scene))
-        daemon = stack.enter_context(process("tormagd", "-m", "tormagd.daemon.main", "--config", str(config)))
+        daemon = start("tormagd", "-m", "tormagd.daemon.main", "--config", str(config))
         watched.wait_for("daemon", daemon.pid)
         # from the first tick on: it also says how a show went that ended early
-        recorder = stack.enter_context(process("recorder", *CTL, "record", str(RECORDING)))
+        recorder = start("recorder", *CTL, "record", str(RECORDING))
         client = stack.enter_context(Client.local(ADDRESS.format("").removeprefix("ipc://").rstrip("/"), ANSWER_S))
-        wait_for_link(daemon, client)
+        if not is_linked(client, daemon, PATIENCE_S):
+            if daemon.poll() is not None:
+                raise ended("tormagd")
+            cause = f"the daemon did not reach its device within {PATIENCE_S:.0f} s"
+            raise ShowError(cause, f"look at the logs in {RUN_DIR}", is_of_time=True)
         arm(client)
         before, start_s, before_s = status(client), time.monotonic(), processor_s(daemon.pid)
         robot = own_machine(PUBLISHER_FIFO, *CTL[1:], "send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ))
-        publisher = stack.enter_context(process("publisher", *robot, is_read=True))
+        publisher = start("publisher", *robot, is_read=True)
         limits = watch(publisher, daemon, client, duration_s)
         printed, _ = publisher.communicate(timeout=PATIENCE_S)
         after, end_s = status(client), time.monotonic()
@@ -273,41 +279,12 @@ def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
     return latched_s, float(np.quantile(spacings_s, FASTEST)) if len(spacings_s) else 0.0
 
 
-@contextlib.contextmanager
-def process(name: str, *arguments: str, is_read: bool = False) -> Iterator["subprocess.Popen[str]"]:
-    """A Python child whose messages go to a log file; told to end, then killed, if it is still there at the end."""
-    with (RUN_DIR / f"{name}.log").open("w") as log:
-        child = subprocess.Popen(
-            [sys.executable, *arguments], stdout=subprocess.PIPE if is_read else log, stderr=log, text=True
-        )
-        try:
-            yield child
-        finally:
-            if child.poll() is None:
-                end(child)
-
-
 def ended(name: str) -> ShowError:
     """A process that is gone, by the last line of its log."""
     log = RUN_DIR / f"{name}.log"
     lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
     said = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
     return ShowError(f"the process {name} ended by itself: {said[:200]}", f"all that it said is in {log}")
-
-
-def wait_for_link(daemon: "subprocess.Popen[str]", client: Client) -> None:
-    """Until the link to the device runs. Raises ShowError."""
-    until_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < until_s:
-        if daemon.poll() is not None:
-            raise ended("tormagd")
-        with contextlib.suppress(ClientError):
-            if client.request("status").get("link", {}).get("state") == "RUNNING":
-                return
-        time.sleep(0.1)
-    raise ShowError(
-        f"the daemon did not reach its device within {PATIENCE_S:.0f} s", f"look at the logs in {RUN_DIR}", True
-    )
 
 
 def arm(client: Client) -> None:

@@ -1,0 +1,56 @@
+"""Processes of ours: begun with a log, waited for, and ended."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from tormagd_client import Client, ClientError
+
+PATIENCE_S, LOOK_S = 20.0, 0.05
+
+
+def begun(
+    stack: contextlib.ExitStack,
+    log: Path,
+    *arguments: str,
+    is_read: bool = True,
+    environment: dict[str, str] | None = None,
+) -> "subprocess.Popen[str]":
+    """A Python that ends with the stack; what it says on stderr is added to the log, and what it prints, unless that
+    `is_read`: a pipe that nobody reads is full some time."""
+    with log.open("a") as said:
+        stdout = subprocess.PIPE if is_read else said
+        child = subprocess.Popen([sys.executable, *arguments], stdout=stdout, stderr=said, text=True, env=environment)
+    stack.callback(end, child)
+    return child
+
+
+def first_line(child: "subprocess.Popen[str]") -> str:
+    """What it prints first, as a simulated device its port; empty where it ended before."""
+    assert child.stdout is not None
+    return child.stdout.readline().strip()
+
+
+def is_linked(client: Client, daemon: "subprocess.Popen[str]", patience_s: float) -> bool:
+    """Waits until the daemon has its device; whether it came to that."""
+    until_s = time.monotonic() + patience_s
+    while time.monotonic() < until_s and daemon.poll() is None:
+        with contextlib.suppress(ClientError):
+            if client.request("status").get("link", {}).get("state") == "RUNNING":
+                return True
+        time.sleep(LOOK_S)
+    return False
+
+
+def end(child: "subprocess.Popen[Any]", number: signal.Signals = signal.SIGTERM) -> int:
+    """Asks a process for its orderly end, and kills it where that does not come; its exit code."""
+    child.send_signal(number)
+    try:
+        return child.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        return child.wait()
