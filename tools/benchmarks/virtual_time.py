@@ -34,61 +34,48 @@ SETPOINT_HZ = 500
 MEAN_N, SWING_N, PULSE_HZ = 1.2, 0.3, 1.2
 STRETCH_TICKS = 100
 BUILDS = ("compiled", "interpreted")
-LOOPS = ("whole_core", "position_loop")
-
-Run = Callable[[int], None]
-
-
-def force_loop(config: Config, plant: str) -> Run:
-    """Runs so many ticks of the whole core, asked for a pulse without end."""
-    loop = armed_loop(config, plant)
-    times_s = np.arange(0.0, 600.0, 1.0 / SETPOINT_HZ)
-    setpoint = stream(times_s, MEAN_N + SWING_N * np.sin(2.0 * np.pi * PULSE_HZ * times_s))
-
-    def run(ticks: int) -> None:
-        for _ in range(ticks):
-            loop.tick(setpoint(loop.now_s))
-
-    return run
+LASTS_S = 600.0
+"Of the pulse: longer than anybody measures."
+TIMES_S = np.arange(0.0, LASTS_S, 1.0 / SETPOINT_HZ)
+PULSE = stream(TIMES_S, MEAN_N + SWING_N * np.sin(2.0 * np.pi * PULSE_HZ * TIMES_S))
 
 
-def gap_loop(config: Config, plant: str) -> Run:
-    """Runs so many ticks of the position loop alone, asked for a step of the gap every 0.1 s."""
-    loop = armed_loop(config, plant)
-
-    def run(ticks: int) -> None:
-        for _ in range(ticks):
-            gap_mm = START_MM + STEP_MM * (int(loop.now_s * 10.0) % 2)
-            loop.tick(plan=hold(gap_mm, loop.now_s))
-
-    return run
+def whole_core(loop: ClosedLoop) -> None:
+    """One tick, asked for a pulse without end."""
+    loop.tick(PULSE(loop.now_s))
 
 
-def armed_loop(config: Config, plant: str) -> ClosedLoop:
-    """Homed and enabled."""
-    core = build_core(config)
-    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(plant), SteadyHand(), seed=1))
-    loop.arm()
-    return loop
+def position_loop(loop: ClosedLoop) -> None:
+    """One tick without plans, asked for a step of the gap every 0.1 s."""
+    gap_mm = START_MM + STEP_MM * (int(loop.now_s * 10.0) % 2)
+    loop.tick(plan=hold(gap_mm, loop.now_s))
 
 
-RUNS: dict[str, Run] = {}
-"Of a process that is measured: its loops."
+LOOPS = {"whole_core": whole_core, "position_loop": position_loop}
+ARMED: dict[str, ClosedLoop] = {}
+"Of a process that is measured."
 Build = tuple[bool, Callable[[str, int], float]]
 """Whether a build is compiled, and how it is asked for the processor time of a tick of a loop over so many, us."""
 
 
-def make_loops(plant: str) -> None:
+def arm_loops(plant: str) -> None:
     """In a process that is measured, before all else."""
-    RUNS.update(whole_core=force_loop(Config(), plant), position_loop=gap_loop(Config(), plant))
+    config = Config()
+    core = build_core(config)
+    for name in LOOPS:
+        device = VirtualDevice(load_plant(plant), SteadyHand(), seed=1)
+        ARMED[name] = ClosedLoop(config, core.stepper(), core.planner(), device)
+        ARMED[name].arm()
     gc.collect()
     gc.freeze()  # what was imported is no garbage; a daemon does the same
 
 
-def tick_us(loop: str, ticks: int) -> float:
+def tick_us(name: str, ticks: int) -> float:
     """In a process that is measured: the processor time of a tick of a loop over so many, us."""
+    loop, tick = ARMED[name], LOOPS[name]
     started_s = time.thread_time()
-    RUNS[loop](ticks)
+    for _ in range(ticks):
+        tick(loop)
     return (time.thread_time() - started_s) / ticks * 1e6
 
 
@@ -97,7 +84,7 @@ def build(plant: str, switch: str | None = None) -> Iterator[Build]:
     """One build in a process of its own; `switch` is TORMAG_COMPILED. Raises BrokenProcessPool where its loops cannot
     be made."""
     switched = {} if switch is None else {SWITCH: switch}
-    with ProcessPoolExecutor(1, get_context("spawn"), make_loops, (plant,)) as process:
+    with ProcessPoolExecutor(1, get_context("spawn"), arm_loops, (plant,)) as process:
         with mock.patch.dict(os.environ, switched):  # what the process begins with
             is_compiled = process.submit(settle).result().is_compiled
         yield is_compiled, lambda loop, ticks: process.submit(tick_us, loop, ticks).result()
