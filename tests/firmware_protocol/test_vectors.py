@@ -84,6 +84,7 @@ def test_the_examples_of_the_readme_are_true() -> None:
         r"```frame\n([0-9a-f ]+)\n```\n\n\| bytes \| meaning \|\n\| --- \| --- \|\n((?:\|.*\n)+)", PAGE
     )
     open_ends = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+    whole = re.findall(r"^\| (?:host|device): (\w+), sequence (\d+),.* \| `([0-9a-f ]+)` \|$", PAGE, re.MULTILINE)
     shown: tuple[tuple[int, Message], ...] = (
         (42, Drive(left_duty=0.125, right_duty=0.1234, mode=DriveMode.RUN, counter=200)),
         (42, State(left_position_mm=-12.0, right_position_mm=-12.1, device_time_s=0.25, counter=0)),
@@ -92,7 +93,10 @@ def test_the_examples_of_the_readme_are_true() -> None:
         (60, Home(nonce=1)),
         (93, Status(DeviceMode.HOMING, open_ends, DeviceFault(0), 25.0, 12.0, drive_counter=44, command_nonce=1)),
     )
-    for (line, rows), (sequence, message) in zip(examples, shown, strict=True):
+    for (name, number, line), (sequence, message) in zip(whole, shown[3:], strict=True):
+        assert (name, int(number)) == (type(message).__name__, sequence)
+        assert bytes.fromhex(line) == encode_frame(FUNCTION[type(message)], sequence, encode(message))
+    for (line, rows), (sequence, message) in zip(examples, shown[:3], strict=True):
         assert bytes.fromhex(line) == encode_frame(FUNCTION[type(message)], sequence, encode(message))
         assert f"function {FUNCTION[type(message)]}, {type(message).__name__} |" in rows
         assert " ".join(re.findall(r"^\| `([0-9a-f ]+)` \|", rows, re.MULTILINE)) == line
@@ -100,7 +104,7 @@ def test_the_examples_of_the_readme_are_true() -> None:
 
 def test_the_crcs_of_the_readmes_examples_are_over_what_it_says() -> None:
     checked = re.findall(r"^\| `([0-9a-f ]+)` \| CRC-(8|16) over `([0-9a-f ]+)` \|$", PAGE, re.MULTILINE)
-    assert len(checked) == 4
+    assert len(checked) == 3
     for crc, width, data in checked:
         expected = bitwise_crc8 if width == "8" else bitwise_crc16
         assert int.from_bytes(bytes.fromhex(crc), "big") == expected(bytes.fromhex(data))
