@@ -2,7 +2,7 @@
 
 import faults
 import pytest
-from fault_matrix.cases import CAN, MATRIX, OPENS, SERIAL, STAYS, Injection
+from fault_matrix.cases import CAN, MATRIX, OPENS, SERIAL, Injection
 from fault_matrix.recovery import recover
 
 from tormagd.scenes.scene import load_scene
@@ -46,21 +46,49 @@ SAMPLED = (
     "homing: left motor wired the wrong way",
     "from the start: wrong CRC-8 in State",
 )
+ON_A_BUS_TOO = (
+    "daemon killed or cable cut",
+    "wrong CRC-8 in State",
+    "5% of the frames lost",
+    "20% of the frames overtaken",
+    "round trip of 15 ms",
+    "from the start: wrong CRC-8 in State",
+)
+"""What is done to frames, and silence; behind the line both buses are one."""
 SAMPLED_S = 3.0
 """How long a fault is watched here: the slowest gap is open after 2.2 s. `tools/faults.py` watches all for longer."""
+JUDGED_S = 1.5
+"""How long where the judge is judged: one gap is open by then, the other has not moved."""
+
+
+def is_let_go_by_the_daemon(item: Injection) -> bool:
+    """At the scene's own rate, in a core that runs."""
+    return item.host in ("stale", "other") or item.publisher == "nan"
+
+
+def fastest_plant(item: Injection) -> str:
+    """The device that loses the force fastest."""
+    return "sample_2" if is_let_go_by_the_daemon(item) else "sample_3"
 
 
 def within_N_s(item: Injection) -> float:
     """How fast the force may be lost."""
     force = load_scene("coronary").force
     # the carriages may have been behind the ramp, and catch up: half as fast again
-    return 1.5 * force.release_N_s if item.host in ("stale", "other") else force.most_release_N_s
+    return 1.5 * force.release_N_s if is_let_go_by_the_daemon(item) else force.most_release_N_s
 
 
-@pytest.mark.parametrize(("plant", "bus"), [("sample_2", SERIAL), ("sample_3", CAN)])
-@pytest.mark.parametrize("item", [item for item in MATRIX if item.name in SAMPLED], ids=lambda item: item.name)
-def test_a_fault_is_named_and_ends_safe_and_not_at_once(item: Injection, plant: str, bus: str) -> None:
-    _, cell = faults.inject(item, plant, bus, SAMPLED_S)
+@pytest.mark.parametrize(
+    ("item", "bus"),
+    [
+        pytest.param(item, bus, id=f"{item.name}-{bus}")
+        for item in MATRIX
+        for bus in (SERIAL, CAN)
+        if item.name in (SAMPLED if bus == SERIAL else ON_A_BUS_TOO)
+    ],
+)
+def test_a_fault_is_named_and_ends_safe_and_not_at_once(item: Injection, bus: str) -> None:
+    _, cell = faults.inject(item, fastest_plant(item), bus, SAMPLED_S)
     assert (cell.bus, cell.fault) == (bus, item.name)
     assert cell.named, cell
     assert cell.safe, cell
@@ -72,18 +100,9 @@ def test_a_fault_is_named_and_ends_safe_and_not_at_once(item: Injection, plant: 
         assert cell.below_1N_ms < 1_000.0
 
 
-@pytest.mark.parametrize(
-    ("item", "plant"),
-    [
-        pytest.param(item, plant, id=f"{item.name}-{plant}")
-        for item in DRIVEN
-        for plant in ("sample_2", "sample_3")
-        # a force that goes on is not lost: one sample is enough
-        if item.name not in SAMPLED and (plant == "sample_2" or item.safe in (OPENS, STAYS))
-    ],
-)
-def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection, plant: str) -> None:
-    rig, watch = faults.spoiled(item, plant, item.buses[0])
+@pytest.mark.parametrize("item", [item for item in DRIVEN if item.name not in SAMPLED], ids=lambda item: item.name)
+def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection) -> None:
+    rig, watch = faults.spoiled(item, fastest_plant(item), item.buses[0])
     for sample in rig.run(SAMPLED_S):
         watch.see(sample)
         if watch.is_open:
@@ -94,35 +113,36 @@ def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection, plant: s
 def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None:
     """The judge has to be able to say no."""
     (stuck,) = (item for item in MATRIX if item.name == "left encoder stuck")
-    _, unnamed = faults.inject(stuck._replace(names=("SENSOR",), within_ms=10.0), "sample_1", watched_s=SAMPLED_S)
+    _, unnamed = faults.inject(stuck._replace(names=("SENSOR",), within_ms=10.0), "sample_1", watched_s=JUDGED_S)
     assert (unnamed.named, unnamed.safe, unnamed.in_time) == (False, True, False)
     (supply,) = (item for item in MATRIX if item.name == "motor supply fails")
-    _, unsafe = faults.inject(supply._replace(safe=OPENS), "sample_1", watched_s=SAMPLED_S)
+    _, unsafe = faults.inject(supply._replace(safe=OPENS), "sample_1", watched_s=JUDGED_S)
     assert (unsafe.named, unsafe.safe) == (True, False)
 
 
 RECOVERED = (
     # a sensor is doubted until it agrees with the device, which is as it was
-    ("force sensor reads nothing", SERIAL, "clear-fault, enable refused: sensor_doubted", ("enable",)),
+    ("force sensor reads nothing", "clear-fault, enable refused: sensor_doubted", ("enable",)),
     # what the device has latched comes back while its cause stands
-    ("device too hot", CAN, "clear-fault, DEVICE_TEMPERATURE again", ("clear-fault", "home", "enable")),
-    ("handle's encoder lost", SERIAL, "HANDLE_LOST still told", ()),
+    ("device too hot", "clear-fault, DEVICE_TEMPERATURE again", ("clear-fault", "home", "enable")),
+    ("handle's encoder lost", "HANDLE_LOST still told", ()),
 )
 
 
-@pytest.mark.parametrize(("name", "bus", "tried", "recovery"), RECOVERED, ids=str)
+@pytest.mark.parametrize(("name", "tried", "recovery"), RECOVERED, ids=str)
 def test_what_leads_out_of_a_fault_does_so_when_its_cause_has_gone(
-    name: str, bus: str, tried: str, recovery: tuple[str, ...]
+    name: str, tried: str, recovery: tuple[str, ...]
 ) -> None:
     (injection,) = (item for item in MATRIX if item.name == name)
-    cell = faults.try_out(injection, "sample_1", bus)
+    rig, cell = faults.inject(injection, "sample_1", watched_s=SAMPLED_S)
+    cell = recover(rig, injection, cell)
     assert (cell.tried, cell.recovery, cell.recovered) == (tried, recovery, True)
 
 
 def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.MonkeyPatch) -> None:
     """The judge has to be able to say no here, too."""
     (injection,) = (item for item in MATRIX if item.name == "device too hot")
-    rig, cell = faults.inject(injection, "sample_1")
+    rig, cell = faults.inject(injection, "sample_1", watched_s=JUDGED_S)
     monkeypatch.setattr(rig, "mend", lambda: None)
     assert not recover(rig, injection, cell).recovered
 
@@ -130,5 +150,5 @@ def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.Mo
 def test_names_are_codes_and_faults_stand_once() -> None:
     names = [injection.name for injection in MATRIX]
     assert len(set(names)) == len(names)
-    assert set(SAMPLED) <= set(names)
+    assert set(ON_A_BUS_TOO) <= set(SAMPLED) <= set(names)
     assert all(bus in (SERIAL, CAN) for injection in MATRIX for bus in injection.buses)
