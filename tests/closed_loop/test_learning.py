@@ -12,18 +12,18 @@ from tormagd.scenes.scene import Terms, load_scene
 from tormagd.simulation.hand import ReversingHand
 
 VALID_S = 0.2
-SAMPLES = ("sample_1", "sample_2", "sample_3")
+SAMPLES = ("sample_2", "sample_3")
+"Neither chose a constant of the learning."
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
 def test_a_step_of_a_new_device_settles_soon_after_its_carriages_have(arm, render, sample: str) -> None:
     loop = arm(sample)
-    render(loop, 0.7, 2.0)
     for overshoots_N, settles_N in ((0.1, 0.02), (0.08, 0.02)):
-        forces_N = [abs(each.truth.force_N) for each in render(loop, 2.0, 3.0)]
+        render(loop, 0.7, 2.0)
+        forces_N = [abs(each.truth.force_N) for each in render(loop, 2.0, 1.6)]
         assert max(forces_N) < 2.0 + overshoots_N
         assert np.mean(forces_N[1_500:1_600]) == pytest.approx(2.0, abs=settles_N)
-        render(loop, 0.7, 2.0)
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
@@ -56,18 +56,17 @@ def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on
     errors_N = [
         each.truth.force_N - (1.55 + 0.1 * np.sin(7.0 * (each.truth.time_s - begins_s)))
         for each in loop.run(
-            6.0, lambda now_s: TimedSetpoint(1.55 + 0.1 * np.sin(7.0 * (now_s - begins_s)), now_s, VALID_S)
+            3.0, lambda now_s: TimedSetpoint(1.55 + 0.1 * np.sin(7.0 * (now_s - begins_s)), now_s, VALID_S)
         )
     ]
     assert np.sqrt(np.mean(np.square(errors_N))) < 0.02
     assert loop.planner.believe.learned() == NOTHING_LEARNED
 
 
-@pytest.mark.parametrize("sample", ["sample_1", "sample_3"])
-def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces_leap(arm, sample: str) -> None:
+def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces_leap(arm) -> None:
     config, scene = Config(scene="pulse"), load_scene("pulse")
     frozen = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
-    loop = arm(sample, ReversingHand(1.0), core=frozen, config=config)
-    list(loop.run(5.0, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)))
+    loop = arm("sample_3", ReversingHand(1.0), core=frozen, config=config)
+    list(loop.run(2.5, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)))
     assert loop.planner.believe.learned() == NOTHING_LEARNED
     assert loop.stepper.move.acceleration_scale == 1.0

@@ -19,8 +19,8 @@ from tormagd.simulation.parameters import load_plant
 FORCE_N = 1.4
 ALLOWED_N = 0.1
 OPEN_MM = 95.0
-SHORT_MS = [5, 8, 15, 25, 35, 45, 47]
-LONG_MS = [60, 83, 150, 400]
+SHORT_MS = [5, 8, 25, 47]
+LONG_MS = [60, 400]
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
     holding: ClosedLoop, stall_ms: int
 ) -> None:
     stall(holding, stall_ms)
-    samples = run(holding, FORCE_N, 3.0)
+    samples = run(holding, FORCE_N, 2.0)
     assert samples[25].safety.operating_state is OperatingState.FAULT
     assert samples[-1].safety.faults == (Fault.HOST_STALL,)
     assert samples[-1].truth.gap_mm > OPEN_MM - 1.0
@@ -165,7 +165,7 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
     device = Stopped(holding.device)
     holding.device = device  # type: ignore[assignment]
     device.stop(holding.now_s, stop_ms)
-    samples = run(holding, FORCE_N, 3.0)
+    samples = run(holding, FORCE_N, 2.0)
     assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
     assert Fault.HOST_STALL not in samples[-1].safety.faults
     assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.safety.faults)
