@@ -162,19 +162,16 @@ HEALTHY = {
     **{f"{name} at 9.1 V": ("serial", with_supply(plant, 9.1)) for name, plant in SAMPLES.items()},
     "14.9 V": ("serial", with_supply(SAMPLES["sample_2"], 14.9)),
     **{f"{ambient_C:g} C": ("serial", at_temperature(SAMPLES["sample_1"], ambient_C)) for ambient_C in (5.0, 40.0)},
-    "slow clock": ("serial", "clock=-5%"),
-    "worn": ("serial", "worn_gearbox"),
+    "slow clock": ("serial", SAMPLES["sample_1"], "clock=-5%"),
+    "worn": ("serial", SAMPLES["sample_1"], "worn_gearbox"),
 }
 
 
 @pytest.mark.parametrize("case", HEALTHY)
 def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
     """From the closed end, while the carriages close at full speed, and again as it rests."""
-    bus, plant = HEALTHY[case]
-    if isinstance(plant, str):
-        loop = closed(bus, gap_mm=CLOSED_MM, faults=[plant])
-    else:
-        loop = closed(bus, plant, CLOSED_MM)
+    bus, plant, *faults = HEALTHY[case]
+    loop = closed(bus, plant, CLOSED_MM, faults)
     held(loop, 70.0, 1.5)
     held(loop, CLOSED_MM, 0.3)
     loop.command("disable")

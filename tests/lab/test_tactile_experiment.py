@@ -17,7 +17,7 @@ from tormagd.lab.thesis.page import pulse_experiment, table_4_1
 @pytest.fixture(scope="module")
 def run():
     # whole groups left out are only looked at for their shape
-    return experiment.contract(replace(models.QUICK, thin=8, group_epochs=2))
+    return experiment.contract(replace(models.QUICK, thin=16, group_epochs=1))
 
 
 def test_the_contract_s_keys_are_there_and_finite(run):

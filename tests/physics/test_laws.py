@@ -108,7 +108,7 @@ def over_loads(seed: int) -> Iterator[Case]:
         yield Case(share * max_radial_moment_Tm(elastomer, geometry), elastomer, geometry)
 
 
-@pytest.mark.parametrize(("cases", "count"), [(over_gaps, 1500), (over_loads, 1500)])
+@pytest.mark.parametrize(("cases", "count"), [(over_gaps, 500), (over_loads, 500)])
 def test_float64_force_and_slope_agree_with_50_digits(cases: Callable[[int], Iterator[Case]], count: int) -> None:
     admitted = 0
     for case in islice(cases(1), count):
@@ -130,7 +130,7 @@ def test_float64_force_and_slope_agree_with_50_digits(cases: Callable[[int], Ite
 def test_float32_force_agrees_with_float64() -> None:
     """Whose own error is a ten-millionth of what is allowed here."""
     strained = 0
-    for case in islice(over_loads(2), 1500):
+    for case in islice(over_loads(2), 500):
         moment = np.array([0.999 * case.moment], dtype=np.float32)
         exact = Case(float(moment[0]), case.elastomer, case.geometry)
         result = brake_force_N(moment, case.elastomer, case.geometry)
