@@ -10,23 +10,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from firmware_protocol.codec import DeviceMode, DriveMode
+from firmware_protocol.codec import DriveMode
 from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config
 from tormagd.exact import packed, plain
 from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import OperatingState, RefusedError
-from tormagd.simulation.device import SerialDevice
+from tormagd.safety.operating_state import RefusedError
 from tormagd.simulation.hand import ReversingHand
 
 CONFIG = Config()
 OPEN_MM = 95.0
 LEAD_IN_S = 0.7
 "A ramp to the first force of the pulse, and a hold there."
-STRIKE_S = 3.4
-"When an injected fault begins: armed, and in the middle of a pulse."
-Maker = Callable[..., ClosedLoop]
 
 
 def pulse_N(time_s: float) -> float:
@@ -192,144 +188,6 @@ def test_stop_opens_and_has_to_be_cleared(armed: ClosedLoop) -> None:
 
 
 # -- faults --------------------------------------------------------------------------------------------------------
-
-
-def struck(arm: Maker, spec: str, seconds: float = 2.6) -> tuple[ClosedLoop, list[Sample]]:
-    """The ticks from a fault on that is injected into a running pulse, and the loop after them."""
-    loop = arm(faults=[f"{spec}@{STRIKE_S:g}"])
-    before = publish(loop, pulse_N, STRIKE_S - loop.now_s, rate_hz=100)
-    assert faults_of(before) == ()
-    assert before[-1].truth.force_N == pytest.approx(pulse_N(before[-1].time_s - before[0].time_s), abs=0.1)
-    phase_s = before[-1].time_s - before[0].time_s
-    samples = publish(loop, lambda time_s: pulse_N(phase_s + time_s), seconds, rate_hz=100)
-    assert (OperatingState.FAULT is samples[-1].safety.operating_state) == bool(faults_of(samples))
-    return loop, samples
-
-
-def first_fault(samples: list[Sample]) -> tuple[Fault, float]:
-    """The first fault and how long after the strike it was latched."""
-    for sample in samples:
-        if sample.safety.faults:
-            return sample.safety.faults[0], sample.time_s - STRIKE_S
-    pytest.fail("no fault")
-
-
-def opened_after_s(samples: list[Sample]) -> float:
-    """When the gap had come within 2 mm of its open end for good, after the strike."""
-    closed = [sample.time_s for sample in samples if sample.truth.gap_mm < OPEN_MM - 2.0]
-    assert samples[-1].truth.gap_mm > OPEN_MM - 2.0, f"gap of {samples[-1].truth.gap_mm} mm"
-    return max(closed) - STRIKE_S
-
-
-@pytest.mark.parametrize(
-    ("spec", "fault", "within_s"),
-    [
-        ("encoder_stuck_left", Fault.NO_MOTION, 0.3),
-        ("reset", Fault.DEVICE_NOT_RUNNING, 0.05),
-    ],
-)
-def test_a_fault_is_named_and_the_gap_opens(arm, spec: str, fault: Fault, within_s: float) -> None:
-    _, samples = struck(arm, spec)
-    found, after_s = first_fault(samples)
-    assert found is fault
-    assert after_s <= within_s
-    assert opened_after_s(samples) < 2.5
-    # what was said once is never taken back
-    assert samples[-1].output.mode is DriveMode.OFF
-    assert not any(sample.output.mode is DriveMode.RUN for sample in samples if sample.safety.faults)
-
-
-def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itself_homed(arm) -> None:
-    loop, samples = struck(arm, "encoder_stuck_left")
-    assert faults_of(samples) == (Fault.NO_MOTION,)
-    assert loop.measurement.is_homed
-    assert not samples[-1].measured.is_homed  # type: ignore[union-attr]
-    loop.command("clear-fault")
-    list(loop.run(0.1))
-    with pytest.raises(RefusedError) as caught:
-        loop.command("enable")
-    assert caught.value.code == "not_homed"
-    loop.device.messages._stuck_left = None  # the connector is pushed in again: a leap that the device takes for motion
-    list(loop.run(0.3))
-    loop.command("clear-fault")
-    list(loop.run(0.1))
-    loop.arm()
-    assert publish(loop, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
-
-
-def test_a_device_that_hears_nothing_opens_by_itself(arm) -> None:
-    """Nothing that the host sends arrives: the opening is the device's own, 50 ms after the last Drive."""
-    _, samples = struck(arm, "commands_vanish")
-    assert first_fault(samples) == (Fault.MEASUREMENT_STALE, pytest.approx(0.03, abs=0.03))
-    assert set(faults_of(samples)) == {Fault.MEASUREMENT_STALE, Fault.DEVICE_COMMAND_TIMEOUT}
-    still_mm = samples[0].truth.gap_mm
-    moving_s = next(sample.time_s for sample in samples if sample.truth.gap_mm > still_mm + 1.0)
-    assert moving_s - STRIKE_S < 0.05 + 0.15
-    assert opened_after_s(samples) < 0.05 + 0.15 + (OPEN_MM - still_mm) / 15.0
-
-
-def test_without_supply_the_gap_is_held_by_friction_and_both_facts_are_named(arm) -> None:
-    loop, samples = struck(arm, "supply_loss", seconds=6.5)
-    found, after_s = first_fault(samples)
-    assert found is Fault.DEVICE_SUPPLY
-    assert after_s < 0.05
-    # where the pulse was closing the gap, the carriages coast on: the device notices that too
-    assert set(faults_of(samples)) - {Fault.DEVICE_UNCOMMANDED_MOTION} == {
-        Fault.DEVICE_SUPPLY,
-        Fault.DEVICE_RETRACT_FAILED,
-    }
-    held_mm = samples[1_000].truth.gap_mm
-    assert held_mm > samples[0].truth.gap_mm - 3.0
-    assert all(sample.truth.gap_mm == pytest.approx(held_mm, abs=0.02) for sample in samples[1_000:])
-    assert loop.measurement.mode is DeviceMode.LATCHED
-
-
-@pytest.mark.parametrize("spec", ["drag_left=+50%", "worn_gearbox"])
-def test_wear_is_made_up_for(arm, spec: str) -> None:
-    """Half as much drag again on one side, or a quarter of the friction: synchronised, and still on the pulse."""
-    samples = publish(arm(faults=[f"{spec}@2.5"]), pulse_N, LEAD_IN_S + 1.7)
-    assert faults_of(samples) == ()
-    assert rms_N(samples, pulse_N, LEAD_IN_S) <= 0.03
-    assert max(abs(sample.truth.left_mm - sample.truth.right_mm) for sample in samples) < CONFIG.limits.skew_fault_mm
-
-
-def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
-    """Killed with the gap closed: the device opens by itself, and nothing shuts on the way."""
-    loop = arm(faults=["worn_gearbox@2.5"])
-    publish(loop, lambda time_s: 1.6, 1.5)
-    closed_mm = loop.device.truth.gap_mm
-    for _ in range(2_500):
-        loop.skip()
-        assert loop.device.truth.gap_mm > closed_mm - 1.0
-    assert loop.device.truth.gap_mm > OPEN_MM - 2.0
-
-
-class Unheard:
-    """A device whose bytes are lost on the way."""
-
-    def __init__(self, device: SerialDevice) -> None:
-        self._device = device
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._device, name)
-
-    def transmit(self, now_s: float) -> bytes:
-        self._device.transmit(now_s)
-        return b""
-
-
-def test_a_lost_link_is_a_fault_that_does_not_go_by_itself(armed: ClosedLoop) -> None:
-    """The device falls silent for the host: its bytes are lost for a quarter of a second."""
-    publish(armed, lambda time_s: 1.4, 0.8)
-    device = armed.device
-    armed.device = Unheard(device)  # type: ignore[assignment]
-    silent = publish(armed, lambda time_s: 1.4, 0.25)
-    armed.device = device
-    back = publish(armed, lambda time_s: 1.4, 2.6)
-    assert faults_of(silent)[0] is Fault.MEASUREMENT_STALE
-    assert Fault.LINK_LOST in faults_of(silent) or silent[-1].safety.operating_state is OperatingState.FAULT
-    assert back[-1].safety.operating_state is OperatingState.FAULT
-    assert back[-1].truth.gap_mm > OPEN_MM - 2.0
 
 
 # -- repetition ----------------------------------------------------------------------------------------------------

@@ -137,18 +137,6 @@ def test_homing_forgets_the_motion_before_it(bench) -> None:
     assert bench.stepper.measured.left_mm_s == 0.0
 
 
-def test_a_homing_that_presses_shut_is_ended_and_named(bench) -> None:
-    at_mm = -7.5
-    bench.step(count=3)
-    bench.command("home")
-    while not bench.faults:
-        at_mm -= 0.012
-        bench.step(left_mm=at_mm, right_mm=-7.5, mode=DeviceMode.HOMING, switches=Switches(0))
-        assert at_mm > -12.0
-    assert (bench.faults, bench.output.request) == ((Fault.WRONG_DIRECTION,), DeviceRequest.RETRACT)
-    assert bench.stepper.homing.went_back_mm[0] > 2.9
-
-
 # -- a link that goes, and numbers that are none -------------------------------------------------------------------
 
 
@@ -216,21 +204,6 @@ def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> Non
 
 
 # -- commands ------------------------------------------------------------------------------------------------------
-
-
-def test_pause_holds_the_gap_and_resume_goes_on(running) -> None:
-    running.step(79.0, count=8)
-    running.command("pause")
-    running.step(50.0, count=100)
-    held = running.move.reference
-    assert held.speed_mm_s == pytest.approx(0.0, abs=1e-6)
-    running.step(50.0, count=50)
-    assert running.move.reference.gap_mm == pytest.approx(held.gap_mm, abs=1e-6)
-    assert running.output.mode is DriveMode.RUN
-    assert not running.faults
-    running.command("resume")
-    running.step(78.0, count=30)
-    assert running.move.reference.gap_mm < held.gap_mm - 0.2
 
 
 def test_disable_and_stop_open(running) -> None:
@@ -418,30 +391,3 @@ def test_a_silent_device_is_held_where_it_is_and_named(running) -> None:
     assert Limit.DEVICE_SILENT not in back.limits
     assert abs(back.left_duty) < 0.2
     assert not running.faults
-
-
-@pytest.mark.parametrize(("stall_ms", "fault"), [(83, Fault.HOST_STALL), (36, Fault.DEVICE_COMMAND_TIMEOUT)])
-def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_ms: int, fault: Fault) -> None:
-    """One fault, though the device goes on saying that it heard nothing; a shorter stall cannot have done it."""
-    running.ticks += stall_ms
-    running.step(count=16)
-    assert not running.faults
-    opened = {"faults": DeviceFault.COMMAND_TIMEOUT, "mode": DeviceMode.RETRACTING}
-    assert running.run_into(fault, **opened) == 1
-    running.step(count=300, **opened | {"mode": DeviceMode.LATCHED})
-    assert running.faults == (fault,)
-    assert running.is_opened
-
-
-@settings(max_examples=60, deadline=None)
-@given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
-def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:
-    """However they follow each other, held or moving; the duty right after each is none."""
-    bench = make_bench().enabled()
-    for stall_ms, ran_ms in stalls_ms:
-        bench.ticks += stall_ms
-        bench.step(79.9)
-        assert bench.is_held
-        bench.step(79.9, count=ran_ms)
-        assert not bench.faults
-        assert abs(bench.move.left.integral) < 0.3

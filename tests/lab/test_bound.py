@@ -123,48 +123,6 @@ def test_without_delay_the_carriages_of_a_device_come_to_rest_where_they_were_se
     assert share[-1] == pytest.approx(1.0, abs=1e-6)
 
 
-def searched_N(drive: Drive, brake: Brake, wanted: Asked, step_s: float, grid_mm_s: float, most_mm_s: float) -> float:
-    """The least RMS error over everything a grid of gaps and speeds holds: a dynamic programme, of a brake without lag.
-    Its speeds are whole multiples of the gaps' grid a step: nothing is interpolated, limits are rounded inwards.
-    """
-    grid_mm = grid_mm_s * step_s
-    wanted_mm = np.interp(-wanted.strength_Tm, -brake.moment_Tm, brake.gap_mm)
-    gaps = np.arange(wanted_mm.min() - 1.0, wanted_mm.max() + 1.0, grid_mm)
-    speeds = np.arange(-round(most_mm_s / grid_mm_s), round(most_mm_s / grid_mm_s) + 1)
-    highest = [math.floor(drive.highest_mm_s(50.0, grid_mm_s * j, step_s) / grid_mm_s + 1e-9) for j in speeds.tolist()]
-    lowest = [math.ceil(drive.lowest_mm_s(50.0, grid_mm_s * j, step_s) / grid_mm_s - 1e-9) for j in speeds.tolist()]
-    fresh_N = np.interp(np.interp(gaps, brake.gap_mm, brake.moment_Tm), brake.strength_Tm, brake.fresh_N)
-    sums = np.zeros((len(speeds), len(gaps)))
-    for index, (asked_N, relaxed_N) in enumerate(zip(wanted.force_N.tolist(), wanted.relaxed_N.tolist(), strict=True)):
-        squared = (wanted.scale * (fresh_N - relaxed_N) + wanted.offset_N - asked_N) ** 2
-        following = np.full_like(sums, np.inf)
-        for row, speed in enumerate(speeds.tolist()):
-            sources = [at for at in range(len(speeds)) if lowest[at] <= speed <= highest[at]]
-            best = sums[sources[0] : sources[-1] + 1].min(axis=0) if index else sums[row]
-            shift = speed if index else 0
-            if shift >= 0:
-                following[row, shift:] = best[: len(best) - shift]
-            else:
-                following[row, :shift] = best[-shift:]
-        sums = following + squared
-    return math.sqrt(float(sums.min()) / len(wanted.force_N))
-
-
-@pytest.mark.parametrize(("low_N", "high_N", "period_s"), [(1.4, 1.7, 0.16), (0.9, 1.3, 0.3)])
-def test_nothing_better_is_found_by_searching_everything(low_N: float, high_N: float, period_s: float) -> None:
-    """On the curved force of sample 1, with friction that only brakes: neither error nor limits are convex."""
-    step_s = 4e-3
-    drive = Drive(stall_mm_s2=1e6, per_s=1.0, most_mm_s2=1500.0, gear_mm_s2=250.0)
-    brake = brake_of(load_plant("sample_1"))._replace(branch_Tm=0.0)
-    along_s = step_s * np.arange(150)
-    force_N = low_N + (high_N - low_N) * (0.5 + 0.5 * zigzag(along_s / period_s) ** 3)
-    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=step_s)
-    found_N = rms(wanted.rendered_N(brake, foresight_mm(drive, brake, wanted, step_s)) - wanted.force_N)
-    searched = searched_N(drive, brake, wanted, step_s, 1.0, 80.0)
-    assert found_N >= 0.002
-    assert found_N == pytest.approx(searched, rel=0.03)
-
-
 SAMPLES = [load_plant(name) for name in ("sample_1", "sample_2", "sample_3")]
 
 

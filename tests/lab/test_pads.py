@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tormagd.lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, drawn_pad, holding_records
+from tormagd.lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.tactile_pad import TactilePad, cycling_program, worked_pad
 
@@ -82,18 +82,6 @@ def test_the_data_have_the_thesis_s_size_and_a_lab_s_noise() -> None:
     noise = data.force_N - data.true_force_N
     assert noise.std() == pytest.approx(0.5, rel=0.02)
     assert abs(noise.mean()) < 0.01
-
-
-def test_recorded_cycles_repeat() -> None:
-    data = cyclic_records(0.0, 0, samples_per_cycle=40, fields_mT=(182.5,))
-    last = data.true_force_N[-3 * 40 :].reshape(3, 40)
-    assert np.abs(last[2] - last[1]).max() < 0.2
-
-
-def test_drawn_pads_differ_and_are_repeatable() -> None:
-    assert drawn_pad(PADS["MRE-C"], 1) == drawn_pad(PADS["MRE-C"], 1)
-    assert drawn_pad(PADS["MRE-C"], 1) != drawn_pad(PADS["MRE-C"], 2)
-    assert drawn_pad(PADS["MRE-C"], 1).modulus_kPa == pytest.approx(281, rel=0.031)
 
 
 @pytest.mark.parametrize(("place", "name"), [((-0.1, 0, 0), "displacement_mm"), ((1, float("nan"), 0), "rate_mm_s")])

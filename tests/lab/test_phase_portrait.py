@@ -34,24 +34,6 @@ def test_coverage_agrees_with_counted_points(
         assert [portrait.true_coverage(region), portrait.trapezoid_coverage(region)] == pytest.approx(counted, abs=1e-3)
 
 
-def test_true_coverage_is_good_to_five_digits(brake: Brake, use_case_2: Region) -> None:
-    portrait = PhasePortrait(brake, SPEEDS[0])
-    gap = np.linspace(brake.gap_mm(use_case_2.most_N), brake.open_mm, 200_001)
-    force = brake.force_N(gap)
-    inside = np.minimum(use_case_2.rate_N_s(force), SPEEDS[0] * brake.slope_N_mm(gap))
-    exact = -np.trapezoid(inside, force) / use_case_2.half_area
-    assert portrait.true_coverage(use_case_2) == pytest.approx(exact, abs=1e-5)
-
-
-def test_outline_lies_inside_the_trapezoid_and_joins_its_corners(brake: Brake) -> None:
-    portrait = PhasePortrait(brake, 40.0)
-    force, rate = portrait.outline()
-    ends = portrait.trapezoid()
-    assert (force[0], force[-1]) == pytest.approx((ends.most_N, ends.least_N))
-    assert (rate[0], rate[-1]) == pytest.approx((ends.most_rate_N_s, ends.least_rate_N_s))
-    assert np.all(rate[1:-1] < ends.rate_N_s(force[1:-1]))
-
-
 def test_boundary_rate_is_what_a_moving_gap_gives(brake: Brake) -> None:
     force, rate = PhasePortrait(brake, 40.0).outline(5)
     step_s = 1e-5
@@ -92,13 +74,6 @@ def test_cloud_says_which_points_fail_and_why(brake: Brake) -> None:
     said = [cloud.covered, cloud.too_fast, cloud.below_least_force, cloud.above_most_force]
     assert [np.flatnonzero(points).tolist() for points in said] == [[0], [1, 2], [3], [4]]
     assert cloud.share == pytest.approx(0.2)
-
-
-def test_brake_comes_back_from_force_to_gap(brake: Brake) -> None:
-    gap = np.linspace(45.0, 95.0, 101)
-    assert brake.gap_mm(brake.force_N(gap)) == pytest.approx(gap, rel=1e-11)
-    assert brake.gap_mm(brake.most_N) == 45.0
-    assert brake.gap_mm(brake.least_N) == pytest.approx(95.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("g0_Pa", [20e3, 79.5e3, 185.5e3, 277.3e3])

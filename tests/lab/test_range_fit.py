@@ -39,13 +39,6 @@ def test_the_registrys_friction_is_the_least_squares_of_the_relative_errors() ->
         assert {item.elastomer.friction_coefficient for item in matrix} == {round(float(least), 3)}
 
 
-def test_no_other_exponent_has_a_smaller_mean_error() -> None:
-    law = ThesisFieldLaw()
-    least = mean_relative_error(fit_exponent(ALL, law), ALL)
-    others = [fit_friction(ALL, law, float(exponent)) for exponent in np.linspace(0.8, 1.6, 161)]
-    assert min(mean_relative_error(other, ALL) for other in others) >= least - 1e-4
-
-
 def test_left_out_inserts_are_predicted_worse() -> None:
     law = ThesisFieldLaw()
     for free in (False, True):
@@ -53,12 +46,6 @@ def test_left_out_inserts_are_predicted_worse() -> None:
         assert set(errors) == set(INSERTS)
         fit = fit_exponent(ALL, law) if free else fit_friction(ALL, law)
         assert np.mean(list(errors.values())) > mean_relative_error(fit, ALL)
-
-
-def test_the_left_out_insert_does_not_see_its_own_measurement() -> None:
-    of_others = fit_friction([item for item in ALL if item.name != "MRE-10-10"], PowerFieldLaw())
-    found = leave_one_out(ALL, PowerFieldLaw(), free_exponent=False)["MRE-10-10"]
-    assert found == of_others.relative_error(INSERTS["MRE-10-10"])
 
 
 def test_exponent_one_is_the_force_law_itself() -> None:

@@ -47,16 +47,6 @@ def test_noise_is_left_over_and_not_fitted() -> None:
     assert fit.r2 > 0.99
 
 
-def test_one_branch_cannot_follow_three() -> None:
-    assert fit_relaxation(record(HOLD_S, step()), branches=1).rms_N > 10.0 * 1e-3
-
-
-def test_more_branches_than_the_record_shows_do_no_harm() -> None:
-    fit = fit_relaxation(record(HOLD_S, step()), branches=4)
-    assert 3 <= len(fit.series.fractions) <= 4
-    assert sum(fit.series.fractions) == pytest.approx(0.13, rel=1e-3)
-
-
 GOOD = record(HOLD_S, step())
 
 

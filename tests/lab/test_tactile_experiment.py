@@ -11,7 +11,6 @@ from tormagd.lab.main import main
 from tormagd.lab.tactile import experiment, models, report
 from tormagd.lab.tactile.pads import PADS
 from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
-from tormagd.lab.thesis.page import pulse_experiment, table_4_1
 
 
 @pytest.fixture(scope="module")
@@ -59,17 +58,6 @@ def test_the_page_and_its_pictures_are_written(run, tmp_path):
         if line.startswith("!["):
             assert (tmp_path / line[line.index("(") + 1 : -1]).read_bytes().startswith(b"\x89PNG")
     assert page.count("![") == 2
-
-
-def test_thesis_and_ours_stand_side_by_side(run):
-    figures = run[0]
-    section = table_4_1(figures["table_4_1"]) + pulse_experiment(figures["pulse"])
-    ours = figures["table_4_1"]["rows"][2]["test"]
-    line = next(line for line in section.splitlines() if line.startswith("| MRE-C, test"))
-    assert "2.7 ± 2.21" in line
-    assert f"{ours['mae_N']:.3f} ± {ours['sd_N']:.3f}" in line
-    assert "1.14 ± 1.48" in section
-    assert "ynthetic" in section
 
 
 def test_arterial_pulses_are_read_where_the_recordings_are(recordings, monkeypatch):

@@ -93,12 +93,6 @@ def test_what_was_taken_out_of_the_data_is_in_the_file(
         assert load_model(out, element="torque").metadata.memory == expected
 
 
-def test_a_table_for_people(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command(data, tmp_path / "m.safetensors", "--epochs", "3")) == 0
-    printed = capsys.readouterr().out
-    assert all(word in printed for word in ("validation", "not_rising_share"))
-
-
 def test_what_cannot_work_is_told_with_exit_2(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "m.safetensors"
     broken = tmp_path / "broken.csv"

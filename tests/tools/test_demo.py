@@ -130,11 +130,6 @@ def test_a_homing_that_came_to_nothing_is_the_hosts_only_where_it_stood_still(co
     assert "homing ended" in sentence
 
 
-def test_the_host_line_names_steal_and_both_worst_stalls():
-    line = demo.host_line(STALLED._replace(steal=0.012), 94.0)
-    assert line.startswith("steal 1.2%, worst stall 94 ms (bare timer 92 ms,")
-
-
 @pytest.mark.parametrize("limits", [(), ("RATE",), *[(limit,) for limit in Limit], tuple(Limit), tuple(Limit)[::-1]])
 @pytest.mark.parametrize("state", ["ENABLED", "DISABLED", "PAUSED", "FAULT"])
 def test_the_live_line_fits_80_columns_and_hides_no_limit(limits, state):
@@ -157,17 +152,6 @@ def printed_lines(capsys) -> list[str]:
     demo.print_forces(shown(), rehearsals())
     demo.print_timing(shown())
     return [line for line in capsys.readouterr().out.splitlines() if line]
-
-
-def test_the_columns_stand_under_each_other(capsys):
-    lines = printed_lines(capsys)
-    heading = lines[1]
-    rows = [line for line in lines if re.search(r" mN +\d+ mN ", line)]
-    assert len(rows) == 1 + sum(case.hand == "steady" for case in demo.CASES)
-    for row in rows:
-        assert [match.end() for match in re.finditer(r"mN", row)] == [
-            heading.index(h) + len(h) for h in ("RMS", "worst")
-        ]
 
 
 def test_the_readmes_sample_has_the_lines_that_are_printed(capsys):

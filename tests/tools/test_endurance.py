@@ -18,7 +18,7 @@ from tormagd_client.messages import MessageError, Request, decode
 
 
 def test_damage_does_no_harm_and_repeats_itself() -> None:
-    result = endure.measured("fuzz", 8_000, 1)
+    result = endure.measured("fuzz", 3_000, 1)
     assert result["failures"] == []
     assert result["passed"]
     first, again = (endure.measured("fuzz", 400, 1) | {"seconds": 0} for _ in range(2))

@@ -43,6 +43,12 @@ SAMPLED = (
     "every other Drive answered",
     "left open switch stuck",
     "setpoints of NaN",
+    # no test in tests/closed_loop puts these into a pulse
+    "motor supply fails",
+    "left drag +50%",
+    "worn gearbox",
+    "worn gearbox, then daemon killed",
+    "cable pulled: nothing goes either way",
     "homing: left motor wired the wrong way",
     "from the start: wrong CRC-8 in State",
 )

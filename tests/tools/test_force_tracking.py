@@ -1,22 +1,18 @@
 """The force-tracking tool: its signals, its draws, and its figures on one short run. All devices are synthetic."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
-from force_tracking import worst
 from rendering.cases import (
     ARRIVES_S,
     LATER_S,
-    SPEEDS_MM_S,
     STEP_S,
     allowed_N,
     compared,
     ideal,
     stair_levels,
     step_figures,
-    tour,
     track,
 )
 from rendering.device_draws import DRAWN, SPREAD, drawn_device, evenly_drawn
@@ -30,7 +26,6 @@ from rendering.signals import (
     pulse_signal,
     recorded_signals,
     staircase_signal,
-    with_approach,
 )
 
 from tormagd.lab.human_pulse import pulse_profile
@@ -83,13 +78,6 @@ def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Followed) -
     assert track(load_plant("sample_1"), begun, "pulse", 0.0).since(0.0).rms_N >= at_first["no_delay_rms_N"]
 
 
-def test_the_same_core_misses_less_with_carriages_that_lose_no_time() -> None:
-    weak, swung = load_plant("sample_2"), swing(1.6)
-    fast = swung._replace(force_N=1.5 + 0.2 * np.sin(12.0 * np.pi * swung.time_s))
-    own, same = (track(weak, fast, "pulse", 0.0, is_ideal=is_ideal).since(0.4).rms_N for is_ideal in (False, True))
-    assert 0.0 < same < 0.8 * own
-
-
 def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:
     """Sample 2 starts and turns too late for what it is not told before: with the slope alone it misses by 28 mN."""
     found = track(load_plant("sample_2"), pulse_signal(6.5), "pulse", 0.0)
@@ -115,13 +103,6 @@ def test_the_pulse_spans_what_was_asked_and_has_no_images() -> None:
         pulse_profile(60.0, 1.4, 1.7, 500)
 
 
-def test_the_approach_ends_where_the_pulse_begins() -> None:
-    times_s, forces_N = with_approach(*pulse_profile(2.0, 1.4, 1.7, 500), 0.6, 1.0, 0.5)
-    assert forces_N[0] == 0.6
-    assert np.abs(np.diff(forces_N)).max() < 0.01
-    assert times_s[-1] == pytest.approx(3.5, abs=0.01)
-
-
 def test_a_step_is_judged_once_it_arrived_a_second_later_and_by_its_greatest() -> None:
     arrives_s = BEGINS_S + IDEAL_S + ARRIVES_S
     found = course(
@@ -141,15 +122,6 @@ def test_a_step_is_judged_once_it_arrived_a_second_later_and_by_its_greatest() -
 def test_the_worst_is_of_means_in_between() -> None:
     found = course((3.0, 3.2, -0.4), (5.0, 5.001, 5.0), (8.0, 9.0, 1.0))
     assert (found.worst_N(2.0, 4.0), found.worst_N(4.5, 6.0)) == pytest.approx((0.4, 0.1))
-
-
-def test_every_speed_follows_every_other_once() -> None:
-    assert sorted(itertools.pairwise(tour())) == sorted(itertools.permutations(SPEEDS_MM_S, 2))
-
-
-def test_figures_are_printed_with_the_worst_device() -> None:
-    devices = {"draw 40": {"up_N": 0.01}, "sample_2": {"up_N": -0.03}, "draw 41": {"up_N": 0.02}}
-    assert worst(devices) == [{"figure": "up_N", "worst": 0.03, "device": "sample_2", "median": 0.02}]
 
 
 def test_a_publisher_sends_what_follows() -> None:
@@ -215,7 +187,3 @@ def test_what_is_allowed_grows_with_what_the_ideal_carriages_miss() -> None:
     assert allowed_N(Kind.PULSE, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.015))
     assert allowed_N(Kind.HAND, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.01))
     assert allowed_N(Kind.HAND, "sample_1", False, row) is None
-
-
-def test_a_folder_without_data_gives_no_signals(tmp_path) -> None:
-    assert recorded_signals(tmp_path) == []

@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 import pytest
 import required_terms
-from distributed import Client, LocalCluster
 from rendering import scene_runs
 from rendering.scene_runs import Case, Play, run, run_all
 from required_terms import NO_COST, RATES_HZ, SHARE, is_good, measure, spared
@@ -181,15 +180,3 @@ def test_what_is_known_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None
     for name, value in changed.items():
         with pytest.raises(ConnectionError):
             run_all([msgspec.structs.replace(cases[0], **{name: value})], Refusing(), known)
-
-
-def test_dask_workers_give_what_this_process_gives(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cases and outcomes go there and back; what a case takes on its way is the same everywhere, so it is not run."""
-    monkeypatch.setattr(scene_runs, "run", str)
-    cases = [Case("brain"), Case("coronary", "sample_3", ("motor", "rate"), "nearest", False)]
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
-        Client(cluster) as client,
-        client.get_executor() as executor,
-    ):
-        assert run_all(cases, executor, {}) == {case: str(case) for case in cases}
