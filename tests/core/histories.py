@@ -351,9 +351,7 @@ def main() -> None:
         "streams": streams,
         "hostile": hostile,
         "sample 1": lambda core, seen: loop(core, seen, "sample_1", SteadyHand(), "", 0.003),
-        "sample 2": lambda core, seen: loop(core, seen, "sample_2", ReversingHand(1.5), "", 0.0),
         "sample 3": lambda core, seen: loop(core, seen, "sample_3", ReversingHand(2.0), "drag_left=+50%@4.5", 0.0),
-        "reset": lambda core, seen: loop(core, seen, "sample_1", ReversingHand(3.0), "reset@4.2", 0.0),
     }
     seen = {name: Digest() for name in histories}
     for name, history in histories.items():

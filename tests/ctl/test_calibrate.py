@@ -18,7 +18,7 @@ from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.ctl import calibrate as ctl_calibrate, calibrate_motors as ctl_calibrate_motors, calibrate_run
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
-from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, excitation, motor_log
+from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
 from tormagd.ctl.calibrate_run import Range
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
@@ -216,23 +216,6 @@ def test_a_sweep_file_that_is_none_says_why(tmp_path):
         path.write_text(text)
         with pytest.raises(ValueError, match=told):
             calibration.read_sweep(path)
-
-
-def test_up_and_down_starts_ends_and_turns_where_it_should():
-    waveform = up_and_down(Range(0.6, 2.0), 0.5)
-    forces = [waveform.at(share * waveform.duration_s).force_N for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    assert forces == pytest.approx([0.6, 1.3, 2.0, 1.3, 0.6])
-    assert waveform.duration_s == pytest.approx(5.6)
-
-
-def test_the_motors_excitation_stays_within_the_range_and_uses_it():
-    forces = Range(0.6, 2.0)
-    waveform = excitation(forces)
-    asked = np.array([waveform.at(t).force_N for t in np.arange(0.0, waveform.duration_s, 0.005)])
-    assert asked.min() >= forces.least_N
-    assert asked.max() == pytest.approx(forces.most_N)
-    assert np.abs(np.diff(asked)).max() > 0.5  # jumps for the inertia
-    assert (np.abs(np.diff(asked)) > 0.0).mean() > 0.5  # ramps for the friction
 
 
 def ticks(count=200):

@@ -202,13 +202,6 @@ def test_scenes_are_listed_and_shown(capsys):
     assert run_json(capsys, "scene", "show")[1]["result"]["name"] == "coronary"
 
 
-def test_scene_text_is_toml_that_loads_again(tmp_path, capsys):
-    assert main(["scene", "show", "pulse"]) == 0
-    (tmp_path / "copy.toml").write_text(capsys.readouterr().out)
-    shown = run_json(capsys, "scene", "show", "pulse")
-    assert run_json(capsys, "scene", "show", str(tmp_path / "copy.toml")) == shown
-
-
 def test_a_scene_without_a_signal_is_shown_as_toml(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     text = 'name = "x"\ndescription = ""\n[force]\nleast_N = 0.0\nmost_N = 2.0\nresolution_N = 0.1\n'

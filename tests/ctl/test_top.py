@@ -85,11 +85,6 @@ def test_a_fault_and_its_remedy_come_before_the_limits(seen: Seen, width: int, h
     assert "gap - mm" in text
 
 
-def test_a_taller_terminal_has_taller_curves(seen: Seen) -> None:
-    low, high = (sum("█" in line for line in drawn(seen, 80, height)) for height in (24, 50))
-    assert high > low
-
-
 @pytest.mark.parametrize(("width", "height"), [(20, 5), (79, 23), (400, 120)])
 def test_any_size_can_be_drawn_on(seen: Seen, width: int, height: int) -> None:
     assert all(len(line) <= width for line in drawn(seen, width, height))

@@ -15,7 +15,6 @@ from firmware_protocol import codec
 from firmware_protocol.codec import (
     FUNCTION,
     SCHEMA_HASH,
-    Clear,
     DecodeError,
     DeviceFault,
     DeviceMode,
@@ -23,7 +22,6 @@ from firmware_protocol.codec import (
     DriveMode,
     EncodeError,
     Hello,
-    Home,
     Identity,
     Message,
     Retract,
@@ -31,7 +29,6 @@ from firmware_protocol.codec import (
     State,
     Status,
     Switches,
-    can_identifier,
     crc8,
     decode,
     encode,
@@ -253,30 +250,3 @@ def test_numbers_of_numpy_s_are_numbers() -> None:
     assert encode(drive) == encode(DRIVE)
     with pytest.raises(TypeError, match="int object expected") if IS_COMPILED else contextlib.nullcontext():
         assert encode(DRIVE.replaced(counter=np.uint8(7))) == encode(DRIVE)
-
-
-@pytest.mark.parametrize(
-    ("message", "function", "payload"),
-    [
-        (Retract(0x12), 1, "12"),
-        (Drive(1.0, -1.0, DriveMode.RUN, 0x34), 2, "1027f0d8013466"),
-        (State(-1 / 560, 1 / 560, 0.00258, 0x34), 3, "ffff0100020134ef"),
-        (Sense(-0.001, 0.258, 1.0, 2 * math.pi * 20), 4, "ffff0201e8030040"),
-        (Clear(0xFF), 5, "ff"),
-        (Home(0), 6, "00"),
-        (Status(DeviceMode.LATCHED, Switches(17), DeviceFault(0x201), -5.0, 12.3, 9, 8), 7, "04110102fb7b0908"),
-        (Hello(0x01020304, 5, 6), 8, "040302010506"),
-        (Identity(0x01020304, 5, 6, 0x0708), 9, "0403020105060807"),
-    ],
-)
-def test_the_bytes_on_the_wire_are_the_agreed_ones(message: Message, function: int, payload: str) -> None:
-    """Written by hand from the signal tables; the two CRC-8 bytes are those of the crccheck package."""
-    assert FUNCTION[type(message)] == function
-    assert encode(message).hex() == payload
-
-
-def test_can_identifiers() -> None:
-    assert can_identifier(2, node=3) == 0x23
-    for function, node in ((0, 1), (128, 1), (2, 16), (2, -1)):
-        with pytest.raises(EncodeError, match=f"function {function}, node {node}"):
-            can_identifier(function, node)

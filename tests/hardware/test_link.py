@@ -33,7 +33,6 @@ from tormagd.hardware.link import (
     HELLO_S,
     OVERTAKEN,
     REPEAT_S,
-    SILENT_S,
     UNANSWERED_S,
     DeviceLink,
     LinkState,
@@ -103,16 +102,6 @@ def test_another_schema_is_refused_with_both_hashes_and_the_firmwares_version() 
     link = running()
     link.receive(1.0, US.replaced(schema_hash=SCHEMA_HASH ^ 1))
     assert link.state is LinkState.REFUSED, "also where it took another one's place"
-
-
-def test_silence_loses_a_running_link() -> None:
-    link = running()
-    link.receive(0.5, Sense(0.0, 0.0, 0.0, 0.0))
-    link.due(0.5 + SILENT_S)
-    assert link.state is LinkState.RUNNING
-    link.due(0.5 + SILENT_S + 1e-3)
-    assert link.state is LinkState.LOST
-    assert "80 ms" in link.cause
 
 
 def test_a_device_that_turns_up_late_is_no_loss_and_asked_at_its_first_word() -> None:

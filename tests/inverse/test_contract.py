@@ -13,8 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, strategies as st
-from scipy.optimize import brentq
+from hypothesis import strategies as st
 
 from tormagd.assembly.build import build_core, choose_solver
 from tormagd.config import Config
@@ -270,11 +269,6 @@ def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> 
         assert solution == searcher.solve(curve, force, last)
 
 
-@pytest.mark.parametrize("name", SUBJECTS)
-def test_far_outside_the_training_range_the_answer_is_not_trusted(rising: ForceModel, name: str) -> None:
-    assert solver(name, rising).solve(rising.curve(100.0, 10.0, CIP), 2.0, 400.0).confidence < 1e-6
-
-
 # -- row by row and by the nearest points ------------------------------------------------------------------------------
 
 
@@ -322,13 +316,6 @@ def attainable(model: ForceModel, displacement_mm: float, rate_mm_s: float, shar
     return low + share * (high - low)
 
 
-def test_interpolation_beats_the_grid(rising: ForceModel) -> None:
-    """With a grid of 25 mT the answers stay within a hundredth of a step."""
-    solver, curve = nearest(step_mT=25.0), rising.curve(0.5, 20, CIP)
-    for field in np.linspace(115.0, 785.0, 41).tolist():
-        assert solver.solve(curve, curve.force_N(field), None).field_mT == pytest.approx(field, abs=0.25)
-
-
 @pytest.mark.parametrize(("neighbours", "keeps"), [(1, False), (2, False), (16, True)])
 def test_neighbours_decide_where_the_force_falls(lopsided: ForceModel, neighbours: int, keeps: bool) -> None:
     """Steep up, gently down: of the points nearest in force the first few are all on the gentle side."""
@@ -340,16 +327,6 @@ def test_neighbours_decide_where_the_force_falls(lopsided: ForceModel, neighbour
         strayed |= solution.field_mT > 450.0
         last = solution.field_mT
     assert strayed is not keeps
-
-
-def test_one_neighbour_is_enough_where_the_force_rises(rising: ForceModel) -> None:
-    one, many = nearest(neighbours=1), nearest(neighbours=64)
-    last = None
-    for displacement, rate, share in np.random.default_rng(5).uniform((0, 0, -0.1), (1, 60, 1.1), (200, 3)).tolist():
-        curve, force = rising.curve(displacement, rate, CIP), attainable(rising, displacement, rate, share)
-        solution = one.solve(curve, force, last)
-        assert solution == many.solve(curve, force, last)
-        last = solution.field_mT
 
 
 def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel, creeping: ForceModel) -> None:
@@ -380,15 +357,6 @@ def test_the_thesis_search_stops_at_the_first_row_within_epsilon_or_has_the_near
     below = rows[0] - 1.26
     assert row_by_row(1.27).solve(curve, below, None).reach is Reach.INSIDE
     assert row_by_row(1.25).solve(curve, below, None).reach is Reach.BELOW
-
-
-def test_the_network_in_torch_is_the_curve(rising: ForceModel) -> None:
-    """As one batch and row by row, for every state of the handle."""
-    batch, row = ordered.batch(rising, GRID_MT), ordered.row(rising)
-    for displacement, rate in ((0.0, 0.0), (0.5, 10.0), (1.0, 60.0)):
-        curve = rising.curve(displacement, rate, CIP)
-        assert batch(curve) == pytest.approx(curve.forces_N(GRID_MT), rel=1e-12)
-        assert row(curve, 333.3) == pytest.approx(curve.force_N(333.3), rel=1e-12)
 
 
 def test_the_grid_has_both_ends_and_no_wider_step() -> None:
@@ -428,29 +396,6 @@ def solved(curve: ForceCurve, force_N: float, last_field_mT: float | None) -> Fi
     assert solution.confidence == curve.confidence(solution.field_mT, force_N - solution.predicted_force_N)
     assert 1 <= solution.iterations < MOST_EVALUATIONS
     return solution
-
-
-@given(units=steps, share=st.floats(0.0, 1.0), last=lasts)
-def test_the_root_is_that_of_brent(units: Steps, share: float, last: float | None) -> None:
-    curve = curve_of([*units, SMOOTH])
-    least_N, most_N = (curve.force_N(field) for field in RANGE_MT)
-    force = least_N + share * (most_N - least_N)
-    root = brentq(lambda field: curve.force_N(field) - force, *RANGE_MT, xtol=1e-9) if 0 < share < 1 else None
-    solution = solved(curve, force, last)
-    assert solution.reach is Reach.INSIDE
-    assert solution.field_mT == pytest.approx(RANGE_MT[round(share)] if root is None else root, rel=0, abs=ACCURACY_MT)
-
-
-@given(units=steps, beyond=st.floats(1e-9, 1e6), last=lasts)
-@example(units=[], beyond=1e-9, last=103.0)
-@example(units=[], beyond=1.0, last=RANGE_MT[0] + 0.5 * ACCURACY_MT)
-@example(units=[], beyond=1.0, last=RANGE_MT[1] - 0.5 * ACCURACY_MT)
-def test_out_of_reach_is_the_end_and_says_so(units: Steps, beyond: float, last: float | None) -> None:
-    curve = curve_of([*units, SMOOTH])
-    least_N, most_N = (curve.force_N(field) for field in RANGE_MT)
-    below, above = solved(curve, least_N - beyond, last), solved(curve, most_N + beyond, last)
-    assert (below.field_mT, below.reach) == (RANGE_MT[0], Reach.BELOW)
-    assert (above.field_mT, above.reach) == (RANGE_MT[1], Reach.ABOVE)
 
 
 @pytest.mark.parametrize("end", RANGE_MT)

@@ -93,14 +93,6 @@ def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
     assert console.trim == Drift(1.0, 1.0, None)
 
 
-def test_a_person_reads_a_line_for_each_console(folder, scheduler, capsys):
-    assert main(["fleet", str(folder / "1"), "--dask", scheduler]) == 0
-    heading, line = capsys.readouterr().out.splitlines()
-    assert heading.split()[:3] == ["device", "insert", "files"]
-    shown = "00000001 MRE-50-40 3 0 s 10.0, 10.0 1.000..1.040 (+0.02/day) 0.50 unknown RATE 50.0%"
-    assert line.split() == shown.split()
-
-
 def test_what_cannot_be_kept_is_told_after_what_was_found(folder, scheduler, capsys, tmp_path):
     (tmp_path / "file").touch()
     assert main(["fleet", str(folder / "1"), "--dask", scheduler, "--out", str(tmp_path / "file" / "a.parquet")]) == 2

@@ -74,13 +74,6 @@ def test_records_that_begin_late_were_run_before() -> None:
         assert force[-1] == pytest.approx(4.0 + remembered, rel=1e-9)
 
 
-def test_records_are_independent() -> None:
-    data = Dataset(np.eye(1, 4).repeat(8, axis=0), np.zeros(8), None, np.tile([0.0, 1.0, 2.0, 5.0], 2))
-    force = relaxed_N(SERIES, np.full(8, 3.0), data)
-    assert force[:4] == pytest.approx(force[4:])
-    assert force[0] == pytest.approx(3.0)
-
-
 def test_the_grey_box_sees_through_the_memory(grey: GreyBox, cycles: Dataset, holds: Dataset) -> None:
     alone, _ = fit_network(cycles, np.ones(len(cycles), dtype=bool), 20, epochs=40)
     error, error_alone = (
@@ -117,12 +110,6 @@ def test_steps_and_records_agree(grey: GreyBox) -> None:
 def test_a_memory_needs_times(grey: GreyBox, cycles: Dataset) -> None:
     with pytest.raises(DomainError, match="time_s"):
         grey.predict(Dataset(cycles.features, cycles.force_N))
-
-
-def test_a_fit_goes_on_from_its_start(cycles: Dataset) -> None:
-    model, training = fit_network(cycles, np.ones(len(cycles), dtype=bool), 15, epochs=30)
-    _, goes_on = fit_network(cycles, cycles.features[:, 2] < 250, 15, epochs=1, start=model)
-    assert goes_on.history[0].train_rmse_N < 1.5 * training.best.train_rmse_N
 
 
 def test_forces_held_out_are_not_looked_at(cycles: Dataset) -> None:

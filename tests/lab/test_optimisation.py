@@ -87,13 +87,6 @@ def test_no_solver_returns_less_than_its_start(use_case_1: Region, as_built: Des
     assert solve(Run(corners, as_built, solver)).corner_cost <= corner_cost(corners, as_built)
 
 
-def test_the_thesis_cost_ends_below_the_grid_and_covers_less(use_case_2: Region, as_built: Design) -> None:
-    problem = Problem(use_case_2, "corners", THESIS_SPEED_MM_S)
-    thesis = found(problem, as_built)
-    assert thesis.corner_cost <= min(corner_cost(problem, design) for design in grid(problem, 10))
-    assert thesis.coverage < coverage(problem, as_built)
-
-
 @pytest.mark.usefixtures("few_generations")
 def test_a_soft_elastomer_keeps_clear_of_collapse(use_case_2: Region) -> None:
     soft = Problem(use_case_2, "true", 40.0, shear_modulus_Pa=20e3)
@@ -111,12 +104,6 @@ def test_an_elastomer_too_soft_for_any_design_is_refused(use_case_2: Region, as_
     for solver in ("local", "global"):
         with pytest.raises(DomainError, match="shear_modulus_Pa"):
             solve(Run(jelly, as_built, solver))
-
-
-def test_corner_cost_of_a_perfect_match_is_nothing(problem: Problem, as_built: Design) -> None:
-    own = msgspec.structs.replace(problem, region=problem.portrait(as_built).trapezoid(), measure="corners")
-    assert corner_cost(own, as_built) == 0.0
-    assert coverage(own, as_built) == pytest.approx(1.0)
 
 
 def test_what_a_design_covers_as_it_is_made_is_the_least_of_its_neighbours(use_case_1: Region) -> None:

@@ -34,14 +34,6 @@ def test_coverage_agrees_with_counted_points(
         assert [portrait.true_coverage(region), portrait.trapezoid_coverage(region)] == pytest.approx(counted, abs=1e-3)
 
 
-def test_boundary_rate_is_what_a_moving_gap_gives(brake: Brake) -> None:
-    force, rate = PhasePortrait(brake, 40.0).outline(5)
-    step_s = 1e-5
-    for gap, limit in zip(brake.gap_mm(force)[1:-1], rate[1:-1], strict=True):
-        moved = brake.force_N(float(gap) - 40.0 * step_s) - brake.force_N(float(gap) + 40.0 * step_s)
-        assert moved / (2.0 * step_s) == pytest.approx(limit, rel=1e-6)
-
-
 def test_a_region_out_of_reach_is_not_covered_and_one_inside_is_whole(brake: Brake) -> None:
     portrait = PhasePortrait(brake, 40.0)
     for region, share in ((Region(brake.most_N, 0.1, brake.most_N + 1.0, 0.1), 0.0), (Region(2.0, 0.1, 3.0, 0.1), 1.0)):

@@ -1,11 +1,9 @@
 import dataclasses
-import math
 
 import pytest
 
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.selection import ForceTask, judge, rank
-from tormagd.physics.field import ThesisFieldLaw
 
 STEP_MM = 0.1
 
@@ -42,15 +40,6 @@ def test_the_sufficient_gap_makes_the_brake_serve(brake: Brake) -> None:
     gap = judge("it", brake, task, STEP_MM).sufficient_gap_mm
     assert gap > brake.open_mm
     assert judge("it", dataclasses.replace(brake, open_mm=gap * 1.0001), task, STEP_MM).serves
-
-
-def test_no_gap_is_named_beyond_the_field_law(brake: Brake) -> None:
-    narrow = dataclasses.replace(brake, field=ThesisFieldLaw())
-    assert math.isnan(judge("it", narrow, ForceTask("task", 0.0, 2.0, 0.1), STEP_MM).sufficient_gap_mm)
-
-
-def test_a_task_out_of_reach_has_no_share(brake: Brake) -> None:
-    assert judge("it", brake, ForceTask("task", 40.0, 50.0, 0.1), STEP_MM).served_share == 0.0
 
 
 def test_ranking_puts_the_finest_that_serves_first(brake: Brake) -> None:

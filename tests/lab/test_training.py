@@ -76,16 +76,6 @@ def test_a_constant_column_neither_divides_by_zero_nor_matters() -> None:
     assert (network.hidden_weight[:, 3] == 0).all()
 
 
-def test_scaling_maps_the_ranges_onto_minus_one_to_one() -> None:
-    data = synthetic(300, 1)
-    network = network_for(data)
-    scaled = network.scale_inputs(torch.tensor(data.features))
-    torch.testing.assert_close(scaled.min(dim=0).values, torch.tensor([-1.0, -1, -1, 0], dtype=torch.float64))
-    torch.testing.assert_close(scaled.max(dim=0).values, torch.tensor([1.0, 1, 1, 0], dtype=torch.float64))
-    forces = network.scale_output(torch.tensor(data.force_N))
-    assert (float(forces.min()), float(forces.max())) == pytest.approx((-1, 1))
-
-
 def test_a_rising_force_rises_everywhere_and_fits() -> None:
     training, fresh = synthetic(2000, 1), synthetic(1000, 3, noise_N=0.0)
     network = network_for(training, hidden=12)

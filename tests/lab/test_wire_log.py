@@ -26,7 +26,6 @@ from firmware_protocol.codec import (
     encode,
 )
 from firmware_protocol.framing import encode_frame
-from firmware_protocol.layouts import LAYOUTS
 from tormagd.lab import wire_log
 from tormagd.lab.main import main
 
@@ -86,21 +85,6 @@ def test_cantools_decodes_every_frame_with_names_and_units(
         suffix = {"mm": "_mm", "s": "_s", "A": "_A", "N": "_N", "V": "_V", "degC": "_C"}
         assert unit is None or name.endswith(suffix[unit])
     assert (units["force_N"], units["left_position_mm"], units["supply_V"]) == ("N", "mm", "V")
-
-
-def test_python_cans_viewer_reads_every_frame(
-    frames: list[can.Message], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["wire-log", "viewer"]) == 0
-    formats = tmp_path / "viewer.txt"
-    formats.write_text(capsys.readouterr().out, encoding="ascii")
-    _, structs = can.viewer._parse_viewer_args(["-i", "virtual", "-c", "test", "-d", str(formats)])
-    assert len(structs) == len(LAYOUTS)
-    for frame in frames:
-        values = can.viewer.CanViewer.unpack_data(frame.arbitration_id, structs, bytes(frame.data))
-        message = ours(frame)
-        ours_values = [float(getattr(message, name)) for name in message.__match_args__]
-        assert values[: len(ours_values)] == pytest.approx(ours_values)
 
 
 def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from tormagd.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
 from tormagd.model.force_curve import LARGEST_EXPONENT, Known, Network
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
-from tormagd.model.network import to_model, to_network
+from tormagd.model.network import to_network
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 
@@ -283,12 +283,6 @@ def test_its_weights_are_checked_too_and_stay_what_they_are(model: ForceModel) -
         model.hidden_weight[0, 0] = 1.0
 
 
-def test_a_network_survives_freezing(model: ForceModel) -> None:
-    again = to_model(to_network(model), model.metadata)
-    np.testing.assert_array_equal(again.hidden_weight, model.hidden_weight)
-    assert again.predict_one(*POINT) == model.predict_one(*POINT)
-
-
 def test_the_slope_is_that_of_finite_differences(model: ForceModel) -> None:
     low, high = (0.3, 12.0, 419.99, 40.0), (0.3, 12.0, 420.01, 40.0)
     slope = (model.predict_one(*high) - model.predict_one(*low)) / 0.02
@@ -469,14 +463,6 @@ def test_a_grid_of_fields_has_the_forces_of_its_fields(
     assert forces.dtype == dtype
     one_by_one = [curve.force_N(field) for field in fields.tolist()]
     assert forces == pytest.approx(one_by_one, rel=0, abs=accuracy * curve.magnitude_N)
-
-
-def test_its_state_is_the_one_asked_for(model: ForceModel) -> None:
-    curve = model.curve(0.3, 12.0, 41.0)
-    assert (curve.displacement_mm, curve.rate_mm_s, curve.cip_percent) == (0.3, 12.0, 41.0)
-    assert curve.magnitude_N == pytest.approx(
-        float(np.abs(model.physical.output_weight).sum()) + abs(model.physical.output_bias)
-    )
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])

@@ -17,9 +17,9 @@ from mcap.reader import make_reader
 
 from tormagd.recording.plot import figure, save_plot
 from tormagd.recording.reader import Recording, RecordingError, read_recording
-from tormagd.recording.series import bands, series, tracking_rms_N
+from tormagd.recording.series import series
 from tormagd.recording.ticks import TickBatch, decode_ticks
-from tormagd.recording.writer import RecordingWriter, plain_schema
+from tormagd.recording.writer import RecordingWriter
 from tormagd_client.messages import MessageError, Telemetry, Tick, encode
 
 START_NS = 1_790_000_000_000_000_000
@@ -86,18 +86,6 @@ def test_other_tools_find_json_messages_with_schemas(written):
         _, _, message = next(iter(reader.iter_messages(topics="/ticks")))
         assert message.log_time == START_NS
         assert json.loads(message.data)["left_mm"] == 35.0
-
-
-def test_the_telemetry_schema_has_every_field_in_plain_form():
-    schema = plain_schema(Telemetry)
-    assert set(schema["properties"]) == set(Telemetry.__struct_fields__)
-    assert schema["properties"]["setpoint_cf"] == {"type": "number"}
-    assert schema["properties"]["duty"] == {"type": "array", "items": {"type": "number"}}
-    assert schema["properties"]["tick"]["properties"] == {
-        "lateness_us": {"type": "number"},
-        "exec_us": {"type": "number"},
-    }
-    assert not {"$ref", "anyOf", "prefixItems"} & set(json.dumps(schema).replace('"', " ").split())
 
 
 def obey(path: Path) -> int:
@@ -208,16 +196,6 @@ def test_half_a_second_is_written_at_once(tmp_path):
     assert read_recording(path).ticks.t_ns.size == 150
 
 
-def test_a_silent_end_is_a_gap(tmp_path):
-    with RecordingWriter(tmp_path / "a.mcap") as writer:
-        for k in range(3):
-            writer.ticks(batch(*((20 * k + i, 0.0) for i in range(20)), columns=("t_ns", "x")))
-        assert not writer.note_silence(45_000_000)
-        assert writer.gaps == 0
-        assert writer.note_silence(80_000_000)
-    assert (writer.gaps, writer.longest_gap_ms) == (1, 80.0)
-
-
 def test_gaps_and_losses_are_counted(tmp_path):
     with RecordingWriter(tmp_path / "a.mcap") as writer:
         columns = ("t_ns", "x")
@@ -239,14 +217,6 @@ def test_columns_may_change_while_recording(tmp_path):
     assert np.isnan(ticks.numbers["old"][1])
     assert np.isnan(ticks.numbers["new"][0])
     assert ticks.words["operating_state"] == [(), ("ENABLED",)]
-
-
-def test_a_recording_cut_short_gives_what_is_whole(written):
-    written.write_bytes(written.read_bytes()[:-40])
-    recording = read_recording(written)
-    assert not recording.is_complete
-    assert recording.ticks.t_ns.size == 100
-    assert "cut short" in figure(recording, "x").get_suptitle()
 
 
 def test_a_recorder_killed_in_the_middle_of_a_chunk_loses_only_that(tmp_path):
@@ -296,26 +266,6 @@ def test_quantities_come_from_the_ticks_and_else_from_telemetry(written):
     assert series(recording, "gap_setpoint_mm").t_s.tolist() == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
     assert series(recording, "right_duty").values.tolist() == [-0.5] * 5
     assert series(recording, "field_mT") is None
-
-
-def test_bands_are_the_stretches_of_time_of_a_code(written):
-    recording = read_recording(written)
-    (limit,) = bands(recording, "limits")
-    assert (limit.name, limit.spans_s) == ("RATE", (pytest.approx((0.02, 0.06)),))
-    assert [(band.name, len(band.spans_s)) for band in bands(recording, "operating_state")] == [
-        ("ENABLED", 1),
-        ("FAULT", 1),
-    ]
-
-
-def test_tracking_error_counts_only_while_enabled(tmp_path, written):
-    assert tracking_rms_N(read_recording(written)) == pytest.approx(0.1)
-    path = tmp_path / "b.mcap"
-    with RecordingWriter(path) as writer:
-        columns = ("t_ns", "setpoint_cf", "measured_cf", "operating_state")
-        writer.ticks(batch(*((i, 1.0, 5.0, "DISABLED") for i in range(10)), columns=columns))
-        writer.ticks(batch(*((10 + i, 1.0, 1.2, "ENABLED") for i in range(10)), columns=columns))
-    assert tracking_rms_N(read_recording(path)) == pytest.approx(0.2)
 
 
 def test_the_picture_names_what_happened(written):

@@ -114,16 +114,6 @@ def test_lost_motion_on_reversal_is_backlash_and_twice_the_drag() -> None:
     assert lost_m == pytest.approx(BACKLASH_M + 2.0 * drag_N / STIFFNESS_N_M, abs=1e-6)
 
 
-def test_magnets_stronger_than_drag_keep_the_nut_on_one_flank() -> None:
-    axis = an_axis(drag_N=6.0)
-    for volts in (3.0, -3.0, 3.0):
-        for step in range(steps(0.05)):
-            axis.step(volts, 20.0)
-            # the first movement takes up the backlash from the unloaded start
-            if volts < 0.0 or step > steps(0.025):
-                assert 14.0 - 1e-6 <= axis.contact_N <= 26.0 + 1e-6
-
-
 def test_the_stops_hold_against_full_drive() -> None:
     for volts, stop_mm in ((12.0, 48.0), (-12.0, 22.0)):
         axis = an_axis(start_mm=35.0)
@@ -230,17 +220,3 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
             throughput_J += abs(electric_J) + abs(magnetic_J)
             stored_J = 0.5 * inertia * axis.speed_rad_s**2 + 0.5 * axis.contact_N**2 / STIFFNESS_N_M
             assert put_in_J + 0.01 * throughput_J + 1e-6 >= stored_J
-
-
-def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
-    axis = an_axis()
-    turn(axis, 0.05, 12.0)
-    speeds = []
-    while axis.speed_rad_s != 0.0:
-        axis.step(None, 0.0)
-        speeds.append(axis.speed_rad_s)
-    assert all(after < before for before, after in itertools.pairwise(speeds))
-    assert min(speeds) == 0.0
-    resting_at = axis.angle_rad
-    turn(axis, 0.1, None)
-    assert axis.angle_rad == resting_at

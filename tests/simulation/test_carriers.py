@@ -2,8 +2,6 @@
 
 import math
 import random
-from collections import Counter
-from itertools import pairwise
 
 import msgspec
 import pytest
@@ -62,21 +60,6 @@ def test_bytes_take_ten_bits_each_in_both_directions(baud: int) -> None:
             return
     (frame,) = FrameDecoder().feed(out)
     assert isinstance(decode(frame.function, frame.payload), Identity)
-
-
-def test_a_written_burst_arrives_one_byte_after_the_other() -> None:
-    device = a_device(baud=115_200)
-    frames = b"".join(encode_frame(2, n, encode(Drive(0.0, 0.0, DriveMode.OFF, n))) for n in range(1, 6))
-    device.receive(0.0, frames)
-    duration_s = len(frames) * 10 / 115_200
-    decoder = FrameDecoder()
-    received = decoder.feed(device.transmit(duration_s / 2.0))
-    assert len(received) < 6
-    received += decoder.feed(device.transmit(1.0))
-    states = [decode(f.function, f.payload) for f in received if f.function == FUNCTION[State]]
-    assert len(states) == 5
-    gaps_s = [after.device_time_s - before.device_time_s for before, after in pairwise(states)]
-    assert gaps_s == pytest.approx([len(frames) / 5 * 10 / 115_200] * 4, abs=2e-5)
 
 
 def answered(device: MessageDevice, time_s: float, counter: int) -> Packet:
@@ -290,17 +273,3 @@ def test_what_the_controllers_cannot_hold_is_lost_and_counted() -> None:
     assert device.lost == 9, "one is on the bus"
     run(device, 0.0, 0.5, 1e-3)
     assert device.messages.undecodable == 0
-
-
-def test_control_at_a_kilohertz_leaves_thirty_percent_of_the_bus() -> None:
-    device = a_bus()
-    device.receive(0.0, HELLO_FRAME)
-    device.transmit(0.01)
-    busy_s = device.busy_s
-    answers: Counter[int] = Counter()
-    for tick in range(500):
-        now_s = 0.01 + tick * 1e-3
-        device.receive(now_s, frame_of(Drive(0.1234, -0.1234, DriveMode.OFF, tick % 256)))
-        answers.update(delivery.frame.identifier for delivery in device.transmit(now_s + 0.999e-3))
-    assert answers[can_identifier(FUNCTION[State])] == answers[can_identifier(FUNCTION[Sense])] == 500
-    assert 0.3 < (device.busy_s - busy_s) / 0.5 < 0.7

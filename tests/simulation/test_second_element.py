@@ -66,16 +66,6 @@ def test_a_step_creeps_with_the_logarithm_of_time_and_comes_to_an_end() -> None:
     assert at_N[3] == pytest.approx(SecondElement(SECOND, 48.0, 0.1).kinetic_N, rel=0.01)
 
 
-def test_creep_does_not_depend_on_the_step() -> None:
-    found = []
-    for step_s in (1e-3, 1e-2):
-        element = SecondElement(SECOND, 90.0, step_s)
-        for _ in range(round(20.0 / step_s)):
-            element.advance(0.0, 55.0, SPEED_MM_S)
-        found.append(element.kinetic_N)
-    assert found[0] == pytest.approx(found[1], rel=1e-3)
-
-
 def test_friction_grows_with_the_logarithm_of_speed_and_with_rest() -> None:
     quiet = of(creeping_share=0.0)
     speeds = (1.0, 10.0, 100.0)
@@ -110,15 +100,6 @@ def test_the_hand_gets_back_no_more_than_the_springs_hold() -> None:
     assert min(stored_J) >= 0.0
     assert work_J > 0.05
     assert directions == {True, False}
-
-
-def test_the_same_bits_twice() -> None:
-    one, other = (Plant(SECOND, ReversingHand(2.0), seed=4) for _ in range(2))
-    for plant in (one, other):
-        plant.drive(-7.0, -6.0)
-        plant.advance(1.5)
-    assert one.truth == other.truth
-    assert one.sensed_force_N == other.sensed_force_N
 
 
 def test_warmth_weakens_it() -> None:

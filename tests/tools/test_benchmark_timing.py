@@ -1,8 +1,6 @@
 """The timing benchmarks on made-up measurements: the contract's keys and their arithmetic, whatever the machine."""
 
 import argparse
-from collections.abc import Callable
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -33,19 +31,6 @@ def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
     assert result["control_exec_us"]["mean"] == 50.0
     assert result["bare"]["merged_share"] == 0.0
     assert result["merged_share"] == pytest.approx(30 / 29_970)
-
-
-def test_ratios_to_another_checkout_are_medians_over_the_pairs() -> None:
-    def costing(tick_us: float, share: float) -> loop.Block:
-        return block(40.0, 0)._replace(exec_us=np.full(5, tick_us), core_share=share)
-
-    pairs = [
-        loop.Pair(costing(tick_us, share), block(40.0, 0), costing(100.0, 0.4))
-        for tick_us, share in ((30.0, 0.2), (10.0, 0.3), (20.0, 0.04))
-    ]
-    result = loop.summary(pairs, RealTime())
-    assert (result["against"]["tick_mean_ratio"], result["against"]["core_share_ratio"]) == (0.2, 0.5)
-    assert (result["core_share"], result["against"]["core_share"]) == (0.2, 0.4)
 
 
 def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
@@ -91,47 +76,6 @@ def test_virtual_time_is_measured() -> None:
     found = virtual_time.measure(argparse.Namespace(seconds=0.2, plant="sample_1"))["interpreted"]
     expected = {name: pytest.approx(1e3 / found["tick_us"][name], rel=0.01) for name in virtual_time.LOOPS}
     assert {name: found[name] for name in virtual_time.LOOPS} == expected
-
-
-def test_builds_take_turns_in_stretches_and_ratios_are_medians_over_them() -> None:
-    asked: list[tuple[str, str]] = []
-
-    def build(name: str, taken_us: float) -> Callable[[str, int], float]:
-        def tick_us(run: str, ticks: int) -> float:
-            asked.append((name, run))
-            assert ticks == virtual_time.STRETCH_TICKS
-            # the machine gives ever less; the builds, side by side, are as much apart as they were
-            return taken_us * (1 + (len(asked) - 1) // 4) * (2 if run == "whole_core" else 1)
-
-        return tick_us
-
-    builds = {"compiled": build("compiled", 20.0), "interpreted": build("interpreted", 100.0)}
-    found = virtual_time.take_turns(builds, 500)
-    assert all(len(taken) == 5 for loops in found.values() for taken in loops.values())
-    assert [name for name, run in asked[4:] if run == "whole_core"][:4:2] == ["compiled", "interpreted"]
-    result = virtual_time.summary(found, 1_000.0)
-    assert result["ratio"] == {"whole_core": 5.0, "position_loop": 5.0}
-    assert set(result["compiled"]) == {"whole_core", "position_loop", "tick_us"}
-
-
-def test_without_a_compiled_build_there_is_none() -> None:
-    result = virtual_time.summary(
-        {"interpreted": {"whole_core": [100.0, 300.0, 200.0], "position_loop": [50.0]}}, 1_000.0
-    )
-    assert result["compiled"] is None
-    assert (result["interpreted"]["whole_core"], result["interpreted"]["position_loop"]) == (5.0, 20.0)
-    assert "ratio" not in result
-
-
-def test_only_a_checkout_is_measured_against(tmp_path: Path) -> None:
-    assert loop.checkout(str(ROOT)) == ROOT
-    with pytest.raises(argparse.ArgumentTypeError, match="allowed is the root of a checkout"):
-        loop.checkout(str(tmp_path))
-
-
-def test_a_build_whose_loops_cannot_be_made_is_not_measured() -> None:
-    with pytest.raises(BrokenProcessPool):
-        virtual_time.build("no such plant").__enter__()
 
 
 def test_a_result_is_told_by_lines_and_tables() -> None:

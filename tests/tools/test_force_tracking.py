@@ -18,11 +18,9 @@ from rendering.cases import (
 from rendering.device_draws import DRAWN, SPREAD, drawn_device, evenly_drawn
 from rendering.following import Followed, publisher, tracking
 from rendering.signals import (
-    SCALED_N,
     TRIM_S,
     Kind,
     Signal,
-    palpation,
     pulse_signal,
     recorded_signals,
     staircase_signal,
@@ -169,15 +167,6 @@ def test_recorded_signals_are_in_the_devices_range(recordings) -> None:
     for signal in found:
         assert np.all(np.diff(signal.time_s) > 0.0)
         assert 0.55 <= signal.force_N.min() <= signal.force_N.max() <= (2.0 if signal.kind is Kind.HAND else 1.75)
-
-
-def test_a_palpation_touches_at_random_and_again_alike() -> None:
-    touched = palpation(1)
-    assert np.all(touched.force_N == palpation(1).force_N)
-    assert not np.all(touched.force_N == palpation(2).force_N)
-    assert SCALED_N[0] <= touched.force_N.min() <= touched.force_N.max() <= SCALED_N[1]
-    # a touch of a newton within a tenth of a second, smoothly
-    assert 10.0 < np.abs(np.gradient(touched.force_N, touched.time_s)).max() < 30.0
 
 
 def test_what_is_allowed_grows_with_what_the_ideal_carriages_miss() -> None:

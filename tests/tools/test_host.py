@@ -1,6 +1,5 @@
 """What the host takes, as bare timers and the kernel see it; made-up stalls, and one that is real."""
 
-import asyncio
 import os
 import signal
 import subprocess
@@ -10,9 +9,7 @@ from pathlib import Path
 
 import pytest
 from machines import host
-from machines.host import PERIOD_NS, Stall
-
-from tormagd.headroom.bare_timer import beat
+from machines.host import Stall
 
 
 def test_a_stall_costs_the_beats_that_were_due_in_it():
@@ -75,24 +72,6 @@ def test_a_timer_on_every_processor_and_a_process_that_waits(tmp_path: Path):
     assert set(found.waited) == {"test"}
     assert (tmp_path / "log").read_text() == ""
     assert len(watched._stalls) == min(len(os.sched_getaffinity(0)), host.MOST_TIMERS)
-
-
-def test_a_timer_that_is_held_up_says_for_how_long():
-    async def beats() -> list[int]:
-        ended, seen = asyncio.Event(), []
-
-        def on_beat(heartbeat, beats, now_ns):
-            seen.append(beats)
-            if len(seen) == 3:
-                time.sleep(0.02)
-            if len(seen) == 6:
-                ended.set()
-
-        await beat(PERIOD_NS, on_beat, ended)
-        return seen
-
-    assert asyncio.run(beats())[3] >= 20
-    assert Stall(1.0, 1.25).length_ms == pytest.approx(250.0)
 
 
 def test_processor_time_is_that_of_the_whole_family():

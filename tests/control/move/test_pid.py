@@ -113,16 +113,6 @@ def test_a_jump_of_the_reference_is_no_derivative_kick() -> None:
     assert updated(begun(), 0.0, ahead=0.3) == pytest.approx(0.3)
 
 
-def test_derivative_action_brakes() -> None:
-    asked = -10.0 * SHIPPED.proportional_per_mm * SHIPPED.derivative_time_s
-    assert updated(begun(), 0.0, -10.0) == pytest.approx(asked)
-
-
-def test_the_first_update_at_rest_on_target_asks_for_nothing() -> None:
-    stage = begun()
-    assert (updated(stage, 0.0), stage.integral, stage.is_saturated) == (0.0, 0.0, False)
-
-
 @given(error=errors, speed=speeds, integral=st.floats(-1.0, 1.0))
 def test_both_directions_are_alike(error: float, speed: float, integral: float) -> None:
     stage, mirrored = begun(integral=integral), begun(integral=-integral)

@@ -118,18 +118,6 @@ def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: 
         assert reference.gap_mm == pytest.approx(target, abs=0.01)
 
 
-@given(start=gaps, target=gaps, speed=st.floats(-100.0, 100.0), turning=st.floats(-1e4, 1e4), dt_s=periods)
-def test_opening_and_closing_are_alike(start: float, target: float, speed: float, turning: float, dt_s: float) -> None:
-    forth, _, _ = follow(MOST_MM_S2, Reference(start, 10.0), Reference(target, speed, turning), dt_s, SPEEDS)
-    back, _, _ = follow(MOST_MM_S2, Reference(-start, -10.0), Reference(-target, -speed, -turning), dt_s, SPEEDS)
-    assert back == Reference(-forth.gap_mm, -forth.speed_mm_s, -forth.acceleration_mm_s2)
-
-
-def test_a_target_at_rest_is_kept() -> None:
-    reference, is_limited, _ = follow(MOST_MM_S2, Reference(70.0), Reference(70.0), DT_S, SPEEDS)
-    assert (reference, is_limited) == (Reference(70.0), False)
-
-
 def test_either_way_has_its_own_limit() -> None:
     slow = SPEEDS.replaced(opening_mm_s=30.0)
     for target, most in ((95.0, 30.0), (45.0, LIMITS.gap_speed_mm_s)):
