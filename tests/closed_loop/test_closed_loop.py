@@ -13,13 +13,11 @@ import pytest
 from firmware_protocol.codec import DriveMode
 from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop, Sample, stream
-from tormagd.config import Config
 from tormagd.exact import packed, plain
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import RefusedError
 from tormagd.simulation.hand import ReversingHand
 
-CONFIG = Config()
 OPEN_MM = 95.0
 LEAD_IN_S = 0.7
 "A ramp to the first force of the pulse, and a hold there."
@@ -187,7 +185,18 @@ def test_stop_opens_and_has_to_be_cleared(armed: ClosedLoop) -> None:
     assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
-# -- faults --------------------------------------------------------------------------------------------------------
+# -- faults: those that are put into a running pulse are rows of the fault matrix --------------------------------------
+
+
+def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
+    """Killed with the gap closed: the device opens by itself, and nothing shuts on the way."""
+    loop = arm(faults=["worn_gearbox@2.5"])
+    publish(loop, lambda time_s: 1.6, 1.5)
+    closed_mm = loop.device.truth.gap_mm
+    for _ in range(2_500):
+        loop.skip()
+        assert loop.device.truth.gap_mm > closed_mm - 1.0
+    assert loop.device.truth.gap_mm > OPEN_MM - 2.0
 
 
 # -- repetition ----------------------------------------------------------------------------------------------------

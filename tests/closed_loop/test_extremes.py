@@ -100,12 +100,6 @@ def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
 # -- the clock -----------------------------------------------------------------------------------------------------
 
 
-def armed() -> ClosedLoop:
-    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
-    loop.arm(gap_plan(OPEN_MM))
-    return loop
-
-
 def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sample]:
     """The ticks on the way to a gap, each this long after the one before it."""
     samples = []
@@ -119,16 +113,16 @@ def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sa
 
 @settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
 @given(periods_s=st.lists(st.floats(1e-5, 4e-3), min_size=300, max_size=300))
-def test_jitter_of_a_few_periods_is_ridden_out(periods_s: list[float]) -> None:
-    samples = unevenly(armed(), 92.0, periods_s)
+def test_jitter_of_a_few_periods_is_ridden_out(arm, periods_s: list[float]) -> None:
+    samples = unevenly(arm(planned=False), 92.0, periods_s)
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
 
 
 @settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
 @given(periods_s=st.lists(st.sampled_from([1e-5, 1e-3, 0.03, 0.1]), min_size=60, max_size=60))
-def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(periods_s: list[float]) -> None:
-    samples = unevenly(armed(), 90.0, periods_s)
+def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(arm, periods_s: list[float]) -> None:
+    samples = unevenly(arm(planned=False), 90.0, periods_s)
     if max(periods_s) > 0.05:
         assert samples[-1].safety.operating_state is OperatingState.FAULT
     assert min(sample.truth.gap_mm for sample in samples) > 90.0 - 2.0
@@ -137,8 +131,8 @@ def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(periods_s: 
 # -- the target ----------------------------------------------------------------------------------------------------
 
 
-def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly() -> None:
-    loop = armed()
+def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm) -> None:
+    loop = arm(planned=False)
     on_the_way(loop, 85.0, 500)
     flipping = [ticked(loop, 80.0 + 10.0 * (tick % 2)) for tick in range(600)]
     assert all(79.9 < sample.truth.gap_mm < 90.1 for sample in flipping)

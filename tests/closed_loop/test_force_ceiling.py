@@ -49,7 +49,7 @@ def frozen() -> Callable[[float], float]:
 
 
 CONFIG = Config(scene="coronary")
-ASKED_N, F_MIN_N, MOST_N = 1.5, 0.65, 2.0
+ASKED_N, MOST_N = 1.5, 2.0
 NAMED = {Limit.SENSOR, Limit.DEVICE_OR_SENSOR}
 CEILING_N = 1.25 * MOST_N + 0.1
 WEAKEST_AND_STRONGEST = ("sample_2", "sample_3")

@@ -5,16 +5,12 @@ from collections.abc import Iterable
 import pytest
 
 from firmware_protocol.codec import DeviceMode
-from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample
-from tormagd.config import Config
 from tormagd.control.move.carriages import Carriages
 from tormagd.control.records import TimedSetpoint
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
 
 FORCE_N = 1.4
 ALLOWED_N = 0.1
@@ -23,21 +19,10 @@ SHORT_MS = [5, 8, 25, 47]
 LONG_MS = [60, 400]
 
 
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(Config())
-
-
-def armed(core: Core, plant: str = "sample_1") -> ClosedLoop:
-    loop = ClosedLoop(Config(), core.stepper(), core.planner(), VirtualDevice(load_plant(plant), SteadyHand(), seed=1))
-    loop.arm()
-    return loop
-
-
 @pytest.fixture
-def holding(core: Core) -> ClosedLoop:
+def holding(arm) -> ClosedLoop:
     """A loop that has settled on the force."""
-    loop = armed(core)
+    loop = arm()
     assert run(loop, FORCE_N, 1.6)[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
     return loop
 
@@ -175,9 +160,9 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
 
 
 @pytest.mark.parametrize("force_N", [0.2, 0.5])
-def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(core: Core, force_N: float) -> None:
+def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(arm, force_N: float) -> None:
     """The switches close 0.2 mm before where they did at homing: the carriages coast on, but not all the way."""
-    loop = armed(core)
+    loop = arm()
     run(loop, 1.2, 0.8)
     loop.device.messages._home_m -= 2e-4
     move = loop.stepper.move

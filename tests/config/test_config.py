@@ -50,10 +50,6 @@ def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
     assert (config.rates, config.device.options) == (Config().rates, {})
 
 
-def test_a_mark_of_the_byte_order_is_passed_over(tmp_path: Path) -> None:
-    path = tmp_path / "windows.toml"
-    path.write_bytes(b'\xef\xbb\xbfscene = "pulse"\r\n')
-    assert load_config(path).scene == "pulse"
 
 
 @pytest.mark.parametrize(
@@ -98,9 +94,6 @@ def test_so_does_a_refusal_that_takes_more_than_the_file(write, capsys, text: st
     assert told.endswith(f"{ending}\n")
 
 
-def test_a_resolved_configuration_is_a_configuration(write) -> None:
-    tables = msgspec.to_builtins(load_config(write("[motor]\nsupply_V = 24.0\n")))
-    assert msgspec.convert(tables, Config).motor.supply_V == 24.0
 
 
 @pytest.mark.parametrize(

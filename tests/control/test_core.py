@@ -391,3 +391,30 @@ def test_a_silent_device_is_held_where_it_is_and_named(running) -> None:
     assert Limit.DEVICE_SILENT not in back.limits
     assert abs(back.left_duty) < 0.2
     assert not running.faults
+
+
+@pytest.mark.parametrize(("stall_ms", "fault"), [(83, Fault.HOST_STALL), (36, Fault.DEVICE_COMMAND_TIMEOUT)])
+def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_ms: int, fault: Fault) -> None:
+    """One fault, though the device goes on saying that it heard nothing; a shorter stall cannot have done it."""
+    running.ticks += stall_ms
+    running.step(count=16)
+    assert not running.faults
+    opened = {"faults": DeviceFault.COMMAND_TIMEOUT, "mode": DeviceMode.RETRACTING}
+    assert running.run_into(fault, **opened) == 1
+    running.step(count=300, **opened | {"mode": DeviceMode.LATCHED})
+    assert running.faults == (fault,)
+    assert running.is_opened
+
+
+@settings(max_examples=60, deadline=None)
+@given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
+def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:
+    """However they follow each other, held or moving; the duty right after each is none."""
+    bench = make_bench().enabled()
+    for stall_ms, ran_ms in stalls_ms:
+        bench.ticks += stall_ms
+        bench.step(79.9)
+        assert bench.is_held
+        bench.step(79.9, count=ran_ms)
+        assert not bench.faults
+        assert abs(bench.move.left.integral) < 0.3

@@ -120,14 +120,6 @@ def test_a_refusal_tells_code_message_and_hint(fake_daemon, capsys, code, expect
     assert (captured.out, captured.err) == ("", "tormagctl enable: cannot enable\n  next: do this first\n")
 
 
-def test_a_status_without_a_key_names_it(fake_daemon, capsys):
-    fake_daemon.answers["status"] = lambda: {"ok": True, "result": {"operating_state": "ENABLED"}}
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "status")
-    assert (code, printed["error"]["code"]) == (3, "unintelligible")
-    assert "tormagd of an unknown version" in printed["error"]["message"]
-    assert "missing required field" in printed["error"]["message"]
-
-
 @pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
 def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, command):
     done = {"operating_state": DONE[command][1][0]}
@@ -184,12 +176,6 @@ def test_usage_errors_exit_2(arguments, capsys):
     with pytest.raises(SystemExit, match=r"^2$"):
         main(arguments)
     assert "usage:" in capsys.readouterr().err
-
-
-def test_a_configuration_names_the_endpoints(fake_daemon, tmp_path, capsys):
-    config = tmp_path / "tormagd.toml"
-    config.write_text(f'[endpoints]\ncontrol = "{fake_daemon.control}"\n')
-    assert run_json(capsys, "--config", str(config), "status")[0] == 0
 
 
 def test_scenes_are_listed_and_shown(capsys):

@@ -1,6 +1,4 @@
 import json
-import math
-import os
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tormagd.ctl.main import main
-from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
+from tormagd.ctl.waveform import SHAPES, read_csv, shape
 from tormagd.force_file import ForceFileError
 from tormagd_client.messages import Setpoint
 
@@ -129,14 +127,6 @@ def test_a_faulty_file_is_refused_by_row_column_and_value(tmp_path, capsys, cont
     assert named in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
-def test_what_is_no_regular_file_is_refused_rather_than_waited_for(tmp_path, capsys):
-    os.mkfifo(tmp_path / "pipe.csv")
-    (tmp_path / "folder.csv").mkdir()
-    for name in ("pipe.csv", "folder.csv"):
-        assert main(["--json", "send", str(tmp_path / name)]) == 2
-        assert f"{name}: allowed is a regular file" in json.loads(capsys.readouterr().out)["error"]["message"]
-
-
 @given(st.binary(max_size=300))
 def test_any_bytes_are_a_waveform_or_refused(tmp_path_factory, data):
     file = Path(tmp_path_factory.getbasetemp()) / "any.csv"
@@ -184,11 +174,3 @@ def test_shapes_have_their_frequency_and_their_step():
     assert (sine.at(0.25).force_N, sine.at(0.5).force_N) == pytest.approx((2.0, 1.0))
     pulse = shape("pulse", 1.0, 2.0, 0.5, 4.0)
     assert pulse.at(0.5).force_N == pytest.approx(pulse.at(2.5).force_N)
-
-
-def test_a_beat_has_a_second_lower_wave_and_closes():
-    heights = [beat(k / 200) for k in range(200)]
-    tops = [k for k in range(1, 199) if heights[k - 1] < heights[k] > heights[k + 1] or heights[k] == 1.0]
-    assert max(tops) / 200 == pytest.approx(0.55, abs=0.02)
-    assert 0.3 < heights[max(tops)] < 0.4
-    assert abs(heights[0] - beat(math.nextafter(1.0, 0.0))) < 1e-3

@@ -184,6 +184,19 @@ def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publ
         assert (publishing.force_N, publishing.age_s) == (tick, pytest.approx(0.001, abs=1e-5))
 
 
+@pytest.mark.parametrize("by_s", [-0.5, 0.5])
+def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publishing, by_s: float) -> None:
+    for tick in range(100):
+        publishing.now_s = tick * 0.002
+        publishing.send(tick, 1.0, "a", 0.0 if tick < 50 else -by_s)
+        assert publishing.age_s == pytest.approx(0.0, abs=1e-3)
+    assert publishing.counters() == (100, 0, 0)
+    found = publishing.of("a")
+    assert found.clock_steps == 1
+    assert f"it was set {'forward' if by_s > 0.0 else 'back'} by 0.500 s" in found.cause
+    assert found.cause in str(publishing.inbox.news(publishing.now_s))
+
+
 def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock(publishing: Publishing) -> None:
     assert not publishing.send(1, 2.0, "a", -AHEAD_S - 0.001)
     assert publishing.counters() == (0, 1, 0)
@@ -210,6 +223,18 @@ def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -
         if found.clock is not None:
             drifts_ppm.append(abs(found.clock.drift_ppm))
     assert max(drifts_ppm) > 200.0
+
+
+@pytest.mark.parametrize("drift_ppm", [200.0, -200.0])
+def test_a_drifting_clock_is_told(publishing: Publishing, drift_ppm: float) -> None:
+    noise = random.Random(1)
+    for tick in range(1_500):
+        publishing.now_s = tick * 0.01
+        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.001) - drift_ppm * 1e-6 * publishing.now_s)
+    found = publishing.of("a")
+    assert found.clock.windows > 8
+    assert found.clock.drift_ppm == pytest.approx(drift_ppm, abs=60.0)
+    assert f"ppm {'fast' if drift_ppm > 0.0 else 'slow'}" in found.cause
 
 
 def test_nothing_is_given_to_a_source_whose_stamps_were_refused(publishing: Publishing) -> None:

@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
+from scipy.optimize import brentq
 
 from tormagd.assembly.build import build_core, choose_solver
 from tormagd.config import Config
@@ -396,6 +397,29 @@ def solved(curve: ForceCurve, force_N: float, last_field_mT: float | None) -> Fi
     assert solution.confidence == curve.confidence(solution.field_mT, force_N - solution.predicted_force_N)
     assert 1 <= solution.iterations < MOST_EVALUATIONS
     return solution
+
+
+@given(units=steps, share=st.floats(0.0, 1.0), last=lasts)
+def test_the_root_is_that_of_brent(units: Steps, share: float, last: float | None) -> None:
+    curve = curve_of([*units, SMOOTH])
+    least_N, most_N = (curve.force_N(field) for field in RANGE_MT)
+    force = least_N + share * (most_N - least_N)
+    root = brentq(lambda field: curve.force_N(field) - force, *RANGE_MT, xtol=1e-9) if 0 < share < 1 else None
+    solution = solved(curve, force, last)
+    assert solution.reach is Reach.INSIDE
+    assert solution.field_mT == pytest.approx(RANGE_MT[round(share)] if root is None else root, rel=0, abs=ACCURACY_MT)
+
+
+@given(units=steps, beyond=st.floats(1e-9, 1e6), last=lasts)
+@example(units=[], beyond=1e-9, last=103.0)
+@example(units=[], beyond=1.0, last=RANGE_MT[0] + 0.5 * ACCURACY_MT)
+@example(units=[], beyond=1.0, last=RANGE_MT[1] - 0.5 * ACCURACY_MT)
+def test_out_of_reach_is_the_end_and_says_so(units: Steps, beyond: float, last: float | None) -> None:
+    curve = curve_of([*units, SMOOTH])
+    least_N, most_N = (curve.force_N(field) for field in RANGE_MT)
+    below, above = solved(curve, least_N - beyond, last), solved(curve, most_N + beyond, last)
+    assert (below.field_mT, below.reach) == (RANGE_MT[0], Reach.BELOW)
+    assert (above.field_mT, above.reach) == (RANGE_MT[1], Reach.ABOVE)
 
 
 @pytest.mark.parametrize("end", RANGE_MT)

@@ -11,8 +11,6 @@ from tormagd.assembly.build import build_core
 from tormagd.config import RealTime, load_config
 from tormagd.lab.told import lines
 
-ROOT = Path(__file__).parents[2]
-
 
 def block(lateness_us: float, merged: int) -> loop.Block:
     """Ten seconds in which every tick was equally late."""
