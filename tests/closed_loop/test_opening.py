@@ -1,10 +1,11 @@
 """After `disable`, `stop` or a fault the gap opens, on both buses; where it does not, that is named in time."""
 
-import random
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 import pytest
+from fault_matrix.bad_lines import BadSerialLine, losing
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.assembly.build import Core
@@ -188,21 +189,8 @@ def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
 @pytest.mark.parametrize("gap_mm", [50.0, 85.0])
 def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: float) -> None:
     loop = closed("serial", gap_mm=gap_mm)
-    device, chance = loop.device, random.Random(3)
-
-    class Loses:
-        def __getattr__(self, name: str) -> object:
-            return getattr(device, name)
-
-        def receive(self, now_s: float, data: bytes) -> None:
-            if chance.random() > 0.1:
-                device.receive(now_s, data)
-
-        def transmit(self, now_s: float) -> bytes:
-            data = device.transmit(now_s)
-            return data if chance.random() > 0.1 else b""
-
-    loop.device = Loses()  # type: ignore[assignment]
+    loop.device = line = BadSerialLine(loop.device)
+    line.spoil(partial(losing, 0.1))
     loop.command("disable")
     assert named_s(loop, seconds=4.0) is None
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0

@@ -50,8 +50,6 @@ def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
     assert (config.rates, config.device.options) == (Config().rates, {})
 
 
-
-
 @pytest.mark.parametrize(
     ("text", "line", "meant"),
     [
@@ -92,8 +90,6 @@ def test_so_does_a_refusal_that_takes_more_than_the_file(write, capsys, text: st
     told = capsys.readouterr().err
     assert told.startswith(f"tormagd: {path}: ")
     assert told.endswith(f"{ending}\n")
-
-
 
 
 @pytest.mark.parametrize(

@@ -2,19 +2,19 @@
 
 Everything is real but the time: the control core, the link, the backend with its driver, the kernel's pty or socket,
 the device with its wire. Time is virtual, so that every case is the same every time: the far end hands what the device
-has sent to the kernel when the virtual clock says so, spoiled by a seeded channel, and waits until it is readable.
+has sent to the kernel when the virtual clock says so, spoiled by a seeded line, and waits until it is readable.
 """
 
 import contextlib
 import fcntl
 import math
 import os
-import random
 import select
 import socket
 import struct
 import termios
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -22,6 +22,7 @@ import can
 import msgspec
 import numpy as np
 import pytest
+from fault_matrix.bad_lines import MakeWay, Way, damaging, delaying, doubling, losing, reordering, whole
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from tormagd.assembly.build import Core, build_core
@@ -62,60 +63,29 @@ COASTING_MM = 8.0
 "How far the carriages may still close after a fault on a late line: what was on its way, and their own speed."
 
 
-# -- channels ------------------------------------------------------------------------------------------------------
+# -- lines: as the fault matrix has them, and one more ---------------------------------------------------------------
 
 
-Fate = Callable[[random.Random, float], Sequence[float]]
-"""After which times, s, a unit comes out, one for each of its copies; it is given a die and the time."""
+def in_bursts(period_s: float) -> Way:
+    """Nothing for so long, then all of it at once."""
+    waiting: list[bytes] = []
+    periods = 0
 
-
-def at_once(draw: random.Random, now_s: float) -> Sequence[float]:
-    return (0.0,)
-
-
-class Channel:
-    """One direction of a line. A unit is what a transport carries at once: a frame, or a line of text."""
-
-    def __init__(self, fate: Fate, seed: int) -> None:
-        self._fate, self._random = fate, random.Random(seed)
-        self._waiting: list[tuple[float, bytes]] = []
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        """What comes out now, of these and earlier units."""
-        self._waiting += [(now_s + after_s, unit) for unit in units for after_s in self._fate(self._random, now_s)]
-        out = [unit for due_s, unit in self._waiting if due_s <= now_s]
-        self._waiting = [(due_s, unit) for due_s, unit in self._waiting if due_s > now_s]
+    def carry(now_s: float, units: list[bytes]) -> list[bytes]:
+        nonlocal waiting, periods
+        waiting += units
+        if math.floor(now_s / period_s) == periods:
+            return []
+        out, waiting, periods = waiting, [], math.floor(now_s / period_s)
         return out
 
-
-class Corruption(Channel):
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return [self._flipped(unit) if self._random.random() < 0.05 else unit for unit in units]
-
-    def _flipped(self, unit: bytes) -> bytes:
-        bit = self._random.randrange(8 * len(unit))
-        return bytes(byte ^ (1 << bit % 8 if at == bit // 8 else 0) for at, byte in enumerate(unit))
-
-
-class Reordering(Channel):
-    """One unit in five waits until another has passed it."""
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        out = []
-        for unit in units:
-            if not self._waiting and self._random.random() < 0.2:
-                self._waiting.append((now_s, unit))
-            else:
-                out += [unit, *(waited for _, waited in self._waiting)]
-                self._waiting.clear()
-        return out
+    return carry
 
 
 class Case(NamedTuple):
     """A kind of line and what has to come of it."""
 
-    fate: Fate = at_once
-    channel: type[Channel] = Channel
+    way: MakeWay = whole
     tolerance_N: float = math.inf
     "The force is rendered so well, in the end, where no fault appears."
     faults: frozenset[Fault] = frozenset()
@@ -138,19 +108,18 @@ TOO_LATE = frozenset({Fault.MEASUREMENT_STALE, Fault.DEVICE_COMMAND_TIMEOUT, Fau
 CASES = {
     "clean": Case(tolerance_N=0.05),
     "one byte at a time": Case(tolerance_N=0.05, is_bytewise=True),
-    "20% loss": Case(lambda draw, _: () if draw.random() < 0.2 else (0.0,), tolerance_N=0.05, counted=("lost",)),
+    "20% loss": Case(partial(losing, 0.2), tolerance_N=0.05, counted=("lost",)),
     # State carries a CRC everywhere, Sense and Status only on serial: there a force or a fault bit may be a wrong one
     "5% corruption": Case(
-        channel=Corruption, tolerance_N=0.5, faults=frozenset(Fault), counted=("corrupt", "resynchronisations")
+        partial(damaging, 0.05), tolerance_N=0.5, faults=frozenset(Fault), counted=("corrupt", "resynchronisations")
     ),
-    "duplicates": Case(lambda draw, _: (0.0,) * (2 if draw.random() < 0.3 else 1), tolerance_N=0.05),
-    "reordering": Case(channel=Reordering, tolerance_N=0.05, uncounted=("lost", "corrupt")),
+    "duplicates": Case(doubling, tolerance_N=0.05),
+    "reordering": Case(partial(reordering, 0.2), tolerance_N=0.05, uncounted=("lost", "corrupt")),
     # what the device says answers a drive of 60 ms ago: a loop around that would swing
-    "30 ms delay": Case(lambda draw, _: (0.03,), faults=TOO_LATE, named=TOO_LATE),
-    # nothing for 60 ms, then all of it at once
-    "burst": Case(lambda _, now_s: (math.ceil(now_s / 0.06) * 0.06 - now_s,), faults=TOO_LATE, named=TOO_LATE),
+    "30 ms delay": Case(partial(delaying, 0.03), faults=TOO_LATE, named=TOO_LATE),
+    "burst": Case(partial(in_bursts, 0.06), faults=TOO_LATE, named=TOO_LATE),
     # lost, and since then the port was opened again and the device asked who it is
-    "cut": Case(lambda *_: (), faults=TOO_LATE, named=TOO_LATE, link=LinkState.IDENTIFYING, losses=1),
+    "cut": Case(partial(losing, 1.0), faults=TOO_LATE, named=TOO_LATE, link=LinkState.IDENTIFYING, losses=1),
 }
 
 
@@ -342,11 +311,11 @@ def _frame(unit: bytes) -> CanFrame:
 class Line:
     """What the closed loop takes for its device: the real backend, a bad line, and the device behind it."""
 
-    def __init__(self, far: FarEnd, device: VirtualDevice, case: Case, seed: int) -> None:
+    def __init__(self, far: FarEnd, device: VirtualDevice, case: Case) -> None:
         self.far, self._device = far, device
         self.backend = choose(far.configured, CONFIG.rates).open()
         self._bytewise = case.is_bytewise
-        self._up, self._down = (case.channel(case.fate, seed + way) for way in (0, 1))
+        self._up, self._down = case.way(), case.way()
         self._to_host, self._from_host = FrameStream(), FrameStream()
 
     @property
@@ -356,8 +325,8 @@ class Line:
 
     def exchange(self, now_s: float) -> list[Message]:
         """What the backend has for the link now."""
-        units = self._up.carry(now_s, self.far.units(now_s))
-        for unit in self._down.carry(now_s, []):
+        units = self._up(now_s, self.far.units(now_s))
+        for unit in self._down(now_s, []):
             self.far.take(now_s, unit)
         messages: list[Message] = []
         for unit in units:
@@ -370,7 +339,7 @@ class Line:
     def send(self, now_s: float, message: Message) -> None:
         """The link's message goes through the backend."""
         self.backend.send(message)
-        for unit in self._down.carry(now_s, [self.far.hear()]):
+        for unit in self._down(now_s, [self.far.hear()]):
             for piece in self._pieces(unit):
                 self.far.take(now_s, piece)
 
@@ -442,8 +411,8 @@ def publisher(from_s: float) -> Callable[[float], object]:
 def lines(tmp_path: Path) -> Iterator[Callable[..., Line]]:
     with contextlib.ExitStack() as opened:
 
-        def make(transport: str, device: VirtualDevice, case: Case, seed: int = 3) -> Line:
-            line = Line(TRANSPORTS[transport](device, tmp_path), device, case, seed)
+        def make(transport: str, device: VirtualDevice, case: Case) -> Line:
+            line = Line(TRANSPORTS[transport](device, tmp_path), device, case)
             opened.callback(line.close)
             return line
 
@@ -516,7 +485,7 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
 
 @pytest.mark.parametrize("transport", EVERY_TRANSPORT)
 def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
-    tap = Tap(lines(transport, a_device(), Case(lambda *_: (0.0, 0.0))))
+    tap = Tap(lines(transport, a_device(), Case(doubling)))
     connection = Connection(CONFIG.device, lambda: tap, lambda: None, lambda: tap.now_s)
     connection.open(VirtualWire())
     for tick in range(1, 300):

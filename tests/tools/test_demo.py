@@ -190,7 +190,7 @@ def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, 
 
 @pytest.mark.parametrize("case", demo.CASES, ids=lambda case: case.label)
 def test_every_case_of_the_demo_is_played(case: Case) -> None:
-    times_s = np.arange(0.0, 1.0, 0.002)
+    times_s = np.arange(0.0, 0.5, 0.002)
     done = rehearse(Config(scene="pulse"), case, times_s, 1.5 + 0.1 * np.sin(2.0 * np.pi * times_s))
     assert np.isfinite(done.rendered_N).all()
-    assert len(done.rendered_N) > 500
+    assert len(done.rendered_N) > 250

@@ -72,8 +72,6 @@ def test_a_missed_bound_is_named() -> None:
     "case",
     [
         envelope.Case("draw 17", "flicks", "steps"),
-        envelope.Case("draw 25", "creep", "steps"),
-        envelope.Case("draw 2", "other reversals", "steps"),
         envelope.Case("sample_2", "300 mm/s", "1 N", 0.0, -300.0),
     ],
     ids=str,
