@@ -32,13 +32,12 @@ comes to on either bus in the [fault matrix](fault-matrix.md).
 _MATRIX_HEAD = """# Fault matrix
 
 Written by `python tools/safety_pages.py` from [evidence/faults.json](evidence/faults.json), a run of `tools/faults.py
---json`, which also has all times, what is stated, and what was tried before the cause had gone. All of it is virtual
-time and simulated devices.
+--json`, which also has all times. All of it is virtual time and simulated devices.
 
 Faults are put in while 1.8 ± 0.1 N are rendered at a turning handle; those of homing and of the start are there from
-the beginning. A row is of both buses, where they agree. *Safe after* is when the end that is stated began: the gap was
-open or at rest, or the limit was told. *Leads out* are the commands that the daemon [names itself](messages.md#status),
-once the cause has gone; afterwards the force is followed again within 0.15 N, and before that they came to nothing.
+the beginning. A row is of both buses, where they agree. *Safe after* is when the gap was open or at rest, or the limit
+was told. *Leads out* are the commands that the daemon names itself, once the cause has gone; afterwards the force is
+followed again within 0.15 N, and before that they came to nothing.
 
 """
 

@@ -79,14 +79,12 @@ def _head(share: float) -> str:
         "| `bandwidth.control_hz`, `inference_hz` | slower rates are refused; with `rates.of_scene = true` the daemon "
         "runs at these, control at 500 Hz at the least |\n"
         '| `terms` | `"all"`, `"required"` (what is measured here), or a table `[terms]` with a boolean each |\n\n'
-        "**Terms** are the parts of the controller's model (`tormagd/scenes/scene.py` describes them). One that is "
-        "left out is decided against when the daemon starts, and not computed. A term is *required* where its absence "
-        f"adds more than {share:.0%} of the tolerance to the RMS error of the force on sample 1, with the device "
-        "learned before and frozen, or while it is learned: learning hides what a term does. What is out is left out "
+        "**Terms** are the parts of the controller's model (`tormagd/scenes/scene.py` describes them). A term is "
+        f"*required* where its absence adds more than {share:.0%} of the tolerance to the RMS error of the force on "
+        "sample 1, with the device learned before and frozen, or while it is learned. The others are left out "
         f"together, and judged on samples 1, 2 and 3: within {JUDGED:g} of the tolerance, or no more than {share:.0%} "
-        "of it worse than with all terms; otherwise the term that counts most is put back, until it is, and those put "
-        "back before the last are tried again. `tormagctl scene explain NAME` prints a decision, and what changes at "
-        "half and at twice the tolerance."
+        "of it worse than with all terms; otherwise the term that counts most is put back, until it is. `tormagctl "
+        "scene explain NAME` prints a decision, and what changes at half and at twice the tolerance."
     )
 
 
@@ -118,11 +116,9 @@ def _terms(scenes: tuple[MeasuredScene, ...]) -> str:
     whole = [f"`{each.name}`" for each in scenes if each.left_out and not terms_of(load_scene(each.name)).left_out]
     return (
         "## What each term does\n\nWhat the absence of each adds to the RMS error on sample 1, mN: the greater of "
-        "frozen and learning. **Bold** is what the scene requires; beside a small figure it was put back. Nothing can "
-        "be told from a scene that is not met, so it requires all. `vitreoretinal` asks for forces that lie below the "
-        "device's least, from a handle that is too slow to teach what the device is. "
-        f"All terms run, whatever is required, in {', '.join(whole)}: they say so. What was asked once about single "
-        "terms is answered in [a decision](decisions/0009-what-a-scene-requires.md).\n\n"
+        "frozen and learning. **Bold** is what the scene requires; beside a small figure it was put back. A scene "
+        "that is not met requires all ([why `vitreoretinal` is not](decisions/0009-what-a-scene-requires.md)). All "
+        f"terms run, whatever is required, in {', '.join(whole)}: they say so.\n\n"
         + table(["scene", *(f"`{term}`" for term in TERMS)], rows)
     )
 
@@ -139,9 +135,8 @@ def _rates(scenes: tuple[MeasuredScene, ...]) -> str:
     ]
     return (
         "## Rates\n\nRMS on sample 1, mN, with all terms, over control / inference rate, Hz; setpoints come as often "
-        "as plans are made, or as the scene says. 83 Hz is the thesis's own rate, 1 / (4 + 8 ms). At 250 Hz of control "
-        "the position loop keeps 4.5 dB; the daemon never watches less often than 500 Hz, so that no scene gets 250. "
-        "Of the others each scene that is met gets the lowest that does what the usual, 1000 / 500, does.\n\n"
+        "as plans are made, or as the scene says. 83 Hz is the thesis's own rate. Each scene that is met gets the "
+        "lowest that does what the usual, 1000 / 500, does, but never 250 Hz of control.\n\n"
         f"{table(head, rows)}"
     )
 
@@ -158,12 +153,9 @@ def _search(scenes: tuple[MeasuredScene, ...]) -> str:
     ]
     return (
         "## The search\n\nWhere the handle's rate is not required there is nothing to search: the force over the gap "
-        "is one table, read by straight lines (`portrait`), and the network is asked once, at the start. Where a "
-        "search runs it is `newton`: in every scene the cheapest of the searches, with an error that no other "
-        "one beats by more than the tolerance's hundredth part, and for networks of 10 to 200 units [exact to 2 uN]"
-        "(inverse_trade.md). So nothing picks among them: a brake's model rises with the field everywhere, and one "
-        "neighbour is enough, as it is not on [the pad](tactile.md). `nearest` runs only where a brake's scene names "
-        "it: `pulse` does, to show the k-nearest search in `make run`, which shows `torch` and `thesis` beside it.\n\n"
+        "is one table, read by straight lines (`portrait`). Where a search runs it is `newton`: the cheapest "
+        "everywhere, with an error that no other one beats by more than the tolerance's hundredth part ([the "
+        "trade](inverse_trade.md)). `nearest` runs only where a scene names it: `pulse` does, for `make run`.\n\n"
         "RMS on sample 1, mN / processor time, %, with the chosen terms and rates and a search that is named.\n\n"
         + table(["scene", "runs, %", *(f"`{name}`" for name in names)], rows)
     )

@@ -108,7 +108,7 @@ def in_words(kind: Any) -> str:
     arguments = get_args(kind)
     if get_origin(kind) in (types.UnionType, Union):
         (known,) = (each for each in arguments if each is not type(None))
-        return f"{in_words(known)} or null"
+        return f"{in_words(known)}?"
     if get_origin(kind) is tuple:
         return f"[{in_words(arguments[0])}]" if arguments[-1] is ... else f"[{', '.join(map(in_words, arguments))}]"
     if get_origin(kind) is dict:

@@ -40,11 +40,10 @@ Written by `python tools/evidence.py inverse` with [its figures](evidence/invers
 not edit. Synthetic throughout: {workload}. One process, one thread, garbage collector frozen as in the daemon
 ({environment}).
 
-A solve gets a state of the handle, a force and the last field, and answers with a field, its confidence and its reach.
-The curve of force over field for that state is made in the time shown. Two errors are kept apart. The *solver error* is
-the distance to the network's own nearest root, found by bisection that shares no code with the searches. The *plant
-error* is the distance to the field at which the simulated element gives the force; it holds the network's error too,
-and no search can be better than its network. *Force* is the plant's force at the answer less the force asked.
+A solve gets a state of the handle, a force and the last field, and answers with a field. The *solver error* is the
+distance to the network's own nearest root, found by bisection that shares no code with the searches. The *plant error*
+is the distance to the field at which the simulated element gives the force: no search can be better than its network.
+*Force* is the plant's force at the answer less the force asked.
 
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
 
@@ -59,13 +58,10 @@ and no search can be better than its network. *Force* is the plant's force at th
   {speedup[linear-argmin]:.0f} times as fast as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as
   `vectorised-argmin`.
 
-Times are from several rounds over all variants, so that a disturbance of the machine meets all alike; p99 still holds
-whatever else ran. *Pareto* marks the variants that no faster one equals in plant error; differences under one encoder
-count of the gap (about 0.02 mT) do not count. Solver errors under 1e-6 mT are drawn there.
-
-The plant has pre-sliding and Stribeck friction, and no hysteresis or relaxation: those are errors of the model whatever
-the search. The networks were trained for this page; how good the *shipped* model is over its box is measured by
-`tools/envelope.py`, and said in [control.md](control.md#the-envelope).
+Times are from several rounds over all variants; p99 still holds whatever else ran. *Pareto* marks the variants that no
+faster one equals in plant error, to an encoder count of the gap (about 0.02 mT). Solver errors under 1e-6 mT are drawn
+there. The plant has no hysteresis or relaxation, and the networks were trained for this page; [how good the shipped
+ones are](guides/insert.md#the-shipped-models).
 
 ## All searches on {usual} units, and the Pareto variants of every size
 

@@ -238,10 +238,10 @@ MATRIX = (
 
 LEFT_OUT = {
     "motor that turns round in the middle of a run": "it is named (WRONG_DIRECTION after 31 ms), but is not safe: the "
-    "device opens by its own routine, which then presses that side shut. Only the wiring can see to that",
-    "bus-off of either node": "in virtual time it is a cable that is pulled; the real one is held by tests/hardware",
-    "NaN from a sensor": "the wire carries integers, and has none; that step takes none is held by tests/control",
-    "position that wraps": "it does every 117 mm, modulo 2^16 counts, and carriages travel 25; held by tests/hardware",
+    "device's own opening then presses that side shut",
+    "bus-off of either node": "in virtual time it is a cable that is pulled; tests/hardware",
+    "NaN from a sensor": "the wire carries integers; tests/control",
+    "position that wraps": "every 117 mm, and carriages travel 25; tests/hardware",
     "sensor's zero that drifts slowly": "it takes minutes and reversals; held by tests/closed_loop",
     "flood of setpoints or requests": "what is not read is decided by sockets; tools/endure.py siege and tests/daemon",
     "SIGKILL, SIGSTOP, SIGTERM, CPU hogs": "as far as a device can see they are silence, stalls and `disable`; with "
