@@ -147,15 +147,15 @@ def _allowed(hint: Any) -> str:
     inner, *metas = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
     elements = [each for each in get_args(inner) if each is not ...]
     if getattr(inner, "__origin__", None) is tuple:
-        return f"a list, each {_allowed(elements[0])}"
+        return f"list of: {_allowed(elements[0])}"
     bounds = [
         text.format(f"{getattr(meta, name):,}")
         for meta in metas
         for name, text in BOUNDS.items()
         if getattr(meta, name) is not None
     ]
-    words = {int: "a whole number", float: "a number", str: "a text", bool: "true, false"}
-    return " ".join((words.get(inner, "a table"), *bounds))
+    words = {int: "whole number", float: "number", str: "text", bool: "true, false"}
+    return " ".join((words.get(inner, "table"), *bounds))
 
 
 def _field_docs(kind: type[msgspec.Struct]) -> dict[str, str]:

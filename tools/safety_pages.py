@@ -24,9 +24,8 @@ HELD = {"named": "named", "safe": "ended safe", "in_time": "reacted in their sta
 
 _STATES_HEAD = """# Operating states, faults and limits
 
-Written by `python tools/safety_pages.py` from the tables that the daemon itself runs on, `operating_state.py` and
-`codes.py` in `tormagd/safety`. What happens beyond this process is told in [safety](safety.md), and what each fault
-comes to on either bus in the [fault matrix](fault-matrix.md).
+Written by `python tools/safety_pages.py` from the tables that the daemon itself runs on. Beyond this process:
+[safety](safety.md). What each fault comes to: the [fault matrix](fault-matrix.md).
 
 """
 _MATRIX_HEAD = """# Fault matrix
