@@ -249,7 +249,7 @@ def life(bench: Bench, generator: random.Random) -> Iterator[str]:
         yield name
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.randoms(use_true_random=False),
     left_mm=st.floats(45.0, 48.0),

@@ -58,7 +58,7 @@ PAGE = Path(firmware_protocol.__file__).parent / "README.md"
 Measured = tuple[State, Sense]
 SAMPLE = load_plant("sample_1")
 NEAR_HOME = msgspec.structs.replace(
-    SAMPLE, assumed=msgspec.structs.replace(SAMPLE.assumed, start_left_mm=45.5, start_right_mm=45.0)
+    SAMPLE, assumed=msgspec.structs.replace(SAMPLE.assumed, start_left_mm=46.2, start_right_mm=45.8)
 )
 """Homing takes less time, and the origin still moves by more than it may."""
 

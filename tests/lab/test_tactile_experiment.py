@@ -16,7 +16,7 @@ from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_sh
 @pytest.fixture(scope="module")
 def run():
     # whole groups left out are only looked at for their shape
-    return experiment.contract(replace(models.QUICK, thin=16, group_epochs=1))
+    return experiment.contract(replace(models.QUICK, samples_per_cycle=16, hold_samples=140, thin=16, group_epochs=1))
 
 
 def test_the_contract_s_keys_are_there_and_finite(run):
