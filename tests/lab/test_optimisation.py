@@ -58,16 +58,6 @@ def test_the_best_design_is_above_the_bar(
 
 
 @pytest.mark.usefixtures("few_generations")
-def test_two_starts_end_together_and_above_the_bar(use_case_1: Region) -> None:
-    """`tormag-lab reproduce-thesis` shows every start of both use cases."""
-    problem = Problem(use_case_1, "true", THESIS_SPEED_MM_S)
-    first, second = (found(problem, start) for start in (problem.lower, Design(40.0, 50.0, 170.0)))
-    assert first.coverage >= 0.97
-    assert first.coverage == pytest.approx(second.coverage, rel=0.01)
-    assert first.volume_mm3 == pytest.approx(second.volume_mm3, rel=0.05)
-
-
-@pytest.mark.usefixtures("few_generations")
 def test_no_design_on_a_grid_is_better_or_as_good_and_smaller(problem: Problem) -> None:
     best = found(problem, problem.lower)
     assert best.coverage >= 0.995
