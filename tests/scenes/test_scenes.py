@@ -160,7 +160,7 @@ def test_a_refusal_names_file_key_value_and_what_is_allowed(
         ({"bandwidth__inference_hz": "1000"}, ("rates.inference_hz = 250: allowed is at least 1000",)),
         (
             {"force__most_release_N_s": "3.0"},
-            ("allowed is at least 6.20: position.gap_speed_mm_s opens the gap by 38",),
+            ("allowed is at least 6.56: position.gap_speed_mm_s opens the gap by 38",),
         ),
         ({"force__resolution_N": "0.0005"}, ("force.resolution_N = 0.0005", "at least 0.001", "force sensor")),
         (
@@ -228,7 +228,7 @@ def test_the_scenes_own_gap_speed_counts_where_it_is_the_lower_one(write) -> Non
     with pytest.raises(ConfigError, match=r"gaps of 8\.33 mm/s"):
         build_core(Config(scene=path))
     build_core(Config(scene=write(signal__bandwidth_hz="0.02", **slow)))
-    sudden = write(force__most_release_N_s="5.0", **slow)
+    sudden = write(force__most_release_N_s="5.5", **slow)
     assert build_core(Config(scene=sudden)).scene.insert.gap_speed_mm_s == 8.33
 
 
