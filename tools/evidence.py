@@ -88,9 +88,9 @@ PARTS = {
         judges=False,
     ),
     "tracking": Part(
-        "tools/force_tracking.py samples draws staircase --json",
-        "the worst of {draws[0][count]} draws, RMS: {draws[0][worst_rms_N]:.4f} N with preview, "
-        "{draws[1][worst_rms_N]:.4f} N live; sample 1's staircase off by {staircase[rows][0][worst_N]:.4f} N at most",
+        "tools/force_tracking.py pulse --json",
+        "the pulse on samples 1 to 3, live, RMS: {pulse[sample_1][live]:.4f}, {pulse[sample_2][live]:.4f}, "
+        "{pulse[sample_3][live]:.4f} N",
         judges=False,
     ),
 }

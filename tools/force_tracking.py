@@ -4,9 +4,9 @@
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
 another, and of draws of the plant card; without draws, where an hour of `drift` of the force sensor leads. How well
-signals are followed: the pulse of `make run` on the `samples` and the second plant, and on random `draws`, 500
-setpoints a second, with a preview of 70 ms and without; a `staircase`; recorded `signals` from the folder that
-TORMAG_DATA names, with 400 ms, as a publisher can that plays a file, and live.
+signals are followed: the `pulse` of `make run` on all of these, and in full on the `samples` and the second plant, 500
+setpoints a second, with a preview of 70 ms and live; recorded `signals` from the folder that TORMAG_DATA names, with
+400 ms, as a publisher can that plays a file, and live.
 Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does with carriages
 that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
 """
@@ -33,11 +33,10 @@ OF_DEVICES = {
     "creep": cases.creep,
     "speeds": cases.speeds,
     "drift": cases.drift,
+    "pulse": cases.pulse,
 }
 OF_SIGNALS: dict[str, Callable[[Executor], Any]] = {
     "samples": cases.samples,
-    "draws": cases.draws,
-    "staircase": cases.staircase,
     "signals": cases.signals,
 }
 CASES = (*OF_DEVICES, *OF_SIGNALS)

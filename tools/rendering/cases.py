@@ -1,4 +1,4 @@
-"""The cases of `force_tracking.py`: how soon a device is known, and how well pulses, stairs and recorded forces are
+"""The cases of `force_tracking.py`: how soon a device is known, and how well pulses and recorded forces are
 followed. Each gives plain data.
 
 Nothing is removed from an error: no mean, no delay. A step has *arrived* ARRIVES_S after the device's ideal carriages
@@ -12,7 +12,7 @@ from concurrent.futures import Executor
 import msgspec
 import numpy as np
 
-from rendering.device_draws import SAMPLES, device, evenly_drawn, judging
+from rendering.device_draws import SAMPLES, device, judging
 from rendering.following import (
     FILE_PREVIEW_S,
     PREVIEW_S,
@@ -29,7 +29,6 @@ from rendering.following import (
 )
 from rendering.hands import Legs
 from rendering.signals import (
-    STAIR_S,
     TRIM_S,
     Kind,
     Signal,
@@ -37,21 +36,19 @@ from rendering.signals import (
     palpation,
     pulse_signal,
     recorded_signals,
-    staircase_signal,
     with_approach,
 )
-from tormagd.assembly.build import build_core
 from tormagd.assembly.profile import profile_of
 from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
-from tormagd.lab.arrays import Array, Json
+from tormagd.lab.arrays import Json
 from tormagd.lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
 from tormagd.safety.codes import Limit
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-STAIR_SCENE = "coronary"
+RECORDED_SCENE = "coronary"
 HIGH_N, LOW_N, ABOVE_N = 2.0, 0.7, 0.1
 "Steps begin at LOW_N, or ABOVE_N over what the open gap brakes where that is more."
 ARRIVES_S, LATER_S = 0.25, 1.0
@@ -75,9 +72,6 @@ OVER_IDEAL = 1.3
 ALLOWED_N = {Kind.PULSE: 0.006, Kind.HAND: 0.010}
 ALLOWED_WEAK_N = 0.015
 "A pulse on sample 2, whose motors are weak."
-EVEN_DRAWS = 32
-WITHIN_N = 0.018
-LEVEL_S = 0.5
 
 
 # -- how soon and how well a device is known ------------------------------------------------------------------------
@@ -297,59 +291,11 @@ def samples(pool: Executor) -> Json:
     return {"rows": rows}
 
 
-def draws(pool: Executor, count: int = EVEN_DRAWS) -> list[Json]:
-    """The pulse on random devices, after TRIM_S: with preview, then live."""
-    drawn, played = evenly_drawn(count), pulse_signal(DRAWN_PULSE_S)
-    result = []
-    for preview_s in (PREVIEW_S, 0.0):
-        runs = [pool.submit(track, plant, played, "pulse", preview_s) for plant, _ in drawn]
-        rows = []
-        for (_, factors), run in zip(drawn, runs, strict=True):
-            found = run.result()
-            rows.append(figures(found.since(TRIM_S)) | {"trim": found.trim, "limits": found.limits, "factors": factors})
-        rms = np.array([row["rms_N"] for row in rows])
-        result.append(
-            {
-                "preview": preview_s > 0.0,
-                "count": count,
-                "worst_rms_N": float(rms.max()),
-                "median_rms_N": float(np.median(rms)),
-                "within_18_mN": int(np.sum(rms <= WITHIN_N)),
-                "rows": rows,
-            }
-        )
-    return result
-
-
-def staircase(pool: Executor) -> Json:
-    """The coronary scene's staircase on the three samples: the level of each step over its last LEVEL_S."""
-    rows = []
-    signal = staircase_signal(build_core(Config(scene=STAIR_SCENE)).portrait.min_N)
-    runs = [pool.submit(track, device(name), signal, STAIR_SCENE, 0.0) for name in SAMPLES]
-    for name, run in zip(SAMPLES, runs, strict=True):
-        asked, levels = stair_levels(run.result())
-        rows.append(
-            {
-                "plant": name,
-                "steps": len(levels),
-                "is_monotone": bool(np.all(np.diff(levels) > 0.0)),
-                "worst_N": float(np.abs(levels - asked).max()),
-                "smallest_step_N": float(np.diff(levels).min()),
-                "asked_N": asked.tolist(),
-                "rendered_N": levels.tolist(),
-            }
-        )
-    return {"rows": rows}
-
-
-def stair_levels(found: Followed) -> tuple[Array, Array]:
-    """The force asked and rendered on every step after the first hold."""
-    asked, levels = [], []
-    for end_s in np.arange(TRIM_S + STAIR_S, found.time_s[-1] + 0.02, STAIR_S):
-        inside = (found.time_s > end_s - LEVEL_S) & (found.time_s <= end_s - 0.01)
-        asked.append(float(np.median(found.asked_N[inside])))
-        levels.append(float(found.rendered_N[inside].mean()))
-    return np.array(asked), np.array(levels)
+def pulse(name: str) -> Json:
+    """The RMS error of the pulse of `make run` after TRIM_S, N, on an unseen device: with a preview and live."""
+    played, previews_s = pulse_signal(DRAWN_PULSE_S), {"with preview": PREVIEW_S, "live": 0.0}
+    runs = {key: track(device(name), played, "pulse", preview_s) for key, preview_s in previews_s.items()}
+    return {key: found.since(TRIM_S).rms_N for key, found in runs.items()}
 
 
 def signals(pool: Executor) -> Json:
@@ -364,7 +310,7 @@ def signals(pool: Executor) -> Json:
         for preview_s in ((FILE_PREVIEW_S, 0.0) if signal.is_known_ahead else (0.0,))
         for name in SAMPLES
     ]
-    runs = [pool.submit(track, device(name), signal, STAIR_SCENE, preview_s) for name, signal, preview_s in cases]
+    runs = [pool.submit(track, device(name), signal, RECORDED_SCENE, preview_s) for name, signal, preview_s in cases]
     best = {(name, signal.name): pool.submit(ideal, name, signal) for signal in found for name in SAMPLES}
     rows = []
     for (name, signal, preview_s), run in zip(cases, runs, strict=True):

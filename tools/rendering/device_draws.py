@@ -13,19 +13,6 @@ FIRST_DRAW = 40
 TURNING_GAP_MM = 67.0
 "The field is drawn at this gap; the drawn exponent turns the law about it."
 SEED = 2026
-EVEN_SEED = 2024
-SPREAD = 0.2
-DRAWN = (
-    ("elastomer", "kinetic_friction"),
-    ("elastomer", "shear_modulus_kPa"),
-    ("field", "coefficient"),
-    ("motor", "resistance_Ohm"),
-    ("motor", "back_emf_V_s_rad"),
-    ("motor", "inertia_kg_m2"),
-    ("gear", "output_friction_Nm"),
-    ("screw", "friction_coefficient"),
-)
-"What is drawn evenly within +-SPREAD."
 
 
 def device(name: str) -> PlantParameters:
@@ -36,20 +23,6 @@ def device(name: str) -> PlantParameters:
 def judging(draws: int) -> list[str]:
     """The samples, the second plant, and the names of so many draws that only judge."""
     return [*SAMPLES, SECOND, *(f"draw {number}" for number in range(FIRST_DRAW, FIRST_DRAW + draws))]
-
-
-def evenly_drawn(count: int) -> list[tuple[PlantParameters, dict[str, float]]]:
-    """Sample 1 with each of DRAWN times a factor, and the factors."""
-    random = np.random.default_rng(EVEN_SEED)
-    found = []
-    for _ in range(count):
-        plant, factors = load_plant(SAMPLES[0]), random.uniform(1.0 - SPREAD, 1.0 + SPREAD, len(DRAWN)).tolist()
-        for (table, name), factor in zip(DRAWN, factors, strict=True):
-            part = getattr(plant, table)
-            other = msgspec.structs.replace(part, **{name: getattr(part, name) * factor})
-            plant = msgspec.structs.replace(plant, **{table: other})
-        found.append((plant, {".".join(each): factor for each, factor in zip(DRAWN, factors, strict=True)}))
-    return found
 
 
 def drawn_device(number: int) -> PlantParameters:

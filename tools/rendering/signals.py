@@ -3,7 +3,6 @@
 Shape and rhythm are measured; where a signal is not a force, the newtons are chosen, as `scaled` says.
 """
 
-import math
 import os
 from enum import StrEnum
 from pathlib import Path
@@ -32,7 +31,6 @@ TOUCHES_N = (0.9, 2.0)
 TOUCHED_S = 16.0
 TRIM_S = 10.0
 "The time the trim is given before the figures of other devices than sample 1 begin."
-STAIR_N, STAIR_TOP_N, STAIR_S = 0.1, 2.0, 1.5
 
 
 class Kind(StrEnum):
@@ -66,15 +64,6 @@ def pulse_signal(duration_s: float) -> Signal:
     """The demonstration's pulse."""
     low_N, high_N = PULSE_N
     return Signal("pulse", f"{low_N}..{high_N} N", *pulse_profile(duration_s, low_N, high_N, RATE_HZ))
-
-
-def staircase_signal(least_N: float) -> Signal:
-    """From the least force to STAIR_TOP_N in steps of STAIR_N, after TRIM_S at 1 N; nothing of it known ahead."""
-    first_N = math.ceil(least_N / STAIR_N) * STAIR_N
-    levels = np.concatenate([[1.0, least_N], np.arange(first_N, STAIR_TOP_N + 1e-9, STAIR_N)])
-    ends_s = np.cumsum([TRIM_S] + [STAIR_S] * (len(levels) - 1))
-    time_s = np.arange(round(float(ends_s[-1]) * 100)) / 100
-    return Signal("staircase", "as it is", time_s, levels[np.searchsorted(ends_s, time_s, side="right")], False)
 
 
 def recorded_signals(folder: Path) -> list[Signal]:
