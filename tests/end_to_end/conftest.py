@@ -149,9 +149,9 @@ class Rig:
         self.client.close()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def shared_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    """A device and a daemon that has found it, which outlive a test."""
+    """A device and a daemon that has found it, which outlive a test but not its module: they take a processor."""
     with contextlib.closing(Rig(tmp_path_factory.mktemp("rig"))) as made:
         yield made
 
