@@ -138,8 +138,8 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_THERE,
     ),
     Fault.PLAN_FAILED: Explanation(
-        "no gap could be planned: model or search refused a number",
-        "report it with the daemon's log; clear-fault",
+        "no gap could be planned: model or search refused a number, or a slow search is late",
+        "report the daemon's log, or choose a faster solver; clear-fault",
         Reaction.OPENING,
         100.0,
         "at once",
