@@ -50,7 +50,7 @@ live: $(VENV)/.dev
 	$(BIN)/python -P -m pytest -q -m live $$(grep -rlE 'mark\.live' tests --include='test_*.py')
 
 yielding: $(VENV)/.dev
-	nice -n 19 $(MAKE) --no-print-directory check interpreted WORKERS=0
+	nice -n 19 $(MAKE) --no-print-directory --jobs=2 check interpreted WORKERS=0
 
 # -P: what its owner keeps in this folder is not imported in place of a module
 compiled: $(VENV)/.dev
