@@ -62,10 +62,12 @@ def test_what_no_device_has_is_refused(changed: dict[str, object]) -> None:
         read_profile(data, bounds=BOUNDS, **OF)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("name", "value"), [("scale", 0.59), ("scale", 2.1), ("offset_N", 0.31), ("slow_factor", 0.5)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("scale", 0.59), ("scale", 2.1), ("offset_N", 0.31), ("slow_factor", 0.5), ("slow_factor", 9.0)]
+)
 def test_what_is_beyond_the_bounds_of_a_device_is_refused_by_name(name: str, value: float) -> None:
     data = json.dumps(json.loads(msgspec.json.encode(KEPT)) | {name: value}).encode()
-    with pytest.raises(ProfileError, match=f"^{name} = {value}: allowed is .* to "):
+    with pytest.raises(ProfileError, match=f"^{name} = {value:g}: allowed is .* to "):
         read_profile(data, bounds=BOUNDS, **OF)  # type: ignore[arg-type]
 
 

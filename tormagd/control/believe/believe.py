@@ -250,7 +250,7 @@ class Believe:
             self.strength.settle()
             if sensor.is_named or sensor.is_doubted:
                 self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
-        elif not self.knows_zero(now_s):
+        elif not zero_sd_N <= self._unknown_sd_N:
             self.strength.settle()
             sensor.compare(fit, model_N)
             self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
