@@ -218,6 +218,8 @@ class ClosedLoop:
         now_s = self.now_s
         self._port.advance(now_s)
         self.connection.receive()
+        if plan is None:
+            self._infer(now_s, setpoint)
         used = self._newest_plan() if plan is None else plan
         measurement, stepper = self.connection.measurement, self.stepper
         output = stepper.step(now_s, measurement, used)
@@ -226,8 +228,6 @@ class ClosedLoop:
         )
         self._output, self._setpoint = output, setpoint
         measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
-        if plan is None:
-            self._infer(now_s, setpoint)
         return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
 
     def skip(self) -> None:
