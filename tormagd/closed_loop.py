@@ -66,38 +66,14 @@ class Sample(Value):
         self.measurement: Final = measurement
 
 
-class VirtualWire:
-    """What every virtual wire is besides: the clock, and the event loop, which never calls back."""
-
-    def __init__(self) -> None:
-        self.now_s = 0.0
-
-    def clock(self) -> float:
-        """Virtual time, s."""
-        return self.now_s
-
-    def fileno(self) -> int:
-        """None: nothing waits in virtual time."""
-        return -1
-
-    def close(self) -> None:
-        """There is nothing to give back."""
-
-    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
-        """Takes no note of it: the closed loop reads in every tick."""
-
-    def remove_reader(self, fd: int) -> None:
-        """Nothing was noted."""
-
-
-class VirtualPort(VirtualWire):
+class VirtualPort:
     """A backend whose far end is the simulated device.
 
     `device` may be changed for one that behaves as badly as a test wants.
     """
 
     def __init__(self, device: SerialDevice) -> None:
-        super().__init__()
+        self.now_s = 0.0
         self.device = device
         self.stream = FrameStream()
         self._unread = b""
@@ -126,12 +102,15 @@ class VirtualPort(VirtualWire):
         """Hands one message to the device's line."""
         self.device.receive(self.now_s, self.stream.pack(message))
 
+    def close(self) -> None:
+        """There is nothing to give back."""
 
-class VirtualBus(VirtualWire):
+
+class VirtualBus:
     """The same with a device on a CAN bus, through the backend's own codec of frames."""
 
     def __init__(self, device: CanLine) -> None:
-        super().__init__()
+        self.now_s = 0.0
         self.device = device
         self.stream = CanStream(DEFAULT_NODE)
         self._unread: list[CanFrame] = []
@@ -164,6 +143,9 @@ class VirtualBus(VirtualWire):
         identifier, data = self.stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
 
+    def close(self) -> None:
+        """There is nothing to give back."""
+
 
 class ClosedLoop:
     """A daemon and its device in one process and one virtual time, which starts at 0."""
@@ -181,8 +163,8 @@ class ClosedLoop:
         self._setpoint: TimedSetpoint | None = None
         self._asked: Question | None = None
         self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
-        self.connection = Connection(config.device, self._port.open, self._lose_link, self._port.clock)
-        self.connection.open(self._port)
+        self.connection = Connection(config.device, self._port.open, self._lose_link)
+        self.connection.open(0.0)
 
     @property
     def now_s(self) -> float:
@@ -217,14 +199,14 @@ class ClosedLoop:
         self._ticks += 1
         now_s = self.now_s
         self._port.advance(now_s)
-        self.connection.receive()
+        self.connection.receive(now_s)
         if plan is None:
             self._infer(now_s, setpoint)
         used = self._newest_plan() if plan is None else plan
         measurement, stepper = self.connection.measurement, self.stepper
         output = stepper.step(now_s, measurement, used)
         self.connection.exchange(
-            output.left_duty, output.right_duty, output.mode, output.request, output.request_number
+            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
         self._output, self._setpoint = output, setpoint
         measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference

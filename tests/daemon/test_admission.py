@@ -7,10 +7,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import cycle
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import msgpack
 import pytest
@@ -21,13 +19,12 @@ from tormagd.daemon import admission
 from tormagd.daemon.admission import CONNECTIONS_PER_PEER, PLAIN
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.keys import KeyRing
-from tormagd_client.endpoints import Curve, Endpoints
+from tormagd_client.endpoints import ConfigError, Curve, Endpoints
 from tormagd_client.keys import KeyPair, fingerprint, generate, load_pair
 from tormagd_client.messages import VERSION, PeerReport, Reply, Request, decode, encode
 
 PATIENCE_S = 8.0
 NAMES = ("setpoint", "telemetry", "control", "recording")
-NEVER = 2**63
 KINDS = {"setpoint": zmq.XPUB, "control": zmq.DEALER, "telemetry": zmq.SUB, "recording": zmq.SUB}
 STRANGER = KeyPair(*zmq.curve_keypair())
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -60,7 +57,8 @@ class Rig:
         }
         curve = Curve(server_secret=str(self.keys / "server.key_secret"), also_local=True)
         endpoints = Config(endpoints=Endpoints(**self.addresses, curve=curve)).endpoints
-        self.endpoint = Endpoint(endpoints, keys=KeyRing(endpoints))
+        self.ring = KeyRing(endpoints)
+        self.endpoint = Endpoint(endpoints, keys=self.ring)
         self.server = load_pair(self.keys / "server.key_secret").public
         self.context = zmq.Context()
         self.answered: list[str] = []
@@ -91,8 +89,12 @@ class Rig:
         until_s = time.monotonic() + PATIENCE_S
         while not reached():
             assert time.monotonic() < until_s, f"not {what}: {self.endpoint.report()}"
-            self.endpoint.drain_setpoints()
-            self.endpoint.serve(time.monotonic(), self.answer, NEVER)
+            self.endpoint.look()
+            self.endpoint.take_setpoints()
+            self.endpoint.take_requests(self.answer)
+            self.endpoint.serve(self.answer)
+            self.endpoint.admission.update()
+            self.endpoint.tell(time.monotonic())
             self.endpoint.publish_ticks([(1,)], ("a",))
             time.sleep(0.002)
 
@@ -273,12 +275,12 @@ def test_a_list_that_is_read_again_lets_in_and_shuts_out(rig: Rig, caplog: pytes
     robot = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
     viewer = rig.peer(zmq.SUB, "recording", rig.pair("viewer"))
     viewer.subscribe(b"")
-    rig.until(lambda: robot.poll(0) and viewer.poll(0))
+    rig.until(lambda: robot.poll(0) and viewer.poll(0) and rig.endpoint.report().connections["recording"])
     (rig.keys / "publish/robot.key").rename(rig.keys / "robot.key")
     (rig.keys / "observe/viewer.key").rename(rig.keys / "viewer.key")
     generate("second", rig.keys, rig.keys / "publish")
-    rig.endpoint.admission.reload()
-    rig.until(lambda: "let in no more" in caplog.text, "read again")
+    rig.endpoint.admission.let_in(rig.ring.load_allowed())
+    assert "let in no more" in caplog.text
     robot.send(setpoint(1))
     second = rig.peer(zmq.XPUB, "setpoint", rig.pair("second"))
     rig.until(lambda: second.poll(0))
@@ -289,24 +291,21 @@ def test_a_list_that_is_read_again_lets_in_and_shuts_out(rig: Rig, caplog: pytes
     rig.until(lambda: rig.endpoint.report().connections["recording"] == 0, "the viewer cut off")
 
 
-def test_lists_that_are_no_good_leave_the_old_ones(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+def test_lists_that_are_no_good_leave_the_old_ones(rig: Rig) -> None:
     (rig.keys / "publish/broken.key").write_text("nothing")
-    rig.endpoint.admission.reload()
-    rig.until(lambda: "stay as they were" in caplog.text, "told")
-    assert "broken.key holds no public key" in caplog.text
+    with pytest.raises(ConfigError, match=r"broken\.key holds no public key"):
+        rig.ring.load_allowed()
     publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
     rig.until(lambda: publisher.poll(0))
 
 
 @over_tcp
 def test_a_stranger_that_leaves_before_it_was_asked_about_is_counted_once(rig: Rig) -> None:
-    rig.endpoint.admission.pause_s = lambda: 0.05
     for _ in range(5):
         stranger = rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
         time.sleep(0.03)
         stranger.close(linger=0)
     rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 0, "closed")
-    rig.endpoint.admission.pause_s = lambda: 0.0
     rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
     rig.until(lambda: rig.endpoint.report().refused >= 6, "refused")
     assert rig.endpoint.report().refused == 6
@@ -316,11 +315,9 @@ def test_a_stranger_that_leaves_before_it_was_asked_about_is_counted_once(rig: R
 def test_one_that_leaves_in_the_handshake_is_not_taken_for_one_that_was_asked_about(rig: Rig) -> None:
     publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
     rig.until(lambda: publisher.poll(0))
-    rig.endpoint.admission.pause_s = lambda: 0.05
     rig.peer(zmq.XPUB, "setpoint", STRANGER)
     rig.dial().close()
-    rig.until(lambda: rig.endpoint.report().refused, "refused")
-    rig.endpoint.admission.pause_s = lambda: 0.0
+    time.sleep(0.05)
     rig.until(lambda: rig.endpoint.report().refused >= 2, "counted")
     rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 1, "closed")
     assert rig.endpoint.report().refused == 2
@@ -367,14 +364,3 @@ def test_the_log_names_the_newest_and_is_not_flooded(rig: Rig, caplog: pytest.Lo
     lines = [record.getMessage() for record in caplog.records if "refused" in record.getMessage()]
     assert len(lines) == 1
     assert f"setpoint: 127.0.0.1, key {fingerprint(STRANGER.public)}: key not listed" in lines[0]
-
-
-@over_tcp
-def test_the_thread_waits_before_each_event_for_as_long_as_it_is_told_to(rig: Rig) -> None:
-    waited = Mock(side_effect=cycle([0.0, 0.01]))
-    rig.endpoint.admission.pause_s = waited
-    for _ in range(5):
-        rig.peer(zmq.DEALER, "control", STRANGER)
-    rig.until(lambda: rig.endpoint.report().refused == 5, "refused")
-    # each is asked about, and seen to come by another thread
-    rig.until(lambda: waited.call_count >= 2 * 5, "seen")

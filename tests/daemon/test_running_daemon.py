@@ -21,7 +21,7 @@ from tormagd.config import Config, Rates, RealTime
 from tormagd.control.core import Planner
 from tormagd.control.records import Plan
 from tormagd.daemon import daemon as daemon_module, notify
-from tormagd.daemon.callbacks import KERNEL, Delay
+from tormagd.daemon.beat import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.hardware.backend import BackendError
 from tormagd.physics.errors import DomainError
@@ -154,8 +154,7 @@ class Running:
         self.planner = FailingPlanner(self.daemon._inference.planner)
         self.daemon._inference.planner = self.planner  # type: ignore[assignment]
         # what was bound before the clock was made
-        self.daemon._inference._clock_ns = self.daemon._callbacks._clock_ns = time.monotonic_ns
-        self.daemon._connection._clock = time.monotonic
+        self.daemon._inference._clock_ns = self.daemon._phases._clock_ns = time.monotonic_ns
         self.clock.slow()
         self._run = asyncio.create_task(self.daemon.run())
         while not Heartbeat.made:
@@ -170,7 +169,6 @@ class Running:
         for _ in range(times):
             self.clock.now_ns += self._heartbeat.period_ns
             self.port.advance(time.monotonic())
-            self.daemon._connection.receive()
             asyncio.get_running_loop().call_soon(self.daemon._beat, self._heartbeat)
             await asyncio.sleep(0)
 
@@ -378,7 +376,7 @@ def test_a_homing_that_is_over_shows_as_one_that_succeeded(running: Running) -> 
     telemetry = running.daemon._telemetry
     for _ in range(PATIENCE_TICKS):
         running.port.advance(time.monotonic() + 0.5e-3)  # a look between two ticks
-        running.daemon._connection.receive()
+        running.daemon._connection.receive(time.monotonic())
         look = telemetry._build_status(telemetry._newest)
         if not look.is_busy:
             break

@@ -42,6 +42,11 @@ from tormagd_client.endpoints import ConfigError
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 
 
+def descriptor(backend: Any) -> int:
+    """What is readable when something has come: the daemon waits for nothing."""
+    return int(backend._fd)
+
+
 def frame_of(message: Message, node: int = 1) -> tuple[int, bytes]:
     return CanStream(node).pack(message)
 
@@ -68,7 +73,7 @@ STATUS_FRAME = bus_frame(STATUS)
 
 
 def wait_readable(backend: Backend) -> None:
-    assert select.select([backend.fileno()], [], [], 5.0)[0]
+    assert select.select([descriptor(backend)], [], [], 5.0)[0]
 
 
 def next_of(backend: CanBackend) -> list[Message]:
@@ -132,7 +137,7 @@ def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
     room = iter([3, 0, 7, 0, 0, 100, 100])
 
     def write(descriptor: int, data: bytes) -> int:
-        assert descriptor == port.fileno()
+        assert descriptor == port._fd
         count = next(room)
         if not count:
             raise BlockingIOError

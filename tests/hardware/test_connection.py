@@ -2,7 +2,6 @@
 
 import itertools
 from collections import deque
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -73,16 +72,13 @@ class Firmware:
 class Port:
     """A backend over nothing: what the device says waits in a queue."""
 
-    def __init__(self, bench: "Bench", fd: int) -> None:
-        self.bench, self.fd = bench, fd
+    def __init__(self, bench: "Bench") -> None:
+        self.bench = bench
         self.waiting: deque[Message] = deque()
         self.statistics = SimpleNamespace(
             frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0, unsent=0, refused={}
         )
         self.is_dead = self.is_closed = False
-
-    def fileno(self) -> int:
-        return self.fd
 
     def receive(self) -> list[Message]:
         assert not self.is_closed
@@ -122,7 +118,6 @@ class Bench:
         self.ports: list[Port] = []
         self.sent: list[type[Message]] = []
         self.attempts_s: list[float] = []
-        self.readers: dict[int, Callable[[], None]] = {}
         self.losses = 0
         self.identity = US
         self.is_there = self.has_status = self.is_armed = True
@@ -132,7 +127,7 @@ class Bench:
         "The device that was asked, by the losses before it; None if there was none to ask."
         self.accepted_before = 0
         self.seen = [LinkState.CLOSED]
-        self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose, lambda: self.now_s)
+        self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose)
 
     @property
     def now_s(self) -> float:
@@ -149,20 +144,13 @@ class Bench:
             raise BackendError("/dev/tormag: there is no such port", "plug the device in")
         if self.is_held:
             raise BackendError("/dev/tormag: another process holds it", "tormagctl ports says who")
-        self.ports.append(Port(self, 10 + len(self.ports)))
+        self.ports.append(Port(self))
         return self.ports[-1]
 
     def _lose(self) -> None:
         self.losses += 1
         if self.is_armed:
             self.ask(DeviceRequest.RETRACT)  # the core latches, and wants the gap open
-
-    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
-        assert fd not in self.readers
-        self.readers[fd] = callback
-
-    def remove_reader(self, fd: int) -> None:
-        del self.readers[fd]
 
     # what happens
     def ask(self, request: DeviceRequest) -> None:
@@ -181,15 +169,14 @@ class Bench:
                 elif self.ms % 20 == 0 and self.has_status and not self.is_mute:
                     port.waiting.append(self.firmware.status())
             if not is_stalled:
-                self.wake()
-                self.connection.exchange(0.0, 0.0, DriveMode.OFF, self.request, self.number)
-                self.look()
+                self.beat()
 
-    def wake(self) -> None:
-        """The event loop's turn."""
-        if (port := self.port) is not None and (port.waiting or port.is_dead):
-            self.readers[port.fd]()
-            self.look()
+    def beat(self) -> None:
+        """The daemon's period."""
+        self.connection.receive(self.now_s)
+        self.look()
+        self.connection.exchange(self.now_s, 0.0, 0.0, DriveMode.OFF, self.request, self.number)
+        self.look()
 
     def look(self) -> None:
         if (state := self.connection.state) is not self.seen[-1]:
@@ -201,7 +188,7 @@ class Bench:
             self.port.is_dead = True
 
     def running(self) -> "Bench":
-        self.connection.open(self)
+        self.connection.open(self.now_s)
         self.pass_ms(100)
         assert self.connection.state is LinkState.RUNNING
         assert self.connection.measurement is not None
@@ -236,7 +223,7 @@ def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
     if not bench.is_there:
         bench.unplug()
     if not is_running:
-        bench.connection.open(bench)
+        bench.connection.open(bench.now_s)
     bench.pass_ms(after_ms)
     report = bench.connection.report()
     assert (report.state, bench.connection.state, bench.connection.measurement) == (str(state), state, None)
@@ -276,16 +263,15 @@ def test_the_core_is_told_of_a_loss_once_and_within_a_tenth_of_a_second(bench: B
 
 
 def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(bench: Bench) -> None:
-    """Whichever the event loop wakes first after a stall, the timer or the port."""
     bench.running().pass_ms(500, is_stalled=True)
     bench.ms += 1
-    bench.connection.exchange(0.0, 0.0, DriveMode.OFF, bench.request, bench.number)
+    bench.beat()
     assert (bench.connection.state, bench.losses) == (LinkState.RUNNING, 0)
 
 
 def test_a_device_whose_first_word_is_who_it_is_runs_at_once(bench: Bench) -> None:
     bench.is_mute = True
-    bench.connection.open(bench)
+    bench.connection.open(bench.now_s)
     bench.pass_ms(1_100)
     bench.is_mute = bench.has_status = False
     bench.pass_ms(1_000)
@@ -329,7 +315,6 @@ def test_a_backend_that_shows_no_stream_has_no_frames_in_a_black_box(bench: Benc
 
 def test_a_closed_connection_stays_closed(bench: Bench) -> None:
     bench.running().connection.close()
-    assert bench.readers == {}
     bench.pass_ms(3_000)
     assert bench.connection.state is LinkState.CLOSED
     assert len(bench.ports) == 1
@@ -367,7 +352,7 @@ class Cables(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.bench = Bench()
-        self.bench.connection.open(self.bench)
+        self.bench.connection.open(self.bench.now_s)
         self.bench.look()
 
     @rule(ms=st.integers(1, 150))
@@ -405,10 +390,9 @@ class Cables(RuleBasedStateMachine):
         assert state is LinkState.RUNNING or connection.measurement is None
 
     @invariant()
-    def one_port_is_open_at_most_and_watched(self) -> None:
-        still_open = [port.fd for port in self.bench.ports if not port.is_closed]
+    def one_port_is_open_at_most(self) -> None:
+        still_open = [port for port in self.bench.ports if not port.is_closed]
         assert len(still_open) <= 1
-        assert list(self.bench.readers) == still_open
         assert (self.bench.connection.state in (LinkState.BACK_OFF, LinkState.LOST)) == (not still_open)
 
     @invariant()
@@ -430,7 +414,7 @@ class Cables(RuleBasedStateMachine):
         if self.bench.request is DeviceRequest.RETRACT:
             assert Retract in self.bench.firmware.accepted[self.bench.accepted_before :]
         self.bench.connection.close()
-        assert self.bench.readers == {}
+        assert all(port.is_closed for port in self.bench.ports)
 
 
 Cables.TestCase.settings = settings(

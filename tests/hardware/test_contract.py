@@ -26,7 +26,7 @@ from fault_matrix.bad_lines import MakeWay, Way, damaging, delaying, doubling, l
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop, Sample, VirtualWire, stream
+from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Device
 from tormagd.exact import plain
 from tormagd.hardware.backend import Backend, BackendError, choose
@@ -64,6 +64,11 @@ COASTING_MM = 8.0
 
 
 # -- lines: as the fault matrix has them, and one more ---------------------------------------------------------------
+
+
+def descriptor(backend: Any) -> int:
+    """What is readable when something has come: the daemon waits for nothing."""
+    return int(backend._fd)
 
 
 def in_bursts(period_s: float) -> Way:
@@ -161,10 +166,10 @@ class PtyEnd(Pty):
 
     def say(self, unit: bytes, backend: Backend) -> None:
         """Hands a unit to the kernel, and waits until the backend can read it."""
-        expected = _waiting(backend.fileno()) + len(unit)
+        expected = _waiting(descriptor(backend)) + len(unit)
         os.write(self.descriptors()[0], unit)
-        while _waiting(backend.fileno()) < expected:
-            assert select.select([backend.fileno()], [], [], PATIENCE_S)[0], "the backend gets nothing"
+        while _waiting(descriptor(backend)) < expected:
+            assert select.select([descriptor(backend)], [], [], PATIENCE_S)[0], "the backend gets nothing"
 
 
 class SerialEnd(PtyEnd, PtyDoor):
@@ -250,7 +255,7 @@ class BusEnd(PacketEnd):
         frame = _frame(unit)
         self._echoes = [*self._echoes[-64:], unit]
         self.bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False), timeout=0)
-        assert select.select([backend.fileno()], [], [], PATIENCE_S)[0], "the backend gets nothing"
+        assert select.select([descriptor(backend)], [], [], PATIENCE_S)[0], "the backend gets nothing"
 
     def close(self) -> None:
         self.bus.shutdown()
@@ -368,7 +373,7 @@ class Tap:
 
     def __init__(self, line: Line) -> None:
         self._line = line
-        self.statistics, self.fileno, self.close = line.backend.statistics, line.backend.fileno, line.backend.close
+        self.statistics, self.close = line.backend.statistics, line.backend.close
         self.now_s = 0.0
         self.heard: list[Message] = []
 
@@ -486,12 +491,12 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
 @pytest.mark.parametrize("transport", EVERY_TRANSPORT)
 def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
     tap = Tap(lines(transport, a_device(), Case(doubling)))
-    connection = Connection(CONFIG.device, lambda: tap, lambda: None, lambda: tap.now_s)
-    connection.open(VirtualWire())
+    connection = Connection(CONFIG.device, lambda: tap, lambda: None)
+    connection.open(0.0)
     for tick in range(1, 300):
         tap.now_s = tick * PERIOD_S
-        connection.exchange(0.0, 0.0, DriveMode.OFF, DeviceRequest.NONE, 0)
-        connection.receive()
+        connection.exchange(tap.now_s, 0.0, 0.0, DriveMode.OFF, DeviceRequest.NONE, 0)
+        connection.receive(tap.now_s)
     assert connection.state is LinkState.RUNNING
     states = sum(isinstance(message, State) for message in tap.heard)
     assert states > 100

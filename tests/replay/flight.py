@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from mcap.reader import make_reader
@@ -15,6 +14,7 @@ from tormagd.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import TimedSetpoint
+from tormagd.daemon.beat import Beat
 from tormagd.daemon.black_box import header
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
@@ -43,18 +43,16 @@ class Flight:
     def __init__(self, config: Config, core: Core, device: VirtualDevice | VirtualBus) -> None:
         self.config, self.core, self.planner = config, core, core.planner()
         self.ring, self._journal, self._ticks = Ring(), Journal(), 0
-        self._is_stepped = False
+        self._is_stepped, self._now_ns = False, 0
         self.loop = ClosedLoop(config, core.stepper(), self.planner, device)
         self.loop.connection.traffic = self
-        self._asked: TimedSetpoint | None = None
         self._inbox = SetpointInbox()
-        endpoint: Any = SimpleNamespace(inbox=self._inbox, drain_setpoints=self._drain)
         period_ns = NS // config.rates.inference_hz
         self._inference = InferenceLoop(
             self.planner,
-            endpoint,
+            self._inbox,
             period_ns,
-            self._clock_ns,
+            clock_ns=self._clock_ns,
             journal=self._journal,
             on_failure=self._fail,
             beside=self if core.element.is_beside else None,  # type: ignore[arg-type]
@@ -65,10 +63,12 @@ class Flight:
     def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
         """One control period."""
         self._is_stepped = False
+        due_ns = self._now_ns + NS // self.config.rates.control_hz
+        self._now_ns, beat = due_ns, Beat(due_ns, due_ns, 0)
+        self._inference.plan(beat, self.loop.stepper.measured, is_asked=self._drain(setpoint))
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
-        self._asked = setpoint
-        self._inference.after_tick(self.loop.stepper.measured)
+        self._inference.foresee(beat)
         record = tick_record(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
         self._journal.ticked(record)
         self._ticks += 1
@@ -81,7 +81,7 @@ class Flight:
     def answer(self) -> Answer | None:
         """Of the search beside the plans, which takes some periods."""
         question = self._question
-        if question is None or self.loop.now_s - question.time_s < SEARCH_S:
+        if question is None or self._now_ns / NS - question.time_s < SEARCH_S:
             return None
         self._question = None
         return self.planner.aim.answer_to(question)
@@ -113,13 +113,13 @@ class Flight:
     def _remember(self) -> None:
         self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory())
 
-    def _drain(self) -> bool:
-        """Whether a setpoint has come."""
-        before, self._inbox.newest = self._inbox.newest, self._asked
-        return self._asked is not None and (before is None or self._asked.stamp_s > before.stamp_s)
+    def _drain(self, setpoint: TimedSetpoint | None) -> bool:
+        """Whether it is a new one."""
+        before, self._inbox.newest = self._inbox.newest, setpoint
+        return setpoint is not None and (before is None or setpoint.stamp_s > before.stamp_s)
 
     def _clock_ns(self) -> int:
-        return round(self.loop.now_s * NS)
+        return self._now_ns
 
     def _fail(self) -> None:
         self._journal.latched(Fault.PLAN_FAILED)

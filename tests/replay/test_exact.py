@@ -123,10 +123,10 @@ def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core
     for tick in range(400):
         planned, setpoint = planner.planned, asked(loop.now_s)
         sample = loop.tick(setpoint)
-        assert stepper_again.step(sample.time_s, sample.measurement, planner_again.planned) == sample.output
         if planner.planned is not planned:
             assert planner_again.plan(sample.time_s, setpoint, stepper_again.measured) == planner.planned
             planner_again.foresee()
+        assert stepper_again.step(sample.time_s, sample.measurement, planner_again.planned) == sample.output
         if tick % 50 == 0:
             assert first_difference(plain(loop.stepper), plain(stepper_again)) is None
             assert first_difference(plain(planner), plain(planner_again)) is None

@@ -197,7 +197,7 @@ def test_a_changed_number_is_found_in_its_tick(core: Core, box: BlackBoxFile, co
     assert done.ticks == CHANGED_TICK - 1 - 3_000
 
 
-def test_a_changed_setpoint_is_found_in_the_next_tick(core: Core, box: BlackBoxFile) -> None:
+def test_a_changed_setpoint_is_found_in_its_tick(core: Core, box: BlackBoxFile) -> None:
     places = list(ticks_of(COLUMNS, box.entries))
     place = next(p for p in range(places[3_400], len(box.entries)) if box.entries[p][0] == "plan")
     entries = list(box.entries)
@@ -205,8 +205,7 @@ def test_a_changed_setpoint_is_found_in_the_next_tick(core: Core, box: BlackBoxF
     entries[place] = ["plan", now_s, [setpoint[0] + 1e-9, *setpoint[1:]]]
     tick = 1 + next(number for number, p in enumerate(places) if p > place)
     found = rerun(core, COLUMNS, entries, 3.0).difference
-    # the plan is made at the end of a period, for the next one's step
-    assert (found.tick, found.field) == (tick + 1, "setpoint_cf")
+    assert (found.tick, found.field) == (tick, "setpoint_cf")
 
 
 def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> None:

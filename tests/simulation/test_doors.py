@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -43,6 +44,11 @@ HELLO = Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)
 IDENTITY = can_identifier(FUNCTION[Identity])
 STATUS = can_identifier(FUNCTION[Status])
 Start = Callable[..., "subprocess.Popen[str]"]
+
+
+def descriptor(backend: Any) -> int:
+    """What is readable when something has come: the daemon waits for nothing."""
+    return int(backend._fd)
 
 
 @pytest.fixture
@@ -80,7 +86,7 @@ def meet(device: Device) -> None:
         while not {Identity, Status} <= seen:
             assert time.monotonic() < deadline_s, f"only {seen} in {LIMIT_S} s"
             backend.send(HELLO)
-            select.select([backend.fileno()], [], [], 0.1)
+            select.select([descriptor(backend)], [], [], 0.1)
             seen |= {type(message) for message in backend.receive()}
 
 

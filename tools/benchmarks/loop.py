@@ -37,7 +37,6 @@ from tormagd.config import Config, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
-from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
 from tormagd.headroom.bare_timer import beat
 from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
@@ -325,12 +324,20 @@ async def _bare(config: Config) -> None:
     def reply(_request: Request) -> dict[str, Any]:
         return answer
 
+    left = 0
+
     def publish(heartbeat: Heartbeat, _beats: int, now_ns: int) -> None:
+        nonlocal left
+        endpoint.look()
+        endpoint.take_requests(reply)
+        endpoint.admission.update()
+        if left:
+            left -= endpoint.serve(reply)
         rows.append((time.time_ns(), (now_ns - heartbeat.due_ns) * 1e-3, 0.0))
         if len(rows) >= TELEMETRY_EVERY:
             endpoint.publish_ticks(rows, ("t_ns", "lateness_us", "exec_us"))
             rows.clear()
-            endpoint.serve(now_ns * 1e-9, reply, heartbeat.due_ns + heartbeat.period_ns - SERVED_BEFORE_NS)
+            left = endpoint.waiting
 
     await beat(1_000_000_000 // config.rates.control_hz, publish, asyncio.Event())
 

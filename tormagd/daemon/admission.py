@@ -2,8 +2,7 @@
 
 libzmq asks here (ZAP, RFC 27) about every peer whose handshake has proved that it has the secret key of the public one
 it shows, and tells here (socket monitors) about those that came no further, which send nothing to us and get nothing
-but ZMTP's greeting. All of it is the work of one thread beside the control thread: a handshake takes longer than a tick
-has to spare.
+but ZMTP's greeting. The handshakes themselves are the work of libzmq's thread; what is left is a slice of the beat.
 """
 
 import contextlib
@@ -11,17 +10,15 @@ import logging
 import os
 import socket
 import struct
-import threading
-import time
 from collections import Counter, deque
-from collections.abc import Callable
 
 import zmq
 import zmq.utils.monitor
 from zmq.utils import z85
 
+from tormagd.daemon.arrivals import Arrivals
 from tormagd.keys import Allowed, KeyRing
-from tormagd_client.endpoints import ROLES, ConfigError
+from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
 from tormagd_client.messages import PeerReport
 
@@ -43,10 +40,8 @@ GUARDED = {
 "Options of a guarded socket; times are in ms and s."
 NEWS_S = 10.0
 "At most one log line in this time."
-AT_ONCE = 8
-"Events taken from one socket before the next one's turn."
-RESTS_S = 1e-3
-"Between two looks for events: a look, too, takes the interpreter's lock, when they come and not when it is to spare."
+AT_ONCE = 2
+"Events taken in one slice at most."
 WATCHED = (
     zmq.EVENT_ACCEPTED
     | zmq.EVENT_DISCONNECTED
@@ -135,40 +130,28 @@ class _Connections:
 
 
 class Admission:
-    """Guards sockets while they are made, then watches them in a thread. `priority` is the thread's, SCHED_FIFO."""
+    """Guards sockets while they are made, then watches them."""
 
-    def __init__(
-        self,
-        context: "zmq.Context[zmq.Socket[bytes]]",
-        keys: KeyRing | None,
-        priority: int = 0,
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._keys, self._priority, self._clock_s = keys, priority, clock_s
+    def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
+        self._keys, self._arrivals = keys, arrivals
         self.allowed: Allowed = keys.allowed if keys else {}
         self._refusals: dict[tuple[str, str, str, str], int] = {}
         self.refused = 0
         self.moves: deque[tuple[str, bool]] = deque(maxlen=64)
         "Publishers that came (False) or, after a handshake that went well, left (True), by their address."
-        self.pause_s: Callable[[], float] = lambda: 0.0
-        """How long to wait before each next event: the control thread, which needs the interpreter's lock, too, is late
-        by every event that it meets."""
         self._told = 0
         self._newest = ""
         self._tell_s = 0.0
         self._endpoints: dict[zmq.Socket[bytes], _Connections] = {}
         self._watched: list[zmq.Socket[bytes]] = []
-        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._is_over = self._is_to_reload = False
-        self._to_cut: deque[tuple[str, str]] = deque(maxlen=PEERS)
         # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
         self._zap = context.socket(zmq.ROUTER)
         self._zap.linger = 0
         self._zap.bind(_ZAP)
-        self._thread = threading.Thread(target=self._run, name="admission", daemon=True)
+        arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
-        """To be called before the socket is bound; `start` once all are."""
+        """To be called before the socket is bound."""
         if is_guarded:
             if self._keys is None:
                 raise OSError("CURVE keys are needed: endpoints.curve.server_secret")
@@ -177,34 +160,27 @@ class Admission:
             endpoint.setsockopt(zmq.ZAP_DOMAIN, name.encode())
             for option, value in GUARDED.items():
                 endpoint.setsockopt(option, value)
-        self._endpoints[endpoint.get_monitor_socket(WATCHED)] = _Connections(name, is_guarded)
+        monitor = endpoint.get_monitor_socket(WATCHED)
+        self._arrivals.watch(monitor)
+        self._endpoints[monitor] = _Connections(name, is_guarded)
         self._watched.append(endpoint)
 
-    def start(self) -> None:
-        """Begins to let in."""
-        self._thread.start()
-
-    def reload(self) -> None:
-        """Reads the lists again, in the thread; those that are no good are told in the log, and the old ones stay."""
-        self._is_to_reload = True
-        os.eventfd_write(self._wake, 1)
-
-    def cut_off(self, name: str, address: str) -> None:
-        """Ends the connections that an address has to an endpoint, in the thread; whoever may connect comes back."""
-        if (name, address) not in self._to_cut:
-            self._to_cut.append((name, address))
-            os.eventfd_write(self._wake, 1)
+    def update(self) -> bool:
+        """Takes a few of the events that wait, of one socket; False where there were none."""
+        if self._arrivals.has(self._zap):
+            self._admit()
+            return True
+        for monitor, known in self._endpoints.items():
+            if self._arrivals.has(monitor):
+                self._watch(monitor, known)
+                return True
+        return False
 
     def close(self) -> None:
-        """Ends the thread; the sockets are the context's to close."""
-        if self._thread.is_alive():
-            self._is_over = True
-            os.eventfd_write(self._wake, 1)
-            self._thread.join()
+        """Watches no more; the sockets are the context's to close."""
         for endpoint in self._watched:
             # or ZeroMQ's thread would wait for ever for a monitor that has gone
             endpoint.disable_monitor()
-        os.close(self._wake)
 
     def roles(self, public: str) -> frozenset[str]:
         """What a key may do now."""
@@ -224,46 +200,42 @@ class Admission:
         """How many connections each endpoint has."""
         return {each.name: len(each.addresses) for each in self._endpoints.values()}
 
+    def is_connected(self, name: str) -> bool:
+        """Whether this endpoint has any."""
+        return bool(self._of(name).addresses)
+
     def refusals(self) -> tuple[PeerReport, ...]:
         """Who was refused, the newest last."""
-        # one step of the interpreter, so that the thread cannot change it meanwhile
-        return tuple(PeerReport(*peer, count) for peer, count in list(self._refusals.items()))
+        return tuple(PeerReport(*peer, count) for peer, count in self._refusals.items())
 
-    # -- the thread ------------------------------------------------------------------------------------------------
+    def tell(self, now_s: float) -> None:
+        """Says in the log whether peers were refused: once a telemetry period."""
+        new = self.refused - self._told
+        if new and now_s >= self._tell_s:
+            log.warning("refused %d peers, the newest at %s", new, self._newest)
+            self._told, self._tell_s = self.refused, now_s + NEWS_S
 
-    def _run(self) -> None:
-        if self._priority:
-            # as ZeroMQ's own threads: an ordinary one could lose its processor while the control thread waits for it
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
-        poller = zmq.Poller()
-        for each in (self._zap, self._wake, *self._endpoints):
-            poller.register(each, zmq.POLLIN)
-        while not self._is_over:
-            for ready, _ in poller.poll(None if self.refused == self._told else round(NEWS_S * 1e3)):
-                if ready is self._zap:
-                    self._admit()
-                elif isinstance(ready, int):
-                    os.eventfd_read(self._wake)
-                    if self._is_to_reload:
-                        self._is_to_reload = False
-                        self._reload()
-                    while self._to_cut:
-                        name, address = self._to_cut.popleft()
-                        self._cut(self._of(name), address)
-                else:
-                    self._watch(ready, self._endpoints[ready])
-            self._tell()
-            time.sleep(RESTS_S)
-            time.sleep(self.pause_s())
+    def let_in(self, allowed: Allowed) -> None:
+        """From now on these keys are let in."""
+        before, self.allowed = self.allowed, allowed
+        log.info("%d keys are let in: %s", len(allowed), _counts(allowed))
+        lost = [key for key, listed in before.items() if not listed.roles <= self.roles(key)]
+        if lost:
+            # what they send is looked at again each time; what is sent to them is not. Who may stay is back in a moment
+            log.warning("keys that are let in no more, or for less: %s", ", ".join(before[key].name for key in lost))
+            for known in self._endpoints.values():
+                if known.is_guarded and known.name in ("telemetry", "recording"):
+                    self._cut(known)
+
+    def cut_off(self, name: str, address: str) -> None:
+        """Ends the connections that an address has to an endpoint; whoever may connect comes back."""
+        self._cut(self._of(name), address)
 
     def _admit(self) -> None:
         for _ in range(AT_ONCE):
-            time.sleep(self.pause_s())
-            try:
-                frames = self._zap.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
+            if not self._arrivals.has(self._zap):
                 return
+            frames = self._zap.recv_multipart(zmq.NOBLOCK)
             envelope, (version, request, domain, address, _, mechanism, *credentials) = frames[:2], frames[2:]
             public = ""
             if mechanism == b"CURVE" and len(credentials) == 1 and len(credentials[0]) == _KEY_BYTES:
@@ -272,6 +244,7 @@ class Admission:
             is_admitted = self._is_admitted(name, address.decode(errors="replace"), public)
             status, text = (b"200", b"OK") if is_admitted else (b"400", b"")
             self._zap.send_multipart([*envelope, version, request, status, text, public.encode(), b""])
+            self._arrivals.touch(self._zap)
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
         known = self._of(name)
@@ -291,11 +264,9 @@ class Admission:
 
     def _watch(self, monitor: "zmq.Socket[bytes]", known: _Connections) -> None:
         for _ in range(AT_ONCE):
-            time.sleep(self.pause_s())
-            try:
-                event = zmq.utils.monitor.recv_monitor_message(monitor, zmq.NOBLOCK)
-            except zmq.Again:
+            if not self._arrivals.has(monitor):
                 return
+            event = zmq.utils.monitor.recv_monitor_message(monitor, zmq.NOBLOCK)
             kind, value = event["event"], event["value"]
             if kind == zmq.EVENT_ACCEPTED:
                 self._accepted(known, value)
@@ -364,31 +335,6 @@ class Admission:
             first = next(each for each in self._refusals if each[1] != OTHERS)
             others = (first[0], OTHERS, "", first[3].split(":")[0])
             self._refusals[others] = self._refusals.pop(others, 0) + self._refusals.pop(first)
-
-    def _tell(self) -> None:
-        new, now_s = self.refused - self._told, self._clock_s()
-        if new and now_s >= self._tell_s:
-            log.warning("refused %d peers, the newest at %s", new, self._newest)
-            self._told, self._tell_s = self.refused, now_s + NEWS_S
-
-    def _reload(self) -> None:
-        if self._keys is None:
-            log.info("no list of keys to read again: there is no endpoints.curve")
-            return
-        before = self.allowed
-        try:
-            self.allowed = self._keys.load_allowed()
-        except ConfigError as error:
-            log.error("the lists of keys stay as they were: %s", error)
-            return
-        log.info("%d keys are let in: %s", len(self.allowed), _counts(self.allowed))
-        lost = [key for key, listed in before.items() if not listed.roles <= self.roles(key)]
-        if lost:
-            # what they send is looked at again each time; what is sent to them is not. Who may stay is back in a moment
-            log.warning("keys that are let in no more, or for less: %s", ", ".join(before[key].name for key in lost))
-            for known in self._endpoints.values():
-                if known.is_guarded and known.name in ("telemetry", "recording"):
-                    self._cut(known)
 
     def _cut(self, known: _Connections, whose: str = "") -> None:
         """Ends the connections of an address, or all."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from tormagd.config import Device
 from tormagd.control.core import Stepper
-from tormagd.daemon.callbacks import Delay
+from tormagd.daemon.beat import Delay
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd_client.messages import Explained, StallReport

@@ -1,4 +1,4 @@
-"""The control loop: on every beat of the heartbeat measure, step, drive."""
+"""The control loop, a phase of every beat: step on the newest measurement and plan, and drive."""
 
 import logging
 import time
@@ -6,14 +6,12 @@ import time
 from tormagd.assembly.journal import Journal
 from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
+from tormagd.daemon.beat import Beat
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, RefusedError, reason
-
-TICK_SHARE, BEFORE_SHARE = 0.3, 0.1
-"Of the period: what a tick is given, and what is kept clear before it."
 
 log = logging.getLogger(__name__)
 
@@ -24,28 +22,23 @@ class ControlLoop:
     def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
         self.stepper, self._connection, self._journal = stepper, connection, journal
         self.output: Duty | None = None
+        self.used: Plan | None = None
         self.measurement: Measurement | None = None
-        "What the last step was given; the connection may have a newer one by now."
+        "What the last step was given, as `used`; None before the first."
         self.timing = RateGroup("control", period_ns)
-        self.next_tick_ns = 0
         self._known_faults: tuple[Fault, ...] = ()
 
-    def tick(self, due_ns: int, merged: int, plan: Plan) -> None:
-        """The control period that was due at `due_ns` and stands for `merged` missed ones too."""
-        self.next_tick_ns = due_ns + self.timing.period_ns
-        start_ns = time.monotonic_ns()
-        now_s = start_ns * 1e-9
-        if merged:
-            self._connection.receive()  # what came before or during the pause is not to be taken for an answer after it
-        self.measurement = self._connection.measurement
+    def drive(self, beat: Beat, plan: Plan) -> None:
+        """Steps along `plan`, and sends the duties."""
+        now_s = time.monotonic()  # of this very moment: a stall within the beat is one, too
+        self.used, self.measurement = plan, self._connection.measurement
         self._journal.stepped()
-        output = self.stepper.step(now_s, self.measurement, plan)
+        output = self.output = self.stepper.step(now_s, self.measurement, plan)
         self._connection.exchange(
-            output.left_duty, output.right_duty, output.mode, output.request, output.request_number
+            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
-        self.output = output
-        end_ns = time.monotonic_ns()
-        self.timing.record(due_ns, start_ns, end_ns, merged)
+        # from the beginning of the beat: what the step waits for is part of the tick
+        self.timing.record(beat.due_ns, beat.start_ns, time.monotonic_ns(), beat.merged)
 
     def command(self, name: str, conditions: Conditions) -> None:
         """An operator's command. Raises RefusedError."""
@@ -57,15 +50,6 @@ class ControlLoop:
             raise
         self._journal.commanded(name, now_s, conditions, is_refused=False)
         log.info("%s: %s", name, reason(name, source))
-
-    def until_slack_s(self) -> float:
-        """How long another thread should wait so as not to hold the interpreter's lock when a tick needs it, s; 0 in
-        the slack. To be asked from any thread."""
-        period_ns = self.timing.period_ns
-        since_due_ns = (time.monotonic_ns() - self.next_tick_ns) % period_ns
-        if since_due_ns > (1.0 - BEFORE_SHARE) * period_ns:
-            since_due_ns -= period_ns
-        return max(0.0, TICK_SHARE * period_ns - since_due_ns) * 1e-9
 
     def latch(self, fault: Fault) -> None:
         """Latches a fault that was found outside the step."""

@@ -16,6 +16,7 @@ import zmq
 
 from tormagd.daemon.admission import MAY, OTHERS, Admission, shown
 from tormagd.daemon.allowance import Allowance
+from tormagd.daemon.arrivals import Arrivals, is_readable
 from tormagd.daemon.inbox import SOURCES, SetpointInbox
 from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
@@ -39,7 +40,7 @@ from tormagd_client.messages import (
 )
 
 DRAIN = 32
-"Setpoints read at once at most; more wait for the next tick, so that a flood cannot stall control."
+"Setpoints read in one beat at most; more wait for the next, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
 SUBSCRIPTIONS = 16
@@ -48,9 +49,9 @@ thousand, as of all else, would make a tick late (`tools/endure.py siege`)."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. Who says more is cut off, and comes back as anybody."
 TAKEN, TAKEN_NS = 64, 80_000
-"Requests taken from the socket at once at most, and for how long."
-REQUESTS = 16
-"Commands answered per telemetry period at most."
+"Requests taken from the socket in one beat at most, and for how long."
+ANSWERS, ANSWERS_NS = 16, 300_000
+"Requests answered in one beat at most, and for how long."
 FIRST_AT_ONCE = 4
 "Requests that may be a `stop`, looked at in one go at most."
 RECONNECT_S = 0.5
@@ -64,6 +65,9 @@ OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
 PUBLISHER = frozenset({"publish"})
+
+Answer = Callable[[Request], Any]
+"Returns the result, as plain data or packed already, or raises RefusedError."
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +90,8 @@ class Endpoint:
         self._files: list[SocketFile] = []
         self._guarded = {name for name in ENDPOINTS if endpoints.is_guarded(name)}
         self.inbox = SetpointInbox(priority)
-        self.admission = Admission(self._context, keys, io_priority)
+        self._arrivals = Arrivals()
+        self.admission = Admission(self._context, keys, self._arrivals)
         try:
             self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
             # XPUB is a PUB that tells what its subscribers say
@@ -97,13 +102,10 @@ class Endpoint:
             self.close()
             raise
         self._setpoints.subscribe(b"")
-        self.admission.start()
+        self._arrivals.watch(self._setpoints)
+        self._arrivals.watch(self._control)
         self._is_in_parts = self._is_in_parts_of_request = False
         self._requests = Requests()
-        self.has_requests = False
-        "Whether requests may be waiting in the socket that its descriptor says nothing of any more."
-        self.is_flooded = False
-        "Whether there were more setpoints than are read at once."
         self._allowance = Allowance(SETPOINTS_PER_S, SETPOINT_BURST)
         self._subscriptions = {
             name: Allowance(SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST) for name in ("telemetry", "recording")
@@ -113,22 +115,21 @@ class Endpoint:
         self._tell_s = 0.0
         self._cut_off: deque[tuple[str, float]] = deque(maxlen=SOURCES)
 
-    def fileno(self) -> int:
-        """The descriptor that becomes readable when setpoints may have arrived (edge-triggered: drain them)."""
-        return self._setpoints.fileno()
+    @property
+    def waiting(self) -> int:
+        """How many requests wait to be answered."""
+        return self._requests.count
 
-    def control_fileno(self) -> int:
-        """The same of requests (`take_requests`)."""
-        return self._control.fileno()
+    def look(self) -> None:
+        """Asks which sockets have news: once a beat, before anything is taken."""
+        self._arrivals.look()
 
-    def drain_setpoints(self) -> bool:
+    def take_setpoints(self) -> bool:
         """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
         is_newer = False
         for _ in range(DRAIN):
-            # asking first takes a third of what an exception does, and most calls find nothing
-            if not int(self._setpoints.get(zmq.EVENTS)) & zmq.POLLIN:
-                self.is_flooded = False
-                return is_newer
+            if not self._arrivals.has(self._setpoints):
+                break
             frame = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             is_rest, self._is_in_parts = self._is_in_parts, frame.more
             if is_rest:
@@ -143,8 +144,11 @@ class Endpoint:
                 continue
             data = b"" if frame.more else frame.bytes
             is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
-        self.is_flooded = True
         return is_newer
+
+    def has_listener(self, name: str) -> bool:
+        """Whether anybody is connected to this endpoint: nothing has to be packed for nobody."""
+        return self.admission.is_connected(name)
 
     def publish(self, telemetry: Telemetry) -> None:
         """Sends one telemetry message to whoever listens."""
@@ -154,19 +158,16 @@ class Endpoint:
         """Sends the control ticks since the last time, a row each."""
         self._send(self._recording, "recording", encode_ticks(rows, columns))
 
-    def take_requests(self, answer: Callable[[Request], dict[str, Any]]) -> None:
+    def take_requests(self, answer: Answer) -> None:
         """Takes what has arrived, at most TAKEN in TAKEN_NS; answers `stop` and `disable`, the rest waits for `serve`.
 
         `answer` returns the result or raises RefusedError.
         """
         looked_at, until_ns = 0, time.monotonic_ns() + TAKEN_NS
-        self.has_requests = True
         for _ in range(TAKEN):
-            try:
-                waiting = self._next_request()
-            except zmq.Again:
-                self.has_requests = False
+            if not self._arrivals.has(self._control):
                 return
+            waiting = self._next_request()
             if waiting is None:
                 continue
             may_be_first = may_go_first(waiting.data)
@@ -176,22 +177,20 @@ class Endpoint:
             if looked_at == FIRST_AT_ONCE or time.monotonic_ns() >= until_ns:
                 return
 
-    def serve(self, now_s: float, answer: Callable[[Request], dict[str, Any]], until_ns: int) -> None:
-        """Answers waiting commands, at most REQUESTS, and none but the first from `until_ns` (monotonic) on.
+    def serve(self, answer: Answer) -> int:
+        """Answers at most ANSWERS of the waiting requests, for ANSWERS_NS; how many there were."""
+        until_ns = time.monotonic_ns() + ANSWERS_NS
+        for number in range(ANSWERS):
+            if time.monotonic_ns() > until_ns or (waiting := self._requests.next()) is None:
+                return number
+            self._reply(waiting, self._answered(waiting, answer))
+        return ANSWERS
 
-        `answer` returns the result or raises RefusedError.
-        """
+    def tell(self, now_s: float) -> None:
+        """Counts and tells what was not read: once a telemetry period."""
         self._count_oversize(now_s)
         self._tell_drops(now_s)
-        if not self._requests.count:
-            self.take_requests(answer)
-        for number in range(REQUESTS):
-            if number and time.monotonic_ns() >= until_ns:
-                return
-            waiting = self._requests.next()
-            if waiting is None:
-                return
-            self._reply(waiting, self._answered(waiting, answer))
+        self.admission.tell(now_s)
 
     def report(self) -> PeersReport:
         """Who connects, who was refused, who sent too much."""
@@ -245,10 +244,9 @@ class Endpoint:
         """Cuts off who says more than subscribers need to."""
         now_s, allowance = time.monotonic(), self._subscriptions[name]
         for _ in range(DRAIN):
-            try:
-                frame = publisher.recv(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
+            if not is_readable(publisher):
                 return
+            frame = publisher.recv(zmq.NOBLOCK, copy=False)
             try:
                 _, peer = self._sender(frame, name)
             except zmq.ZMQError:
@@ -271,7 +269,7 @@ class Endpoint:
         return address if address == OTHERS else shown(address), self.admission.name(public) if public else ""
 
     def _next_request(self) -> Waiting | None:
-        """The next message; None for a further part of one that had too many. Raises zmq.Again.
+        """The next message, which there has to be; None for a further part of one that had too many.
 
         A message that is no request has nothing in it, and is answered as what is no request.
         """
@@ -287,7 +285,7 @@ class Endpoint:
         public, peer = self._sender(part, "control")
         return Waiting(envelope, b"" if part.more else part.bytes, public, peer, self._requests.opens)
 
-    def _is_answered_first(self, waiting: Waiting, answer: Callable[[Request], dict[str, Any]]) -> bool:
+    def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
         try:
             request = decode(waiting.data, Request)
         except MessageError:
@@ -300,7 +298,7 @@ class Endpoint:
         self._reply(waiting, reply)
         return True
 
-    def _answered(self, waiting: Waiting, answer: Callable[[Request], dict[str, Any]]) -> Reply:
+    def _answered(self, waiting: Waiting, answer: Answer) -> Reply:
         try:
             request = decode(waiting.data, Request)
         except MessageError as error:
@@ -308,7 +306,7 @@ class Endpoint:
             return Reply(v=VERSION, id=None, ok=False, error=refused)
         return self._carried_out(request, waiting, answer)
 
-    def _carried_out(self, request: Request, waiting: Waiting, answer: Callable[[Request], dict[str, Any]]) -> Reply:
+    def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:
         try:
             self._require_permitted(request, waiting)
             return Reply(v=VERSION, id=request.id, ok=True, result=answer(request))
@@ -333,7 +331,7 @@ class Endpoint:
             )
 
     def _reply(self, waiting: Waiting, reply: Reply) -> None:
-        self.has_requests = True
+        self._arrivals.touch(self._control)
         # a client that has gone meanwhile is not our business
         with contextlib.suppress(zmq.ZMQError):
             self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)

@@ -1,4 +1,4 @@
-"""The inference loop: plans at once when a setpoint arrived, and at least `inference_hz` times a second otherwise."""
+"""The inference loop, a phase of every beat: plan for a setpoint that has come, and `inference_hz` times a second."""
 
 import logging
 import time
@@ -10,14 +10,10 @@ from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import Planner
 from tormagd.control.records import Measured
-from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.beat import Beat
+from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.search_process import SearchProcess
-
-LEARNT_SHARE = 0.01
-"By how much of itself one plan moves the slack, however long it was interrupted."
-MOST_SLACK_NS = 400_000.0
-"Plans that take longer run into the tick, rather than let setpoints wait for one tick after another."
 
 PLAN_ERRORS = (ValueError, ArithmeticError, RuntimeError)
 "A DomainError; what NumPy raises."
@@ -26,27 +22,25 @@ log = logging.getLogger(__name__)
 
 
 class InferenceLoop:
-    """Plans in the slack of the control loop, which always goes first. `on_failure` hears of a plan that failed."""
+    """Plans for the newest setpoint. `on_failure` hears of a plan that failed."""
 
     def __init__(
         self,
         planner: Planner,
-        endpoint: Endpoint,
+        inbox: SetpointInbox,
         period_ns: int,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
         *,
         journal: Journal,
         on_failure: Callable[[], None],
+        clock_ns: Callable[[], int] = time.monotonic_ns,
         beside: SearchProcess | None = None,
     ) -> None:
         """`beside` is the search for the field where it is not part of the plans."""
-        self.planner, self._endpoint, self._clock_ns, self._journal = planner, endpoint, clock_ns, journal
+        self.planner, self._inbox, self._clock_ns, self._journal = planner, inbox, clock_ns, journal
         self._on_failure, self._failure = on_failure, ""
         self.beside: Final = beside
         self.timing = RateGroup("inference", period_ns)
-        self._due_ns = 0  # the first is due with the first tick: what the daemon does before that is no stall
-        self._waiting_ns = 0
-        self._slack_ns = 200_000.0
+        self._due_ns = 0
 
     def teach(self, learned: Learned) -> None:
         """Plans from now on for a device of which this is known."""
@@ -58,51 +52,32 @@ class InferenceLoop:
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 
-    def receive(self, measured: Measured | None, next_tick_ns: int) -> None:
-        """Something has arrived: reads it, and plans on a new setpoint, if the next control tick leaves the time."""
-        start_ns = self._clock_ns()
-        if start_ns + self._slack_ns >= next_tick_ns:
-            # not even reading: the tick would wait for that, and the plan come no sooner. The descriptor stays
-            # readable, so this is asked again and again until the tick: at 500 setpoints a second 1 % of the time
-            self._waiting_ns = self._waiting_ns or start_ns
-        elif self._endpoint.is_flooded:
-            pass  # it goes on once a tick: between ticks a flood would leave the processor nothing else
-        elif self._endpoint.drain_setpoints():
-            self._plan(measured, start_ns)
-            self._learn_slack(start_ns)
-
-    def after_tick(self, measured: Measured | None) -> None:
-        """Plans if a setpoint is waiting or a plan is due; called in the slack after a control tick."""
-        now_ns = self._clock_ns()
-        # reading here too makes the edge-triggered descriptor harmless: nothing waits longer than a tick
-        if self._endpoint.drain_setpoints():
-            self._plan(measured, self._waiting_ns or now_ns)
-            self._learn_slack(now_ns)
-        elif now_ns >= self._due_ns:
-            self._plan(measured, self._due_ns or now_ns)
-        self._waiting_ns = 0
-        # here the next tick is farthest: a plan for a setpoint that comes just before it has not that time
-        self._foresee(now_ns * 1e-9)
-
-    def _plan(self, measured: Measured | None, due_ns: int) -> None:
+    def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool) -> None:
+        """Plans if a setpoint has come (`is_asked`) or a plan is due. `measured` is what the last step measured."""
+        period_ns = self.timing.period_ns
+        # by when beats are due, not by when they begin: lateness takes nothing from the rate
+        if not is_asked and beat.due_ns < self._due_ns:
+            return
         start_ns = self._clock_ns()
         self._make_plan(start_ns * 1e-9, measured)
-        self.timing.record(due_ns, start_ns, self._clock_ns())
-        # a period after this one was due, or the rate would fall by what each waits for its tick; but what was missed
-        # is not made up for
-        period_ns = self.timing.period_ns
-        self._due_ns = period_ns + (due_ns if start_ns - due_ns < period_ns else start_ns)
+        self.timing.record(beat.due_ns, start_ns, self._clock_ns())
+        # what was missed is not made up for
+        is_regular = not is_asked and beat.due_ns - self._due_ns < period_ns
+        self._due_ns = period_ns + (self._due_ns if is_regular else beat.due_ns)
 
-    def _learn_slack(self, start_ns: int) -> None:
-        """From reading, which began then, to the plan, which is done."""
-        took_ns = self._clock_ns() - start_ns
-        # to the median: half of the setpoints that just have the time make the tick wait, by what plans vary; with a
-        # longer slack more of them would wait, and for a whole period
-        moved_ns = self._slack_ns * (1.0 + (LEARNT_SHARE if took_ns > self._slack_ns else -LEARNT_SHARE))
-        self._slack_ns = min(moved_ns, MOST_SLACK_NS)
+    def foresee(self, _beat: Beat) -> bool:
+        """Makes the forecast for the next plans; False where none was due."""
+        try:
+            is_made = self.planner.foresee()
+        except PLAN_ERRORS as error:
+            self._begin_afresh(self._clock_ns() * 1e-9, error)
+            return True
+        if is_made:
+            self._journal.foresaw()
+        return is_made
 
     def _make_plan(self, now_s: float, measured: Measured | None) -> None:
-        setpoint, beside = self._endpoint.inbox.newest, self.beside
+        setpoint, beside = self._inbox.newest, self.beside
         answer = None if beside is None else beside.answer()
         if answer is not None:
             self._journal.answered(answer)
@@ -115,20 +90,12 @@ class InferenceLoop:
         if beside is not None:
             beside.ask(self.planner.question)
 
-    def _foresee(self, now_s: float) -> None:
-        try:
-            if self.planner.foresee():
-                self._journal.foresaw()
-        except PLAN_ERRORS as error:
-            self._begin_afresh(now_s, error)
-
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
         """Goes on without what could not be planned for."""
-        inbox = self._endpoint.inbox
         if str(error) != self._failure:  # the first failure is news, the same one again is not
             self._failure = str(error)
-            log.error("no gap could be planned for %s", inbox.newest, exc_info=error)
-        inbox.withdraw(f"no gap could be planned: {error}")
+            log.error("no gap could be planned for %s", self._inbox.newest, exc_info=error)
+        self._inbox.withdraw(f"no gap could be planned: {error}")
         self._on_failure()
         self._journal.began_afresh(now_s)
         self.planner.afresh(now_s)

@@ -1,7 +1,9 @@
 """The telemetry loop: at 50 Hz publish the snapshot and the ticks, answer commands and `status`, feed the watchdog."""
 
 import logging
+import math
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,9 @@ from tormagd.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.config import Config
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.move.opening import is_open
-from tormagd.control.records import Plan
 from tormagd.daemon import notify
+from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import ASKED, BlackBox
-from tormagd.daemon.callbacks import Callbacks
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
@@ -45,8 +46,8 @@ from tormagd_client.messages import (
 NS = 1_000_000_000
 MOST_TICKS = 100
 "Ticks in one recording message at most."
-SERVED_BEFORE_NS = 200_000
-"No command is taken up later than this before the next control tick: an answer takes a quarter of it."
+TELL_S = 0.1
+"How often systemd, log, profile and black box are seen to."
 PORTRAIT_STEP = 5
 "Every fifth point of the portrait is told: it is smooth."
 
@@ -54,7 +55,7 @@ log = logging.getLogger(__name__)
 
 
 class TelemetryLoop:
-    """Tells everybody else what the control and inference loops do. It runs in their slack, after a control tick.
+    """Tells everybody else what the control and inference loops do: a phase of every beat, and three slices.
 
     `not_granted` is what the kernel refused at the start.
     """
@@ -68,7 +69,7 @@ class TelemetryLoop:
         profiles: Profiles,
         connection: Connection,
         endpoint: Endpoint,
-        callbacks: Callbacks,
+        phases: Phases,
         causes: Causes,
         box: BlackBox,
         not_granted: list[str],
@@ -76,29 +77,34 @@ class TelemetryLoop:
         self._config, self._core, self._not_granted = config, core, tuple(not_granted)
         self._control, self._inference, self._profiles = control, inference, profiles
         self._connection, self._endpoint = connection, endpoint
-        self._callbacks, self._causes, self._box = callbacks, causes, box
+        self._phases, self._causes, self._box = phases, causes, box
         self.timing = RateGroup("telemetry", NS // config.rates.telemetry_hz)
         self._groups = [control.timing, inference.timing, self.timing]
         if inference.beside is not None:
             self._groups.append(inference.beside.timing)
         self._newest: Telemetry
         self._started_s = time.monotonic()
-        self._ticks: list[TickRecord] = []
+        self._ticks: deque[TickRecord] = deque(maxlen=MOST_TICKS)
         self._way = Way()
         self._service = Service()
-        self._status: dict[str, Any] | None = None
+        self._status: msgspec.Raw | None = None
+        self._left, self._beats_per_snapshot = 0, config.rates.control_hz // config.rates.telemetry_hz
+        self._answers, self._turn, self._told_s = 0, 0, -math.inf
+        self._reports: dict[str, Any] = {}
+        self._reported_s, self._reported_state = -math.inf, connection.state
 
-    def record(self, used: Plan) -> None:
-        """Keeps the control tick that just ran, with what had been planned when it did."""
+    def record(self, _beat: Beat) -> None:
+        """Keeps the control tick that just ran, with the plan that it used."""
         control = self._control
-        if control.output is None:
+        if control.output is None or control.used is None:
             return
-        self._way.ticked(control.stepper.time_s, used)
+        self._left -= 1
+        self._way.ticked(control.stepper.time_s, control.used)
         timing = control.timing
         record = tick_record(
             control.stepper,
             control.output,
-            used,
+            control.used,
             control.measurement,
             timing.lateness_us,
             timing.exec_us,
@@ -107,32 +113,52 @@ class TelemetryLoop:
         self._ticks.append(record)
         self._box.ticked(record, control.stepper, self._inference.planner)
 
-    def publish(self, due_ns: int) -> None:
-        """One telemetry period, which was due at `due_ns`."""
+    def publish(self, beat: Beat) -> bool:
+        """The snapshot of a telemetry period, and its ticks; False where none is due."""
+        if self._left > 0 or not self._ticks:
+            return False
+        self._left = max(self._left + self._beats_per_snapshot, 1)
         start_ns = time.monotonic_ns()
-        self._newest = self._snapshot(start_ns * 1e-9)
-        self._endpoint.publish(self._newest)
+        endpoint = self._endpoint
+        # with this very snapshot those are answered who wait now; who asks later waits for the next
+        self._status, self._answers = None, endpoint.waiting
+        if endpoint.has_listener("telemetry") or self._answers:
+            self._newest = self._snapshot(start_ns * 1e-9)
+            endpoint.publish(self._newest)
+        if endpoint.has_listener("recording"):
+            endpoint.publish_ticks(list(self._ticks))
+        self._ticks.clear()
+        self.timing.record(beat.due_ns, start_ns, time.monotonic_ns())
+        return True
+
+    def tell(self, _beat: Beat) -> bool:
+        """Every TELL_S: log, service, profile and black box. False where it has been done."""
+        now_s = time.monotonic()
+        if now_s - self._told_s < TELL_S:
+            return False
+        self._told_s = now_s
         link = self._connection.link
         identity = None if link is None else link.identity
         self._profiles.look(
             None if identity is None else identity.serial_number, self._control.stepper.safety.is_driven
         )
-        self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
-        self._ticks.clear()
-        self._refresh(start_ns * 1e-9)
+        self._refresh(now_s)
         self._box.look()
-        self._status = None
-        self._tell_service(start_ns * 1e-9, self._newest.is_homed)
+        self._tell_service(now_s, self._is_homed())
+        self._endpoint.tell(now_s)
         self._report_late_ticks()
-        self._report_sources(start_ns * 1e-9)
-        self.timing.record(due_ns, start_ns, time.monotonic_ns())
+        self._report_sources(now_s)
+        return True
 
-    def serve(self) -> None:
-        """Answers the requests that wait, with what was published last."""
-        until_ns = self._control.next_tick_ns - SERVED_BEFORE_NS
-        self._endpoint.serve(time.monotonic(), self._answer, until_ns)
+    def serve(self, _beat: Beat) -> bool:
+        """Answers a few of the requests that waited at the last snapshot; False where there are none."""
+        if not self._answers:
+            return False
+        answered = self._endpoint.serve(self._answer)
+        self._answers = self._answers - answered if answered else 0
+        return answered > 0
 
-    def take_requests(self) -> None:
+    def take_requests(self, _beat: Beat) -> None:
         """Takes the requests that have arrived: `stop` and `disable` are carried out, the rest waits for `serve`."""
         self._endpoint.take_requests(self._command)
 
@@ -210,31 +236,34 @@ class TelemetryLoop:
             notify.notify(message)
 
     def _report_late_ticks(self) -> None:
-        news = self._callbacks.news()
+        news = self._phases.news()
         if news is not None:
             is_stall = news.worst.took_ns > ERROR_PERIODS * self._control.timing.period_ns
             log.log(logging.ERROR if is_stall else logging.WARNING, "%s", news)
 
     def _refresh(self, now_s: float) -> None:
-        """Makes one report anew: all of them at once would make a tick wait."""
-        turn = self.timing.runs % (len(self._groups) + 2)
+        """Makes one report anew: all of them at once would take too long for one beat."""
+        self._turn += 1
+        turn = self._turn % (len(self._groups) + 3)
         if turn < len(self._groups):
             self._groups[turn].refresh()
         elif turn == len(self._groups):
             self._way.refresh()
-        else:
+        elif turn == len(self._groups) + 1:
             self._endpoint.inbox.refresh(now_s)
+        else:
+            self._phases.refresh()
 
     def _report_sources(self, now_s: float) -> None:
         news = self._endpoint.inbox.news(now_s)
         if news is not None:
             log.warning("%s", news)
 
-    def _answer(self, request: Request) -> dict[str, Any]:
+    def _answer(self, request: Request) -> Any:
         if request.command == "status":
             # built once for everybody who asks in this period
             if self._status is None:
-                self._status = msgspec.to_builtins(self._build_status(self._newest))
+                self._status = msgspec.Raw(msgspec.msgpack.encode(self._build_status(self._newest)))
             return self._status
         return self._describe() if request.command == "describe" else self._command(request)
 
@@ -263,7 +292,7 @@ class TelemetryLoop:
         )
 
     def _command(self, request: Request) -> dict[str, Any]:
-        self._status = None
+        self._status, self._reported_s = None, -math.inf
         if request.command == "take":
             return self._give(request.args.get("source"))
         if request.command == "confirm":
@@ -313,10 +342,11 @@ class TelemetryLoop:
             "is_busy": self.is_busy(),
             "faults": safety.faults,
         }
-        now_s, inbox, link = time.monotonic(), self._endpoint.inbox, self._connection.report()
+        now_s = time.monotonic()
         outside = ", ".join(f"{it.quantity} {it.asked:.4g} asked, {it.used:.4g} used" for it in plan.outside)
         return Status(
             **known,
+            **self._slowly_changing(now_s),
             version=__version__,
             build=str(settle()),
             scene=self._core.scene.name,
@@ -337,22 +367,34 @@ class TelemetryLoop:
                 sensor_zero_sd_N=round(believe.zero.sd_N(now_s), 4),
                 lag_ms=round(believe.carriages.lag_s * 1e3, 1),
             ),
-            profile=self._profiles.report(),
             least_gap_mm=round(plan.min_gap_mm, 2),
-            link=link,
-            setpoints=inbox.report(now_s),
-            peers=self._endpoint.report(),
-            rates={group.name: group.report for group in self._groups},
-            late_ticks_by=dict(self._callbacks.blamed),
             fault_details=self._causes.of_faults(safety.faults),
-            limit_details=self._causes.of_limits(newest.limits, outside, inbox.told(now_s), self._control.measurement),
+            limit_details=self._causes.of_limits(
+                newest.limits, outside, self._endpoint.inbox.told(now_s), self._control.measurement
+            ),
             newest_stall=self._causes.newest_stall(),
             not_granted=self._not_granted,
-            way=self._way.report(
-                None if link.round_trip_us is None else link.round_trip_us.p50, believe.carriages.lag_s
-            ),
-            black_box=self._box.report(),
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, is_homed_))),
             is_open=self.is_open(),
         )
+
+    def _slowly_changing(self, now_s: float) -> dict[str, Any]:
+        """The reports that take most of a status' time: made anew every TELL_S, after a command, and when the link
+        changes."""
+        if now_s - self._reported_s >= TELL_S or self._connection.state is not self._reported_state:
+            self._reported_s, self._reported_state = now_s, self._connection.state
+            link = self._connection.report()
+            device_us = None if link.round_trip_us is None else link.round_trip_us.p50
+            self._reports = {
+                "link": link,
+                "profile": self._profiles.report(),
+                "setpoints": self._endpoint.inbox.report(now_s),
+                "peers": self._endpoint.report(),
+                "rates": {group.name: group.report for group in self._groups},
+                "phases_us": dict(self._phases.report),
+                "late_ticks_by": dict(self._phases.blamed),
+                "way": self._way.report(device_us, self._inference.planner.believe.carriages.lag_s),
+                "black_box": self._box.report(),
+            }
+        return self._reports

@@ -68,9 +68,6 @@ class Backend(Protocol):
     def statistics(self) -> LinkStatistics:
         """Counters since the connection was opened."""
 
-    def fileno(self) -> int:
-        """The descriptor to watch for reading."""
-
     def receive(self) -> Sequence[Message]:
         """All valid messages that have arrived; never blocks. Raises BackendError when the device is gone."""
 

@@ -73,10 +73,6 @@ class CanBackend:
         """Counters since the bus was opened."""
         return self.stream.statistics
 
-    def fileno(self) -> int:
-        """The bus's descriptor."""
-        return self._fd
-
     def receive(self) -> list[Message]:
         """All messages of the node that have arrived.
 

@@ -7,7 +7,6 @@ CLOSED --> IDENTIFYING <--> UNANSWERED             the port is opened: --> IDENT
 """
 
 import logging
-import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
@@ -37,16 +36,6 @@ _REMEDIES = {
 log = logging.getLogger(__name__)
 
 
-class Watcher(Protocol):
-    """The part of an event loop that a connection needs."""
-
-    def add_reader(self, fd: int, callback: Callable[[], None]) -> object:
-        """Calls back whenever the descriptor is readable."""
-
-    def remove_reader(self, fd: int) -> object:
-        """Stops that."""
-
-
 class Traffic(Protocol):
     """Who is told of all that passes, as it was."""
 
@@ -63,19 +52,12 @@ class Traffic(Protocol):
 class Connection:
     """One device, however often its cable is pulled.
 
-    It moves when `exchange` is called, once a control period, and when its descriptor is readable; it has no timers
-    of its own. `clock` gives seconds of a monotonic clock.
+    It moves when `receive` and `exchange` are called, both once a control period; it has no clock and no timers.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        open_backend: Callable[[], Backend],
-        on_loss: Callable[[], None],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._device, self._open_backend, self._on_loss, self._clock = device, open_backend, on_loss, clock
-        self._watcher: Watcher | None = None
+    def __init__(self, device: Device, open_backend: Callable[[], Backend], on_loss: Callable[[], None]) -> None:
+        self._device, self._open_backend, self._on_loss = device, open_backend, on_loss
+        self._is_wanted = False
         self._backend: Backend | None = None
         self._stream: Stream | None = None
         self._link: DeviceLink | None = None
@@ -134,24 +116,39 @@ class Connection:
         """The request that the device has not acknowledged; what waits for a device to come back counts too."""
         return self._unfinished if self._link is None else self._link.pending
 
-    def open(self, watcher: Watcher) -> None:
+    def open(self, now_s: float) -> None:
         """Opens the port, now or as soon as it can be."""
-        self._watcher = watcher
-        self._open(self._clock())
+        self._is_wanted = True
+        self._open(now_s)
+
+    def receive(self, now_s: float) -> None:
+        """Takes in what has come since the last period."""
+        backend, link = self._backend, self._link
+        if backend is None or link is None:
+            return
+        try:
+            messages = backend.receive()
+        except BackendError as error:
+            self._lose(now_s, error)
+            return
+        if self.traffic is not None and self._stream is not None and self._stream.received:
+            self.traffic.read(now_s, self._stream.received)
+        for message in messages:
+            link.receive(now_s, message)
+            if link.state is not self._seen:
+                self._notice()
 
     def exchange(
-        self, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
+        self, now_s: float, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
     ) -> None:
-        """Sends one drive message, and whatever handshake or request is due; opens the port when it is time to."""
-        now_s = self._clock()
-        if self._link is None and self._watcher is not None and now_s >= self._reopen_s:
+        """Sends one drive message, and whatever handshake or request is due; opens the port when it is time to.
+
+        To be called behind `receive`: what has come by then is no silence.
+        """
+        if self._link is None and self._is_wanted and now_s >= self._reopen_s:
             self._open(now_s)
         link, backend = self._link, self._backend
         if link is None or backend is None:
-            return
-        if link.is_silent(now_s):
-            self.receive()  # a process that was not run itself finds here what it took for silence
-        if self._link is not link:
             return
         if number != self._requested:
             self._requested = number
@@ -165,7 +162,7 @@ class Connection:
             for message in link.due(now_s):
                 self._send(backend, message, sent)
         except BackendError as error:
-            self._lose(error)
+            self._lose(now_s, error)
             return
         if self.traffic is not None and self._stream is not None:
             self.traffic.wrote(now_s, sent, backend.statistics.unsent)
@@ -174,14 +171,12 @@ class Connection:
             link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
         self._notice()
         if link.state is LinkState.LOST:
-            self._give_back(link.cause, "")
+            self._give_back(now_s, link.cause, "")
 
     def close(self) -> None:
         """Closes the port for good."""
-        watcher = self._watcher
-        self._watcher = None
-        if watcher is not None:
-            self._release(watcher)
+        self._is_wanted = False
+        self._release()
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
         self._seen = LinkState.CLOSED
 
@@ -231,13 +226,12 @@ class Connection:
         )
 
     def _open(self, now_s: float) -> None:
-        assert self._watcher is not None, "only an opened connection is opened again"
         try:
             self._backend = self._open_backend()
         except BackendError as error:
             # the first failure is news, the same one again is not
             log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
-            self._wait(LinkState.BACK_OFF, str(error), error.remedy)
+            self._wait(now_s, LinkState.BACK_OFF, str(error), error.remedy)
             self._notice()
             return
         self._remedy = ""
@@ -249,59 +243,38 @@ class Connection:
         self._stream = stream if isinstance(stream, FrameStream | CanStream) else None
         if self.traffic is not None:
             self.traffic.connected(self.memory())
-        self._watcher.add_reader(self._backend.fileno(), self.receive)
         log.info("%s is open", self._device.port)
         self._notice()
-
-    def receive(self) -> None:
-        """Takes in what has come. The watcher calls it; so does whoever was not run for a while, before it judges."""
-        backend, link = self._backend, self._link
-        if backend is None or link is None:
-            return
-        try:
-            messages = backend.receive()
-        except BackendError as error:
-            self._lose(error)
-            return
-        now_s = self._clock()
-        if self.traffic is not None and self._stream is not None and self._stream.received:
-            self.traffic.read(now_s, self._stream.received)
-        for message in messages:
-            link.receive(now_s, message)
-            if link.state is not self._seen:
-                self._notice()
 
     def _send(self, backend: Backend, message: Message, sent: list[Sent]) -> None:
         backend.send(message)
         if self._stream is not None:
             sent.append(self._stream.sent)
 
-    def _lose(self, error: BackendError) -> None:
+    def _lose(self, now_s: float, error: BackendError) -> None:
         """The port failed."""
         assert self._link is not None, "only an open port can fail"
         self._link.lose(str(error))
         self._notice()
-        self._give_back(str(error), error.remedy)
+        self._give_back(now_s, str(error), error.remedy)
 
-    def _give_back(self, cause: str, remedy: str) -> None:
+    def _give_back(self, now_s: float, cause: str, remedy: str) -> None:
         """Closes the port, to open it again later."""
         assert self._link is not None, "only what is open is given back"
-        assert self._watcher is not None, "only an opened connection has a port"
         self._unfinished = self._link.pending
-        self._release(self._watcher)
-        self._wait(LinkState.LOST, cause, remedy)
+        self._release()
+        self._wait(now_s, LinkState.LOST, cause, remedy)
 
-    def _release(self, watcher: Watcher) -> None:
+    def _release(self) -> None:
         if self._backend is not None:
-            watcher.remove_reader(self._backend.fileno())
             self._backend.close()
             if self.traffic is not None:
                 self.traffic.connected(None)
         self._backend = self._link = self._stream = None
 
-    def _wait(self, state: LinkState, cause: str, remedy: str) -> None:
+    def _wait(self, now_s: float, state: LinkState, cause: str, remedy: str) -> None:
         self._waiting, self._cause, self._remedy = state, cause, remedy
-        self._reopen_s = self._clock() + self._back_off_s
+        self._reopen_s = now_s + self._back_off_s
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
 
     def _notice(self) -> None:

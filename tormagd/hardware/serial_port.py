@@ -31,10 +31,6 @@ class SerialPort:
         """Counters since the port was opened."""
         return self.stream.statistics
 
-    def fileno(self) -> int:
-        """The port's descriptor."""
-        return self._fd
-
     def receive(self) -> list[Message]:
         """All valid messages that have arrived. Raises BackendError at end-of-file or a read error."""
         try:

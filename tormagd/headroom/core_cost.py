@@ -52,9 +52,10 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
         now_s = loop.now_s + period_s
         force_N = middle_N * (1.0 + SWING_SHARE * math.sin(math.tau * PULSE_HZ * now_s))
         setpoint = TimedSetpoint(force_N, now_s, 0.1)  # a new one for every tick, so that every tick plans
+        measured = loop.stepper.measured
         sample = loop.tick(setpoint)
         steps.append(partial(stepper.step, sample.time_s, sample.measurement, sample.plan))
-        plans.append(partial(planner.plan, sample.time_s, setpoint, sample.measured))
+        plans.append(partial(planner.plan, sample.time_s, setpoint, measured))
     return steps, plans
 
 
@@ -75,11 +76,11 @@ async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) 
             ended.set()
             return
         start_ns = time.thread_time_ns()
-        steps[number]()
-        stepped_ns = time.thread_time_ns()
         plans[number]()
-        found.step_us.append((stepped_ns - start_ns) * 1e-3)
-        found.plan_us.append((time.thread_time_ns() - stepped_ns) * 1e-3)
+        planned_ns = time.thread_time_ns()
+        steps[number]()
+        found.plan_us.append((planned_ns - start_ns) * 1e-3)
+        found.step_us.append((time.thread_time_ns() - planned_ns) * 1e-3)
 
     await beat(NS // rate_hz, on_beat, ended)
     return found

@@ -45,27 +45,22 @@ class Damage(NamedTuple):
 
 
 class RecordedWire:
-    """Clock, backend and event loop of a connection: what is read stands in the file, what is written is compared."""
+    """The backend of a connection: what is read stands in the file, what is written is compared."""
 
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
-        self.now_s = 0.0
         self.unread: Sequence[Any] = ()
         "Pieces: one of bytes, or a bus's frames."
         self.damaged: list[int] = []
         "Of those that were read last, which were."
         self.written: list[Sent] = []
-        self.connection = Connection(Device(), lambda: self, lambda: None, lambda: self.now_s)
-        self.connection.open(self)
+        self.connection = Connection(Device(), lambda: self, lambda: None)
+        self.connection.open(0.0)
 
     @property
     def statistics(self) -> LinkStatistics:
         """Counters since the port was opened."""
         return self.stream.statistics
-
-    def fileno(self) -> int:
-        """None: nothing waits."""
-        return -1
 
     def receive(self) -> list[Message]:
         """The messages in what was read."""
@@ -92,12 +87,6 @@ class RecordedWire:
 
     def close(self) -> None:
         """There is nothing to give back."""
-
-    def add_reader(self, fd: int, callback: object) -> None:
-        """Takes no note of it: the file says when something was read."""
-
-    def remove_reader(self, fd: int) -> None:
-        """Nothing was noted."""
 
 
 class Conversation:
@@ -139,26 +128,26 @@ class Conversation:
         wire = self._wire
         if wire is None:
             return
-        _, wire.now_s, raw = entry
+        _, now_s, raw = entry
         wire.unread = pieces = raw if isinstance(raw, list) else [raw]
         seen, found_again = wire.statistics, wire.statistics.resynchronisations
-        wire.connection.receive()
+        wire.connection.receive(now_s)
         self.frames += len(pieces)
         self.damaged += len(wire.damaged)
         self.resynchronised += seen.resynchronisations - found_again
         if wire.damaged and self.first_damage is None:
             why = ", ".join(f"{name}: {each}" for name, each in seen.refused.items()) or "unreadable"
-            self.first_damage = Damage(self.frame - len(pieces) + 1 + wire.damaged[0], wire.now_s, why)
+            self.first_damage = Damage(self.frame - len(pieces) + 1 + wire.damaged[0], now_s, why)
 
     def wrote(self, entry: Any, output: Duty) -> Found | None:
         """A step's output went to the device: what was written otherwise."""
         wire = self._wire
         if wire is None:
             return None
-        _, wire.now_s, recorded, unsent = entry
+        _, now_s, recorded, unsent = entry
         wire.written, wire.statistics.unsent = [], unsent
         wire.connection.exchange(
-            output.left_duty, output.right_duty, output.mode, output.request, output.request_number
+            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
         for number, (told, own) in enumerate(zip_longest(recorded, wire.written), self.frame - len(recorded) + 1):
             if packed(told) != packed(own):

@@ -358,6 +358,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     setpoints: SetpointReport
     peers: PeersReport = PeersReport()
     rates: dict[str, RateReport]
+    phases_us: dict[str, ExecReport] = {}
     late_ticks_by: dict[str, int]
     fault_details: tuple[Explained, ...]
     limit_details: tuple[Explained, ...]

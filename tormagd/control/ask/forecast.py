@@ -38,6 +38,8 @@ STRIDE: Final = 3
 HORIZON: Final = 8
 "Points that are forecast: a plan looks 30 ms ahead, and further by the carriages' lag."
 HORIZON_S: Final = HORIZON * GRID_S
+EVERY: Final = 2
+"A forecast is made for every second point of the grid: it takes several times as long as a plan."
 JUDGED: Final = 4
 "The point ahead that forecasts are judged at: the middle of what a plan looks at."
 MAX_STEP_S: Final = 0.1
@@ -54,10 +56,13 @@ those most like it, in their standard deviations."""
 LONG_S: Final = 2.0
 SHORT_S: Final = 0.2
 "Skill is earned over the long time, a few beats, and lost over the short."
-_LONG_SHARE: Final = GRID_S / (LONG_S + GRID_S)
-_SHORT_SHARE: Final = GRID_S / (SHORT_S + GRID_S)
+_LONG_SHARE: Final = EVERY * GRID_S / (LONG_S + EVERY * GRID_S)
+_SHORT_SHARE: Final = EVERY * GRID_S / (SHORT_S + EVERY * GRID_S)
 _MIN_BYTES: Final = MIN_HISTORY * array("d").itemsize
 _MAX_BYTES: Final = HISTORY * array("d").itemsize
+
+
+_LONGEST: Final = BEAT_DELAYS[-1]
 
 
 def embedding(delays: tuple[int, ...]) -> Array:
@@ -67,12 +72,12 @@ def embedding(delays: tuple[int, ...]) -> Array:
     first column is the newest stretch: what followed is its own end.
     """
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
-    ends = np.arange(-1 - HORIZON, delays[-1] - HISTORY - 1, -STRIDE)
+    ends = np.arange(-1 - HORIZON, _LONGEST - HISTORY - 1, -STRIDE)
     return np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
 
 
-RISE: Final = embedding(RISE_DELAYS)
-BEAT: Final = embedding(BEAT_DELAYS)
+EMBEDDINGS: Final = np.stack([embedding(RISE_DELAYS), embedding(BEAT_DELAYS)])
+"Shape (2, TAPS + 1 + HORIZON, n)."
 
 
 @final
@@ -151,15 +156,14 @@ class Forecast:
         self.stamp_s, self.force_N = stamp_s, force_N
 
     def foresee(self, slope_N_s: float) -> bool:
-        """Forecast from the newest point of the grid, once for each, and return whether there was something to do.
+        """Forecast from the newest point of the grid, once for EVERY point, and return whether there was something to
+        do.
 
-        The forecast and `slope_N_s` are noted, to be judged by what comes. This takes several times as long as a plan.
+        The forecast and `slope_N_s` are noted, to be judged by what comes.
         """
-        if self.from_s >= self.time_s or len(self.history) < _MIN_BYTES:
+        if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
             return False
-        history = np.frombuffer(self.history)
-        rise, rise_unlike = _search(history, RISE, RISE_DELAYS[-1])
-        beat, beat_unlike = _search(history, BEAT, BEAT_DELAYS[-1])
+        (rise, rise_unlike), (beat, beat_unlike) = _search(np.frombuffer(self.history))
         changes: list[float] = []
         said: Guess | None = None
         if rise or beat:
@@ -231,27 +235,31 @@ def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
     return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
 
 
-def _search(history: Array, around: Array, longest: int) -> tuple[list[float], float]:
-    """Return the changes from the newest point of the grid to itself and the next HORIZON; none without a like stretch.
+def _search(history: Array) -> list[tuple[list[float], float]]:
+    """Return for each embedding the changes from the newest point of the grid to itself and the next HORIZON; none
+    without a like stretch.
 
     Also returned is the distance of the stretch most like the newest: the mean square of a point, N², at least
-    SAME_N's. `around` is an embedding, `longest` the longest of its delays.
+    SAME_N's.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.
     """
-    changes = history[around[:, : (len(history) - longest - 1 - HORIZON) // STRIDE + 2]]
-    changes -= changes[TAPS]
-    before = changes[:TAPS]
-    before -= before[:, :1].copy()
-    apart = np.add.reduce(before * before) + TAPS * SAME_N**2
-    apart[0] = math.inf
-    weight = apart**-2
-    changes[TAPS] = 1.0
-    unlike = float(apart.min()) / TAPS
-    if unlike > UNLIKE_N * UNLIKE_N:
-        return [], unlike
-    return _constants((changes[: TAPS + 1] * weight @ changes.T).tolist()), unlike
+    # both at once: most of the time goes into the calls, not into their numbers
+    changes = history[EMBEDDINGS[:, :, : (len(history) - _LONGEST - 1 - HORIZON) // STRIDE + 2]]
+    changes -= changes[:, TAPS : TAPS + 1]
+    before = changes[:, :TAPS]
+    before -= before[:, :, :1].copy()
+    apart = (before * before).sum(axis=1) + TAPS * SAME_N**2
+    apart[:, 0] = math.inf
+    unlike: list[float] = (apart.min(axis=1) / TAPS).tolist()
+    weight = 1.0 / (apart * apart)
+    changes[:, TAPS] = 1.0
+    # which numpy multiplies as stacks of matrices
+    sums = ((changes[:, : TAPS + 1] * weight[:, None]) @ changes.transpose(0, 2, 1)).tolist()
+    return [
+        ([] if each > UNLIKE_N * UNLIKE_N else _constants(rows), each) for rows, each in zip(sums, unlike, strict=True)
+    ]
 
 
 def _constants(rows: list[list[float]]) -> list[float]:

@@ -1,0 +1,150 @@
+"""What a beat runs and in which order, and who is to blame for a late one, on a clock that the test moves."""
+
+from collections.abc import Callable
+
+import pytest
+
+from tormagd.daemon.beat import COUNTED, KERNEL, NEWS_NS, Beat, Delay, Phases
+
+MS = 1_000_000
+
+
+class Rig:
+    """Phases `read` and `drive`, and slices; each takes as many ms as the test says, and drives judge the delay."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+        self.stopped_ns = 0
+        "For how long the thread had no processor."
+        self.took = {"read": 0, "drive": 0}
+        self.waiting: dict[str, int] = {"first": 0, "second": 0}
+        "How often each slice still has something to do."
+        self.ran: list[str] = []
+        self.delays: list[Delay] = []
+        self.errors: dict[str, Exception] = {}
+        self.phases = Phases(lambda: self.now_ns, lambda: self.now_ns - self.stopped_ns)
+        self.phases.begin(
+            [(name, self.phase(name)) for name in self.took], [(name, self.slice(name)) for name in self.waiting]
+        )
+
+    def phase(self, name: str) -> Callable[[Beat], None]:
+        def run(beat: Beat) -> None:
+            self.ran.append(name)
+            self.now_ns += self.took[name] * MS
+            if name in self.errors:
+                raise self.errors[name]
+            if name == "drive":
+                if self.now_ns - beat.due_ns > MS:
+                    self.delays.append(self.phases.blame(beat.due_ns))
+                else:
+                    self.phases.on_time()
+
+        return run
+
+    def slice(self, name: str) -> Callable[[Beat], bool]:
+        def run(_beat: Beat) -> bool:
+            if not self.waiting[name]:
+                return False
+            self.waiting[name] -= 1
+            self.ran.append(name)
+            self.now_ns += self.took.get(name, 0) * MS
+            return True
+
+        return run
+
+    def beat(self, due_ms: int, **took: int) -> list[str]:
+        """One beat, not before it is due: what ran in it."""
+        self.ran.clear()
+        self.took |= {"read": 0, "drive": 0, **took}
+        self.now_ns = max(self.now_ns, due_ms * MS)
+        self.phases.run(due_ms * MS, 0)
+        return self.ran
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_all_phases_run_in_their_order_and_then_one_slice(rig: Rig) -> None:
+    rig.waiting |= {"first": 2, "second": 1}
+    in_turn = [list(rig.beat(due_ms)) for due_ms in range(8)]
+    assert all(ran[:2] == ["read", "drive"] for ran in in_turn)
+    assert sorted(name for ran in in_turn for name in ran[2:]) == ["first", "first", "second"]
+    assert max(map(len, in_turn)) == 3
+    assert rig.beat(9) == ["read", "drive"]
+
+
+def test_slices_that_always_have_something_to_do_take_turns(rig: Rig) -> None:
+    rig.waiting |= {"first": 100, "second": 100}
+    names = [rig.beat(due_ms)[-1] for due_ms in range(20)]
+    assert names.count("first") == names.count("second") == 10
+
+
+def test_an_error_ends_its_phase_alone_and_is_told_once(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    rig.errors["read"] = TypeError("a bug")
+    assert rig.beat(0) == rig.beat(1) == ["read", "drive"]
+    assert [record.getMessage() for record in caplog.records] == ["the beat's 'read' failed"]
+
+
+@pytest.mark.parametrize(
+    ("before", "late", "delay"),
+    [
+        ({}, {"read": 3}, Delay(3 * MS, "read", 3 * MS)),
+        ({}, {"drive": 3}, Delay(3 * MS, "drive", 3 * MS)),
+        # what a slice took before the beat was due does not count
+        ({"second": 12}, {"read": 1}, Delay(4 * MS, "second", 3 * MS)),
+    ],
+)
+def test_whatever_filled_most_of_the_delay_is_named(
+    rig: Rig, before: dict[str, int], late: dict[str, int], delay: Delay
+) -> None:
+    rig.waiting |= dict.fromkeys(rig.waiting, len(before))
+    rig.beat(1, **before)
+    rig.waiting |= dict.fromkeys(rig.waiting, 0)
+    rig.beat(10, **late)
+    assert rig.delays == [delay]
+    assert rig.phases.blamed == {delay.culprit: 1}
+
+
+def test_where_nothing_of_ours_ran_it_was_the_kernel(rig: Rig) -> None:
+    rig.beat(0)
+    rig.now_ns = rig.stopped_ns = 15 * MS
+    rig.beat(10)
+    assert rig.delays == [Delay(5 * MS, KERNEL, 5 * MS)]
+
+
+def test_a_phase_in_whose_midst_the_thread_was_stopped_is_not_to_blame(rig: Rig) -> None:
+    rig.beat(0)
+    rig.stopped_ns = 37 * MS
+    rig.beat(10, read=40)
+    assert rig.delays == [Delay(40 * MS, KERNEL, 27 * MS)]
+    rig.beat(51, drive=10)
+    assert rig.delays[1:] == [Delay(10 * MS, "drive", 10 * MS)]
+
+
+def test_one_log_line_in_a_while_with_the_worst_of_all(rig: Rig) -> None:
+    assert rig.phases.news() is None
+    rig.beat(0, read=2)
+    assert str(rig.phases.news()) == (
+        "control ticks that were late: 1, the worst done 2.0 ms after it was due; 2.0 ms of that went to read"
+    )
+    for due_ms, took in ((10, 3), (20, 7), (30, 5)):
+        rig.beat(due_ms, read=took)
+    assert rig.phases.news() is None
+    rig.now_ns = 2 * MS + NEWS_NS
+    news = rig.phases.news()
+    assert news is not None
+    assert (news.beats, news.worst) == (3, Delay(7 * MS, "read", 7 * MS))
+    rig.now_ns += NEWS_NS
+    assert rig.phases.news() is None
+    assert rig.phases.blamed.total() == 4
+
+
+def test_the_times_of_the_parts_are_reported(rig: Rig) -> None:
+    for due_ms in range(10 * COUNTED):
+        rig.beat(10 * due_ms, read=2)
+    for _ in range(5):
+        rig.phases.refresh()
+    assert rig.phases.report["read"].max == 2_000.0
+    assert rig.phases.report["drive"].max == 0.0
