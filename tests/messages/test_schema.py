@@ -48,7 +48,7 @@ V1: dict[type[msgspec.Struct], str] = {
     Tick: "lateness_us exec_us",
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver roller_radius_mm uptime_s least_N "
     "most_N trim device profile least_gap_mm link setpoints peers "
-    "rates late_ticks_by fault_details limit_details newest_stall not_granted way "
+    "rates phases_us late_ticks_by fault_details limit_details newest_stall not_granted way "
     "black_box output next_commands is_open",
     OutputReport: "rate slew not_finite range",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "

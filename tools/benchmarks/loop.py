@@ -4,14 +4,17 @@ Daemon and stub run in alternating blocks, because a shared machine drifts: what
 neighbour. Both have the same heartbeat, event loop and scheduling, publish a row for each tick, and answer the same
 eight clients, each of which asks for status again as soon as it is answered; the stub has no controller and no device.
 
-Processor time is that of the daemon with its threads and children; recording is on: a subscriber reads every tick. A
-tick is fresh whose measurement came since the tick before it. With `--against` the daemon of another checkout takes its
-turn, on its own simulated device: the protocol changes, too.
+Processor time is that of the daemon with its threads and children; wake-ups are voluntary switches of its threads. Each
+block has two halves: alone, then with the clients, and a subscriber that reads every tick (recording). A tick is fresh
+whose measurement came since the tick before it. With `--against` the daemon of another checkout takes its turn, on its
+own simulated device: the protocol changes, too. Where there is a C compiler, a host in C (`reference_host.c`) with
+nothing but wire, timer and two PIDs takes its turn on a device of its own: the limit of this wire on this machine.
 """
 
 import argparse
 import asyncio
 import contextlib
+import json
 import multiprocessing
 import os
 import statistics
@@ -24,7 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import uvloop
@@ -32,7 +35,9 @@ import zmq
 from machines.host import processor_s
 from machines.own import own_machine
 from machines.processes import begun, first_line, is_linked
+from matplotlib.figure import Figure
 
+from firmware_protocol.c.build import ROOM as FIRMWARE, BuildError, compiler
 from tormagd.config import Config, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
@@ -57,6 +62,8 @@ STARTS_MS = 20_000
 WARM_UP_S = 1.0
 TELEMETRY_EVERY = 20
 PLAN_QUANTILES = ("p50", "p99")
+HOST_SOURCES = "codec", "crc", "framing", "messages", "tormag"
+HOST_FLAGS = "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2"
 COLUMNS = ("t_ns", "lateness_us", "exec_us", "received_s")
 "What is read of a recorded tick; a stub has not all of them."
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
@@ -75,7 +82,15 @@ class Block(NamedTuple):
     plan_us: dict[str, float] | None = None
     "p50 and p99 of its plans over the last 5 to 10 s as the daemon's status has them, in bins of 3%."
     core_share: float = 0.0
-    "Processor time of all its processes over wall time, while the clients ask."
+    "Processor time of all its processes over wall time, while the clients ask,"
+    alone_share: float = 0.0
+    "and before."
+    wakeups_hz: tuple[float, float] = (0.0, 0.0)
+    "Of its first thread and of all its threads, while the clients ask,"
+    alone_hz: tuple[float, float] = (0.0, 0.0)
+    "and before."
+    phases_us: dict[str, dict[str, float]] | None = None
+    "p50 and p99 of each phase of a beat."
 
 
 class Pair(NamedTuple):
@@ -84,6 +99,8 @@ class Pair(NamedTuple):
     daemon: Block
     bare: Block
     against: Block | None = None
+    host: dict[str, Any] | None = None
+    "What the host in C says."
 
 
 class Stand(NamedTuple):
@@ -94,6 +111,7 @@ class Stand(NamedTuple):
     root: Path | None = None
 
 
+T = TypeVar("T")
 Running = tuple[Config, int]
 """The configuration and the id of a process that keeps time."""
 Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
@@ -116,12 +134,24 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
             for name in ("p50", "p99", "p999")
         },
         "pairs": len(pairs),
+        "load": {
+            "clients": CLIENTS,
+            "recording": True,
+            "setpoint_hz": SETPOINT_HZ,
+            "alone": "neither of the first two",
+        },
     }
+    hosts = [pair.host for pair in pairs if pair.host is not None]
+    if hosts:
+        result["reference_host"] = _middle(hosts)
     against = [(pair.daemon, pair.against) for pair in pairs if pair.against is not None]
     if against:
         result["against"] = _told([theirs for _, theirs in against]) | {
             "core_share_ratio": round(
                 statistics.median(one.core_share / other.core_share for one, other in against), 3
+            ),
+            "alone_share_ratio": round(
+                statistics.median(one.alone_share / other.alone_share for one, other in against), 3
             ),
             "tick_mean_ratio": round(
                 statistics.median(float(one.exec_us.mean() / other.exec_us.mean()) for one, other in against), 3
@@ -142,30 +172,88 @@ def _told(blocks: list[Block]) -> dict[str, Any]:
         "control_exec_us": {"mean": float(whole.exec_us.mean())} | quantiles(whole.exec_us),
         "plan_us": whole.plan_us,
         "core_share": round(whole.core_share, 4),
+        "alone_share": round(whole.alone_share, 4),
+        "wakeups_hz": _wakeups(whole.wakeups_hz),
+        "alone_wakeups_hz": _wakeups(whole.alone_hz),
+        "phases_us": whole.phases_us,
+    }
+
+
+def _wakeups(hz: tuple[float, float]) -> dict[str, float]:
+    return {"control": round(hz[0]), "all": round(hz[1])}
+
+
+def _middle(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """The median of each figure; yes where it was yes each time."""
+    return {
+        key: _middle([each[key] for each in found])
+        if isinstance(first, dict)
+        else (all if isinstance(first, bool) else statistics.median)(each[key] for each in found)
+        for key, first in found[0].items()
     }
 
 
 def block(started: Started, seconds: float) -> Block:
     """One block of one kind, under the load of the clients."""
-    with (
-        tempfile.TemporaryDirectory(prefix="tormag-") as folder,
-        started(Path(folder)) as (config, pid),
-        recording(config.endpoints) as recorder,
-    ):
-        stop = multiprocessing.Event()
-        load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
-        load.start()
-        try:
-            recorder.poll(STARTS_MS)
-            collect(recorder, WARM_UP_S)
-            started_s, before_s = time.monotonic(), processor_s(pid)
-            ticks = collect(recorder, seconds)
-            share = (processor_s(pid) - before_s) / (time.monotonic() - started_s)
-            plan_us = planned(config.endpoints.control)
-        finally:
-            stop.set()
-            load.join(5.0)
-    return ticks._replace(plan_us=plan_us, core_share=share)
+    with tempfile.TemporaryDirectory(prefix="tormag-") as folder, started(Path(folder)) as (config, pid):
+        time.sleep(WARM_UP_S)
+        _, alone_share, alone_hz = spent(pid, lambda: time.sleep(seconds))
+        with recording(config.endpoints) as recorder:
+            stop = multiprocessing.Event()
+            load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
+            load.start()
+            try:
+                recorder.poll(STARTS_MS)
+                collect(recorder, WARM_UP_S)
+                ticks, share, hz = spent(pid, partial(collect, recorder, seconds))
+                plan_us, phases_us = reported(config.endpoints.control)
+            finally:
+                stop.set()
+                load.join(5.0)
+    return ticks._replace(
+        plan_us=plan_us,
+        phases_us=phases_us,
+        core_share=share,
+        alone_share=alone_share,
+        wakeups_hz=hz,
+        alone_hz=alone_hz,
+    )
+
+
+def spent(pid: int, wait: Callable[[], T]) -> tuple[T, float, tuple[float, float]]:
+    """What `wait` returns; meanwhile the process's share of a processor, and the wake-ups of its first thread and of
+    all, Hz."""
+    started_s, before_s, before = time.monotonic(), processor_s(pid), wakeups(pid)
+    result = wait()
+    took_s, after = time.monotonic() - started_s, wakeups(pid)
+    woken = {thread: count - before.get(thread, count) for thread, count in after.items()}
+    return result, (processor_s(pid) - before_s) / took_s, (woken[pid] / took_s, sum(woken.values()) / took_s)
+
+
+def wakeups(pid: int) -> dict[int, int]:
+    """How often each thread of a process has been woken (proc_pid_status(5))."""
+    found = {}
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # it may have ended
+            status = (thread / "status").read_text(encoding="ascii", errors="replace")
+            found[int(thread.name)] = int(status.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
+    return found
+
+
+def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
+    """What the host in C prints, on a simulated device of its own; None without a C compiler."""
+    with contextlib.suppress(BuildError), contextlib.ExitStack() as stack:
+        cc, folder = compiler(), Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
+        built, room = folder / "reference_host", FIRMWARE
+        sources = [TOOLS / "reference_host.c", *(room / f"{name}.c" for name in HOST_SOURCES)]
+        subprocess.run([cc, *HOST_FLAGS, f"-I{room}", *map(str, sources), "-o", str(built)], check=True)
+        start = partial(begun, stack, folder / LOG, environment=environment(None, folder))
+        port = first_line(start(*own_machine(0, "tormagd.simulation", "--pty")))
+        words = [port, str(1_000_000 // CONTROL_HZ), str(seconds), str(stand.realtime.fifo_priority)]
+        ran = subprocess.run([str(built), *words], check=True, capture_output=True, text=True)
+        found: dict[str, Any] = json.loads(ran.stdout)
+        return found
+    return None
 
 
 @contextlib.contextmanager
@@ -198,16 +286,22 @@ def as_block(rows: list[list[Any]]) -> Block:
     return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
 
 
-def planned(address: str) -> dict[str, float] | None:
-    """What status says of the plans; None where it says nothing, as the stub's."""
+def reported(address: str) -> tuple[dict[str, float] | None, dict[str, dict[str, float]] | None]:
+    """p50 and p99 of plans and of phases, as status has them; None where it says nothing, as the stub's."""
     with contextlib.closing(Client(Endpoints(control=address), 5.0)) as client:
-        spent = client.request("status").get("rates", {}).get("inference", {}).get("exec_us")
-    return None if spent is None else {name: float(spent[name]) for name in PLAN_QUANTILES}
+        status = client.request("status")
+    plans = status.get("rates", {}).get("inference", {}).get("exec_us")
+    phases = status.get("phases_us", {})
+    return (
+        None if plans is None else {name: float(plans[name]) for name in PLAN_QUANTILES},
+        {phase: {name: float(each[name]) for name in PLAN_QUANTILES} for phase, each in phases.items()} or None,
+    )
 
 
 def merge(blocks: list[Block]) -> Block:
     """All blocks as one; shares and plans in the median."""
     plans = [block.plan_us for block in blocks if block.plan_us is not None]
+    phases = [block.phases_us for block in blocks if block.phases_us is not None]
     return Block(
         np.concatenate([block.lateness_us for block in blocks]),
         np.concatenate([block.exec_us for block in blocks]),
@@ -215,9 +309,30 @@ def merge(blocks: list[Block]) -> Block:
         sum(block.merged for block in blocks),
         sum(block.seconds for block in blocks),
         sum(block.fresh for block in blocks),
-        {name: statistics.median(plan[name] for plan in plans) for name in PLAN_QUANTILES} if plans else None,
+        _middle(plans) if plans else None,
         statistics.median(block.core_share for block in blocks),
+        statistics.median(block.alone_share for block in blocks),
+        _medians([block.wakeups_hz for block in blocks]),
+        _medians([block.alone_hz for block in blocks]),
+        _middle(phases) if phases else None,
     )
+
+
+def _medians(pairs: list[tuple[float, float]]) -> tuple[float, float]:
+    first, second = zip(*pairs, strict=True)
+    return statistics.median(first), statistics.median(second)
+
+
+def draw(path: Path, phases_us: dict[str, dict[str, float]]) -> None:
+    """A PNG of one beat: a bar for each phase, to its p50 and on to its p99."""
+    figure = Figure(figsize=(9, 0.5 * len(phases_us) + 1.5), layout="constrained")
+    axes = figure.subplots()
+    names = list(phases_us)[::-1]
+    axes.barh(names, [phases_us[name]["p99"] for name in names], color="#d8dee9", label="p99")
+    axes.barh(names, [phases_us[name]["p50"] for name in names], color="#2a6f97", label="p50")
+    axes.set(xlabel="us", title=f"What a beat does (eight clients and recording; a period is {1e6 / CONTROL_HZ:g} us)")
+    axes.legend(loc="lower right")
+    figure.savefig(path, dpi=110)
 
 
 def quantiles(values: Array) -> dict[str, float]:
@@ -370,6 +485,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--against", type=checkout, metavar="FOLDER", help="root of another checkout, measured in turns with this one"
     )
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="PNG of one beat, phase by phase")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
@@ -381,7 +497,11 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
             block(partial(daemon, ours), options.seconds),
             block(partial(stub_process, ours), options.seconds),
             None if options.against is None else block(partial(daemon, theirs), options.seconds),
+            reference_host(ours, options.seconds),
         )
         for _ in range(options.pairs)
     ]
-    return summary(pairs, ours.realtime)
+    result = summary(pairs, ours.realtime)
+    if options.picture is not None and result["phases_us"]:
+        draw(options.picture, result["phases_us"])
+    return result
