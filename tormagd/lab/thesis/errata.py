@@ -161,11 +161,11 @@ def _eq_25() -> Row:
     moment_Tm = ThesisFieldLaw().radial_moment_Tm(CLOSED_MM)
     radial = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     stretch = constitutive.stretches(radial, 1.0)
-    b = constitutive.field(moment_Tm / TORMAG.inner_radius_m)
+    b_T = np.array([moment_Tm / TORMAG.inner_radius_m, 0.0, 0.0])
     material = constitutive.MooneyRivlin(SAMPLE.shear_modulus_Pa / 2.0, 0.0, SAMPLE.relative_permeability)
-    pressure_Pa = constitutive.pressure_for_free_ends_Pa(stretch, b, material)
+    pressure_Pa = constitutive.pressure_for_free_ends_Pa(stretch, b_T, material)
     stresses = (constitutive.cauchy_stress_Pa, constitutive.nominal_stress_Pa)
-    true_kPa, nominal_kPa = (1e-3 * float(each(stretch, b, material, pressure_Pa)[0, 0]) for each in stresses)
+    true_kPa, nominal_kPa = (1e-3 * float(each(stretch, b_T, material, pressure_Pa)[0, 0]) for each in stresses)
     return (
         "Eq. 25",
         "T is the nominal stress",
