@@ -60,15 +60,10 @@ class Trained:
     grey: GreyBox
 
 
-def dataset(record: PadRecord, thin: int = 1) -> Dataset:
-    """A record as a laboratory would have it: without the true force."""
-    return Dataset(record.features[::thin], record.force_N[::thin], record.cycle[::thin], record.time_s[::thin])
-
-
 def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
     """Train both models on the training part of the random split."""
     cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
-    data = dataset(cycles)
+    data = cycles.data
     known = ~random_split(len(data), SPLIT_SEED)
     model, _ = fit_network(data, known, epochs=effort.epochs)
     pad = PADS[PAD_IN_USE]
@@ -76,7 +71,7 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
     grey = fit_grey_box(
         data.subset(own),
         known[own],
-        dataset(holding_records(pad, noise_N, int(pad.cip_percent), samples=effort.hold_samples)),
+        holding_records(pad, noise_N, int(pad.cip_percent), samples=effort.hold_samples).data,
         epochs=effort.pad_epochs,
         settling_epochs=effort.settling_epochs,
     )
@@ -85,7 +80,7 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
 
 def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
     """Table 4.1 per class on the random split, the noise floor, and what whole groups left out do to it."""
-    data = dataset(trained.cycles)
+    data = trained.cycles.data
     held = random_split(len(data), SPLIT_SEED)
     predicted = trained.model.predict(data.features)
     rows = []
@@ -99,8 +94,8 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
             row[part] = {"mae_N": scores["mae_N"], "sd_N": deviation, "mae_percent": scores["mae_percent"]}
             row[part]["r2"] = scores["r2"]
         rows.append(row)
-    noise_N = float(np.abs(trained.cycles.force_N - trained.cycles.true_force_N)[held].mean())
-    thinned = dataset(trained.cycles, effort.thin)
+    noise_N = float(np.abs(data.force_N - trained.cycles.true_force_N)[held].mean())
+    thinned = data.subset(np.arange(0, len(data), effort.thin))
     epochs = effort.group_epochs
     fields = tqdm(list(leave_one_out(thinned, "field_mT")), desc="fields left out", disable=None, leave=False)
     test = rows[-1]["test"]

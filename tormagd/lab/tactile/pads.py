@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tormagd.lab.training.dataset import Dataset
 from tormagd.simulation.parameters import PadParameters, Relaxation
 from tormagd.simulation.tactile_pad import (
     FULL_FIELD_MT,
@@ -29,6 +30,7 @@ RISE_SAMPLES = 46
 """Of a relaxation test: until the depth is reached."""
 PASSES_BEFORE = 3
 """Unrecorded passes of the same program before each record: 5 minutes, after which the peaks repeat."""
+HOLD_S = 3600.0
 
 
 PADS = MappingProxyType(
@@ -64,22 +66,30 @@ def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
     )
 
 
-class PadRecord(NamedTuple):
-    """Samples of one or more records: features (n x 4: mm, mm/s, mT, %), force, and time since the last rest.
+class Program(NamedTuple):
+    """What is done to a pad, sample by sample: time, displacement, rate by the two-point difference, field."""
 
-    `true_force_N` is the force without the sensor's noise, which no laboratory has. `cycle` counts through all records.
-    """
-
-    features: Array
-    force_N: Array
-    true_force_N: Array
-    cycle: NDArray[np.int64]
     time_s: Array
+    displacement_mm: Array
+    rate_mm_s: Array
+    field_mT: Array
 
-    @classmethod
-    def join(cls, records: "list[PadRecord]") -> "PadRecord":
-        """One after the other."""
-        return cls(*(np.concatenate(parts) for parts in zip(*records, strict=True)))
+    def features(self, cip_percent: float) -> Array:
+        """The network's features (n x 4)."""
+        cip = np.full_like(self.field_mT, cip_percent)
+        return np.column_stack((self.displacement_mm, self.rate_mm_s, self.field_mT, cip))
+
+
+class PadRecord(NamedTuple):
+    """What was measured, record after record; `cycle` counts through all of them. And the force without the sensor's
+    noise, which no laboratory has."""
+
+    data: Dataset
+    true_force_N: Array
+
+
+Pass = tuple[PadParameters, Program, Array]
+"What a pad was given in one record, and its force, N."
 
 
 def cyclic_records(
@@ -87,7 +97,6 @@ def cyclic_records(
     seed: int,
     *,
     samples_per_cycle: int = SAMPLES_PER_CYCLE,
-    fields_mT: tuple[float, ...] = FIELDS_MT,
     pads: Iterable[PadParameters] = tuple(PADS.values()),
 ) -> PadRecord:
     """The data of figure 4.3: three pads, eleven fields, twelve cycles of 175 samples, 69,300 rows. No holds, as there.
@@ -95,23 +104,17 @@ def cyclic_records(
     Each field is a record of its own after a rest, preceded by three unrecorded passes of the same cycles.
     """
     time_s, displacement_mm, rate_mm_s, cycle = cycling_program(samples_per_cycle)
-    noise = np.random.default_rng(seed)
-    records: list[PadRecord] = []
+    passes: list[Pass] = []
     for parameters in pads:
         pad = TactilePad(parameters)
-        for field_mT in fields_mT:
+        for field_mT in FIELDS_MT:
             pad.rest()
-            fields = np.full_like(time_s, field_mT)
-            for pass_index in range(PASSES_BEFORE + 1):
-                times = time_s + pass_index * time_s[-1]
-                force_N = pad.run(times, displacement_mm, rate_mm_s, fields)
-            features = np.column_stack(
-                (displacement_mm, rate_mm_s, fields, np.full_like(fields, parameters.cip_percent))
-            )
-            noisy = force_N + noise.normal(0.0, noise_N, len(force_N))
-            labels = cycle + len(records) * (int(cycle[-1]) + 1)
-            records.append(PadRecord(features, noisy, force_N, labels, times))
-    return PadRecord.join(records)
+            for number in range(PASSES_BEFORE + 1):
+                times_s, fields_mT = time_s + number * time_s[-1], np.full_like(time_s, field_mT)
+                program = Program(times_s, displacement_mm, rate_mm_s, fields_mT)
+                force_N = pad.run(*program)
+            passes.append((parameters, program, force_N))
+    return _recorded(passes, cycle, noise_N, seed)
 
 
 def holding_records(
@@ -120,22 +123,22 @@ def holding_records(
     seed: int,
     *,
     fields_mT: tuple[float, ...] = (0.0, 91.25, 182.5, 273.75, 365.0),
-    duration_s: float = 3600.0,
     samples: int = 500,
 ) -> PadRecord:
     """Relaxation tests, which the thesis did not have: to 4.5 mm at 1 mm/s, then held; sampled ever more rarely."""
     rise_s = FULL_INDENTATION_MM
-    held_s = np.geomspace(0.05, duration_s, samples - RISE_SAMPLES)
+    held_s = np.geomspace(0.05, HOLD_S, samples - RISE_SAMPLES)
     time_s = np.concatenate((np.linspace(0.0, rise_s, RISE_SAMPLES), rise_s + held_s))
-    displacement_mm = np.minimum(time_s, rise_s)
-    rate_mm_s = np.where(time_s <= rise_s, 1.0, 0.0)
-    noise = np.random.default_rng(seed)
-    records = []
-    for index, field_mT in enumerate(fields_mT):
-        pad = worked_pad(parameters)
-        fields = np.full_like(time_s, field_mT)
-        force_N = pad.run(time_s, displacement_mm, rate_mm_s, fields)
-        features = np.column_stack((displacement_mm, rate_mm_s, fields, np.full_like(fields, parameters.cip_percent)))
-        noisy = force_N + noise.normal(0.0, noise_N, samples)
-        records.append(PadRecord(features, noisy, force_N, np.full(samples, index), time_s))
-    return PadRecord.join(records)
+    displacement_mm, rate_mm_s = np.minimum(time_s, rise_s), np.where(time_s <= rise_s, 1.0, 0.0)
+    programs = [Program(time_s, displacement_mm, rate_mm_s, np.full_like(time_s, field_mT)) for field_mT in fields_mT]
+    passes = [(parameters, program, worked_pad(parameters).run(*program)) for program in programs]
+    return _recorded(passes, np.zeros(samples, dtype=np.int64), noise_N, seed)
+
+
+def _recorded(passes: list[Pass], cycle: NDArray[np.int64], noise_N: float, seed: int) -> PadRecord:
+    """The passes one after the other, each with these numbers of its cycles, as a sensor with that noise shows them."""
+    features = np.concatenate([program.features(pad.cip_percent) for pad, program, _ in passes])
+    true_N = np.concatenate([force_N for *_, force_N in passes])
+    noisy_N = true_N + np.random.default_rng(seed).normal(0.0, noise_N, len(true_N))
+    cycles = np.concatenate([cycle + number * (int(cycle[-1]) + 1) for number in range(len(passes))])
+    return PadRecord(Dataset(features, noisy_N, cycles, np.concatenate([each.time_s for _, each, _ in passes])), true_N)

@@ -1,14 +1,12 @@
 """The pictures of docs/learned_inverse.md."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from tormagd.lab.arrays import Array
 from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT, Trained
-from tormagd.lab.tactile.pads import PadRecord
+from tormagd.lab.training.dataset import Dataset
+from tormagd.model.features import FIELD
 
 CLASSES = {25.0: "MRE-A, 25 %", 35.0: "MRE-B, 35 %", 45.0: "MRE-C, 45 %"}
 SHOWN_FIELDS = (0, 3, 6, 10)
@@ -20,39 +18,30 @@ def pictures(trained: Trained, traces: dict[str, Array]) -> dict[str, Figure]:
     return {"tactile_fit": _fit(trained), "tactile_pulse": _pulse(traces)}
 
 
-def _last_cycles(cycles: PadRecord, cip_percent: float) -> list[tuple[float, NDArray[np.int64]]]:
-    """(field, rows) of the last cycle at 1 mm/s, at some of the fields."""
-    features = cycles.features
-    chosen = []
-    for field_mT in np.unique(features[:, 2])[list(SHOWN_FIELDS)]:
-        rows = np.flatnonzero(
-            (features[:, 3] == cip_percent)
-            & (features[:, 2] == field_mT)
-            & np.isclose(np.abs(features[:, 1]), SHOWN_RATE_MM_S)
-        )
-        cycle = cycles.cycle[rows]
-        chosen.append((float(field_mT), rows[cycle == cycle.max()]))
-    return chosen
-
-
-def _panels(title: str, width: float = 11.0) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(width, 3.8), layout="constrained")
-    axes = figure.subplots(1, 3)
-    for axis, label in zip(axes, CLASSES.values(), strict=True):
-        axis.set(xlabel="displacement, mm", title=label)
-    axes[0].set_ylabel("force, N")
-    figure.suptitle(title)
-    return figure, axes
+def _last_cycle(cycles: Dataset, cip_percent: float, field_mT: float) -> Dataset:
+    """The last one at 1 mm/s of that class and field."""
+    _, rate_mm_s, fields_mT, classes = cycles.features.T
+    is_slow = np.isclose(np.abs(rate_mm_s), SHOWN_RATE_MM_S)
+    rows = cycles.subset((classes == cip_percent) & (fields_mT == field_mT) & is_slow)
+    assert rows.cycle is not None  # the pads' records have them
+    return rows.subset(rows.cycle == rows.cycle.max())
 
 
 def _fit(trained: Trained) -> Figure:
-    figure, axes = _panels("Data and network at 1 mm/s (synthetic; like figures 4.3 and 4.4)")
-    for axis, cip_percent in zip(axes, CLASSES, strict=True):
-        for index, (field_mT, rows) in enumerate(_last_cycles(trained.cycles, cip_percent)):
-            features = trained.cycles.features[rows]
+    figure = Figure(figsize=(11.0, 3.8), layout="constrained")
+    axes = figure.subplots(1, 3)
+    axes[0].set_ylabel("force, N")
+    figure.suptitle("Data and network at 1 mm/s (synthetic; like figures 4.3 and 4.4)")
+    cycles = trained.cycles.data
+    shown_mT = np.unique(cycles.features[:, FIELD])[list(SHOWN_FIELDS)]
+    for axis, (cip_percent, title) in zip(axes, CLASSES.items(), strict=True):
+        axis.set(xlabel="displacement, mm", title=title)
+        for index, field_mT in enumerate(shown_mT):
+            rows = _last_cycle(cycles, cip_percent, field_mT)
+            displacement_mm = rows.features[:, 0]
             label = f"data, {field_mT:.0f} mT"
-            axis.plot(features[:, 0], trained.cycles.force_N[rows], ".", ms=4, color=f"C{index}", label=label)
-            axis.plot(features[:, 0], trained.model.predict(features), lw=1, color="black")
+            axis.plot(displacement_mm, rows.force_N, ".", ms=4, color=f"C{index}", label=label)
+            axis.plot(displacement_mm, trained.model.predict(rows.features), lw=1, color="black")
     axes[0].plot([], [], color="black", label="network")
     axes[0].legend()
     return figure

@@ -13,7 +13,7 @@ from tormagd.inverse.solution import FieldSolver, Reach
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
-from tormagd.lab.tactile.pads import PADS, drawn_pad
+from tormagd.lab.tactile.pads import PADS, Program, drawn_pad
 from tormagd.lab.training.grey_box import GreyBoxMemory
 from tormagd.model.model_file import ForceModel
 from tormagd.simulation.parameters import PadParameters
@@ -35,20 +35,6 @@ HOLD_FORCES_N = (148.0, 154.0)
 """Within reach of the field at the beginning and after an hour of relaxation."""
 HELD_PULSE_S = 20.0
 TEN_MINUTES_S = 600.0
-
-
-class Program(NamedTuple):
-    """What is done to the pad, sample by sample: time, displacement, rate by the two-point difference, field."""
-
-    time_s: Array
-    displacement_mm: Array
-    rate_mm_s: Array
-    field_mT: Array
-
-    def features(self, cip_percent: float) -> Array:
-        """The network's features (n x 4)."""
-        cip = np.full_like(self.field_mT, cip_percent)
-        return np.column_stack((self.displacement_mm, self.rate_mm_s, self.field_mT, cip))
 
 
 def pulse_shape(duration_s: float, rate_hz: int) -> Array:
@@ -85,23 +71,20 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 
 def solve_all(
     solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
-) -> tuple[Array, Array]:
-    """The field for each row in turn, and the force that the solver was asked for.
-
-    With `memory` that is the force asked, freed of what the pad remembers.
-    """
-    fields, wanted, last = np.empty(len(force_N)), force_N.copy(), None
-    for index, (row, asked_N) in enumerate(zip(features.tolist(), force_N.tolist(), strict=True)):
+) -> Array:
+    """The field for each row in turn. With `memory` each force is freed of what the pad remembers first."""
+    fields, last = [], None
+    for row, wanted_N in zip(features.tolist(), force_N.tolist(), strict=True):
         displacement_mm, rate_mm_s, _, cip_percent = row
         if memory is not None:
-            wanted[index] = memory.elastic_N(displacement_mm, rate_mm_s, asked_N, cip_percent)
+            wanted_N = memory.elastic_N(displacement_mm, rate_mm_s, wanted_N, cip_percent)
         curve = model.curve(displacement_mm, rate_mm_s, cip_percent)
-        last = solver.solve(curve, float(wanted[index]), last).field_mT
+        last = solver.solve(curve, wanted_N, last).field_mT
         if memory is not None:
             # what the field found can give, not what was wished
             memory.advance(displacement_mm, rate_mm_s, last, cip_percent)
-        fields[index] = last
-    return fields, wanted
+        fields.append(last)
+    return np.array(fields)
 
 
 class Course(NamedTuple):
@@ -148,24 +131,23 @@ def nearest() -> NearestFieldSearch:
     return NearestFieldSearch(field_grid(FIELDS_MT, 2.0))
 
 
-def aware_fields(trained: Trained, along: Course, force_N: Array) -> Array:
-    """The fields that the relaxation-aware model finds for the forces."""
+def aware_fields(trained: Trained, along: Course, noise_N: float = 0.0) -> Array:
+    """The fields that the relaxation-aware model finds for the forces, as a sensor with that noise shows them."""
+    noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
     memory = GreyBoxMemory(trained.grey, along.dt_s)
-    return solve_all(nearest(), trained.grey.model, along.features, force_N, memory)[0]
+    return solve_all(nearest(), trained.grey.model, along.features, noisy_N, memory)
 
 
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
     """Scores of each way to the field, and the traces."""
-    noise_N = trained.noise_N
-    noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
     linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
-        "mlp": solve_all(nearest(), trained.model, along.features, along.force_N, None)[0],
-        "mlp_thesis_search": solve_all(linear, trained.model, along.features, along.force_N, None)[0],
-        "relaxation_aware": aware_fields(trained, along, along.force_N),
-        "relaxation_aware_noisy": aware_fields(trained, along, noisy_N),
+        "mlp": solve_all(nearest(), trained.model, along.features, along.force_N, None),
+        "mlp_thesis_search": solve_all(linear, trained.model, along.features, along.force_N, None),
+        "relaxation_aware": aware_fields(trained, along),
+        "relaxation_aware_noisy": aware_fields(trained, along, trained.noise_N),
     }
-    bound_mT = np.sqrt(2.0 / np.pi) * noise_N / along.slope_N_mT[along.scored]
+    bound_mT = np.sqrt(2.0 / np.pi) * trained.noise_N / along.slope_N_mT[along.scored]
     scores: dict[str, Any] = {name: along.scores(fields) for name, fields in ways.items()}
     scores["noise_bound_mae_mT"] = float(bound_mT.mean())
     scores["scored_share"] = float(along.scored.mean())
@@ -180,19 +162,14 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
     own = course(pad, shape, every)
     strangers = [course(drawn_pad(pad, seed), shape, every) for seed in OTHER_PADS]
     recorded = {name: course(pad, other, every) for name, other in recorded_shapes(HELD_S, RATE_HZ).items()}
-    by_noise, all_traces = {}, []
-    for trained in trainings:
-        scores, traces = pulse_on(own, trained)
-        scores["other_pads"] = [along.scores(aware_fields(trained, along, along.force_N)) for along in strangers]
-        scores["other_pulses"] = {
-            name: along.scores(aware_fields(trained, along, along.force_N)) for name, along in recorded.items()
-        }
-        by_noise[str(trained.noise_N)] = scores
-        all_traces.append(traces)
-    top = by_noise[str(trainings[0].noise_N)]
+    rendered = [pulse_on(own, trained) for trained in trainings]
+    for trained, (scores, _) in zip(trainings, rendered, strict=True):
+        scores["other_pads"] = [along.scores(aware_fields(trained, along)) for along in strangers]
+        scores["other_pulses"] = {name: along.scores(aware_fields(trained, along)) for name, along in recorded.items()}
+    top, traces = rendered[0]
     kept = ("mlp", "mlp_thesis_search", "relaxation_aware", "noise_bound_mae_mT", "scored_share")
-    figures = {"synthetic": True, "shape": SHAPE, **{name: top[name] for name in kept}, "by_noise": by_noise}
-    return figures, all_traces[0]
+    by_noise = {str(trained.noise_N): scores for trained, (scores, _) in zip(trainings, rendered, strict=True)}
+    return {"synthetic": True, "shape": SHAPE, **{name: top[name] for name in kept}, "by_noise": by_noise}, traces
 
 
 def hold(trained: Trained, duration_s: float) -> dict[str, Any]:

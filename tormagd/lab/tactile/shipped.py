@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from tormagd.lab.main import Found
-from tormagd.lab.tactile.models import FULL, Effort, dataset
+from tormagd.lab.tactile.models import FULL, Effort
 from tormagd.lab.tactile.pads import cyclic_records, holding_records
 from tormagd.lab.training.grey_box import fit_grey_box
 from tormagd.lab.training.metrics import force_metrics, not_rising_share, random_split
@@ -34,12 +34,12 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
     if plant.pad is None:
         raise PlantError(f"plant {plant_name}: allowed is one with a [pad]")
     noise_N = 1e-3 * plant.force_sensor.noise_mN
-    cycles = dataset(cyclic_records(noise_N, SEED, samples_per_cycle=effort.samples_per_cycle, pads=[plant.pad]))
-    holds = dataset(holding_records(plant.pad, noise_N, SEED, samples=effort.hold_samples))
+    cycles = cyclic_records(noise_N, SEED, samples_per_cycle=effort.samples_per_cycle, pads=[plant.pad]).data
+    holds = holding_records(plant.pad, noise_N, SEED, samples=effort.hold_samples).data
     held_out = random_split(len(cycles), SEED)
     epochs, settling_epochs = effort.pad_epochs, effort.settling_epochs
     grey = fit_grey_box(cycles, ~held_out, holds, hidden=HIDDEN, epochs=epochs, settling_epochs=settling_epochs)
-    unseen = dataset(holding_records(plant.pad, 0.0, SEED, fields_mT=UNSEEN_FIELDS_MT, samples=effort.hold_samples))
+    unseen = holding_records(plant.pad, 0.0, SEED, fields_mT=UNSEEN_FIELDS_MT, samples=effort.hold_samples).data
     is_pressed = unseen.features[:, 0] > 1.0
     predicted_N = grey.predict(cycles)[held_out]
     scores = force_metrics(predicted_N, cycles.force_N[held_out], grey.model.force_span_N)
