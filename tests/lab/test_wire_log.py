@@ -1,5 +1,6 @@
 """A recorded session is read by stock CAN tools: cantools with the DBC, and python-can's own."""
 
+import contextlib
 import os
 import select
 import threading
@@ -90,11 +91,11 @@ def test_cantools_decodes_every_frame_with_names_and_units(
 def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:
     drive = encode(Drive(0.1, 0.2, DriveMode.RUN, 5))
     good = encode_frame(FUNCTION[Drive], 0, drive)
-    with wire_log.WireLog(tmp_path / "session.log") as log:
+    with contextlib.closing(wire_log.WireLog(tmp_path / "session.log")) as log:
         for byte in good:
-            log.to_device(1.5, bytes((byte,)))
-        log.to_device(2.0, good[:5] + b"\0")
-        log.to_device(2.5, encode_frame(0x80, 1, b"") + encode_frame(0, 2, b""))
+            log.add(1.5, bytes((byte,)), is_rx=False)
+        log.add(2.0, good[:5] + b"\0", is_rx=False)
+        log.add(2.5, encode_frame(0x80, 1, b"") + encode_frame(0, 2, b""), is_rx=False)
         assert (log.frames, log.damaged) == (1, 3)
     with can.LogReader(tmp_path / "session.log") as reader:
         (frame,) = reader
@@ -140,7 +141,7 @@ class Tap:
     def close(self) -> None:
         self.end()
         self.port.close()
-        self.log.__exit__(None, None, None)
+        self.log.close()
         for descriptor in (self.host, self._near, self.device):
             if descriptor >= 0:
                 os.close(descriptor)

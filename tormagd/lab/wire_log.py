@@ -14,17 +14,14 @@ import select
 import signal
 import threading
 import time
-import tty
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import can
 import serial
 
 from firmware_protocol.codec import FUNCTION, can_identifier
-from firmware_protocol.framing import Frame, FrameDecoder
+from firmware_protocol.framing import FrameDecoder
 from firmware_protocol.layouts import LAYOUTS
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
@@ -36,23 +33,22 @@ from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
 from tormagd.simulation.plant import Truth
+from tormagd.simulation.pty_door import READ_BYTES, Pty
 
 NODE = 1
-READ_BYTES = 4096
 POLL_MS = 100
 MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 
 
 class WireLog:
-    """A log of both directions of one serial line; also a context manager.
+    """A log of both directions of one serial line, to be closed.
 
     A frame is stamped with the time its last byte passed. What is no frame, or names a function that CAN has no
     identifier for, is counted in `damaged` and not in the log. Raises ValueError for a file type that python-can does
     not know, and OSError where the file cannot be made.
     """
 
-    def __init__(self, path: Path, node: int = NODE) -> None:
-        self._node = node
+    def __init__(self, path: Path) -> None:
         self._log = can.Logger(path)
         self._decoders = {is_rx: FrameDecoder() for is_rx in (False, True)}
         self._nameless = 0
@@ -63,39 +59,26 @@ class WireLog:
         """Stretches of bytes that could not be logged."""
         return self._nameless + sum(decoder.statistics.corrupt for decoder in self._decoders.values())
 
-    def to_device(self, time_s: float, data: bytes) -> None:
-        """Bytes from the host."""
-        self._add(time_s, data, is_rx=False)
-
-    def to_host(self, time_s: float, data: bytes) -> None:
-        """Bytes from the device."""
-        self._add(time_s, data, is_rx=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Ends the file."""
         self._log.stop()
 
-    def _add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
+    def add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
+        """Bytes from the device, where the host receives them, or from the host."""
         for frame in self._decoders[is_rx].feed(data):
             if not 1 <= frame.function <= 0x7F:
                 self._nameless += 1
                 continue
-            self._log.on_message_received(self._message(time_s, frame, is_rx))
+            message = can.Message(
+                timestamp=time_s,
+                arbitration_id=can_identifier(frame.function, NODE),
+                is_extended_id=False,
+                data=frame.payload,
+                is_rx=is_rx,
+                channel="can0",
+            )
+            self._log.on_message_received(message)
             self.frames += 1
-
-    def _message(self, time_s: float, frame: Frame, is_rx: bool) -> can.Message:
-        return can.Message(
-            timestamp=time_s,
-            arbitration_id=can_identifier(frame.function, self._node),
-            is_extended_id=False,
-            data=frame.payload,
-            is_rx=is_rx,
-            channel="can0",
-        )
 
 
 class TappedDevice:
@@ -112,13 +95,13 @@ class TappedDevice:
 
     def receive(self, now_s: float, data: bytes) -> None:
         """As the device's own."""
-        self._log.to_device(now_s, data)
+        self._log.add(now_s, data, is_rx=False)
         self._device.receive(now_s, data)
 
     def transmit(self, now_s: float) -> bytes:
         """As the device's own."""
         data = self._device.transmit(now_s)
-        self._log.to_host(now_s, data)
+        self._log.add(now_s, data, is_rx=True)
         return data
 
 
@@ -142,42 +125,32 @@ def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stop
 
     Raises OSError when the port goes away.
     """
-    with contextlib.ExitStack() as resources:
-        ours, theirs = os.openpty()
-        resources.callback(os.close, ours)
-        resources.callback(os.close, theirs)  # held open, so that there is no end of file between hosts
-        tty.setraw(theirs)
-        os.set_blocking(ours, False)
-        announce(os.ttyname(theirs))
+    with contextlib.closing(Pty()) as line:
+        announce(line.address)
         poll = select.poll()
-        poll.register(ours, select.POLLIN)
-        poll.register(port.fileno(), select.POLLIN)
+        for descriptor in (*line.descriptors(), port.fileno()):
+            poll.register(descriptor, select.POLLIN)
         while not stopped():
             for descriptor, _ in poll.poll(POLL_MS):
                 data = os.read(descriptor, READ_BYTES)
                 if not data:
                     raise OSError(f"{port.port}: the device was unplugged")
-                if descriptor == ours:
-                    _pass_on(port.fileno(), data)
-                    log.to_device(time.time(), data)
+                is_rx = descriptor == port.fileno()
+                if is_rx:
+                    line.write(data)
                 else:
-                    _pass_on(ours, data)
-                    log.to_host(time.time(), data)
+                    with contextlib.suppress(BlockingIOError):  # what a device does not fetch is lost
+                        os.write(port.fileno(), data)
+                log.add(time.time(), data, is_rx=is_rx)
 
 
-def _pass_on(descriptor: int, data: bytes) -> None:
-    """What nobody fetches is lost, as on a port; descriptors do not block."""
-    with contextlib.suppress(BlockingIOError):
-        os.write(descriptor, data)
-
-
-def viewer_formats(node: int = NODE) -> list[str]:
+def viewer_formats() -> list[str]:
     """`ID:FORMAT:DIVISOR...` of each message, as `python -m can.viewer -d FILE` reads them."""
     lines = []
     for layout in LAYOUTS:
         divisors = [repr(1.0 / signal.scale) if signal.type is float else "1" for signal in layout.signals]
         divisors += ["1"] * layout.protected
-        lines.append(":".join([f"{can_identifier(FUNCTION[layout.message], node):X}", layout.format, *divisors]))
+        lines.append(":".join([f"{can_identifier(FUNCTION[layout.message], NODE):X}", layout.format, *divisors]))
     return lines
 
 
@@ -203,7 +176,7 @@ def run(options: argparse.Namespace) -> Found:
         log = WireLog(options.file)
     except ValueError as error:
         raise LabError(str(error)) from error
-    with log:
+    with contextlib.closing(log):
         if options.way == "virtual":
             virtual_session(options.seconds, log)
         else:
