@@ -77,17 +77,17 @@ def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
     return {
         "points": len(curve.stretch),
         "stretch": [float(np.min(curve.stretch)), float(np.max(curve.stretch))],
-        "neo_hookean": {"shear_modulus_kPa": 1e-3 * neo_hookean.law.shear_modulus_Pa, "r2": neo_hookean.r2},
+        "neo_hookean": {"shear_modulus_kPa": 1e-3 * neo_hookean.shear_modulus_Pa, "r2": neo_hookean.r2},
         "ogden": {
-            "shear_modulus_kPa": 1e-3 * ogden.law.shear_modulus_Pa,
-            "moduli_kPa": [1e-3 * modulus_Pa for modulus_Pa in ogden.law.moduli_Pa],
-            "exponents": list(ogden.law.exponents),
+            "shear_modulus_kPa": 1e-3 * ogden.shear_modulus_Pa,
+            "moduli_kPa": [1e-3 * modulus_Pa for modulus_Pa in ogden.moduli_Pa],
+            "exponents": list(ogden.exponents),
             "r2": ogden.r2,
         },
         "thesis_eq_3": {
-            "shear_modulus_kPa": 1e-3 * thesis.law.shear_modulus_Pa,
-            "G_o_kPa": 1e-3 * thesis.law.constant_Pa,
-            "alpha": thesis.law.exponent,
+            "shear_modulus_kPa": 1e-3 * thesis.shear_modulus_Pa,
+            "G_o_kPa": 1e-3 * 2.0 * thesis.shear_modulus_Pa / thesis.exponents[0],
+            "alpha": thesis.exponents[0],
             "r2": thesis.r2,
         },
     }

@@ -1,56 +1,81 @@
-"""Fits of the uniaxial laws to a stress-stretch curve by least squares of the engineering stress.
+"""Fits of uniaxial laws of incompressible rubber to a stress-stretch curve, by least squares of the engineering stress.
+
+The *engineering stress* is force over undeformed area; tension, and stretches above one, are positive.
+
+    Ogden        sigma = sum 2 mu_i / alpha_i (lambda^(alpha_i - 1) - lambda^(-alpha_i / 2 - 1))
+    neo-Hookean  sigma = G (lambda - lambda^-2), which is Ogden's with alpha = 2
+    thesis       sigma = G_o (lambda^alpha - lambda^(-alpha / 2))                                      (Eq. 3)
+
+The thesis calls Eq. 3 an Ogden law for the engineering stress of Eq. 1, and G_o the shear modulus. It is one up to
+two factors: lambda times Ogden's stress is the *true* stress, and G_o stands for 2 mu / alpha. Any incompressible law
+starts with the slope 3 G; that of Eq. 3 is 3 alpha G_o / 2. So its shear modulus is mu = alpha G_o / 2, and G_o only
+where alpha is 2.
 
 Every law is linear in its moduli, so only the exponents are searched: the moduli are the non-negative least-squares
 solution for each trial (variable projection). A grid of exponents starts the search, so that it needs no first guess.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import combinations
-from typing import Generic, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from tormagd.lab.arrays import Array
-from tormagd.lab.characterisation.hyperelastic import (
-    MAX_EXPONENT,
-    MAX_STRETCH,
-    MIN_STRETCH,
-    Ogden,
-    ThesisOgden,
-    ogden_shape,
-    thesis_shape,
-)
 from tormagd.lab.errors import LabError
 from tormagd.physics.errors import FloatArray, require
 
-Law = TypeVar("Law", Ogden, ThesisOgden)
 Shape = Callable[[FloatArray, float], FloatArray]
+"The stress of one term over its modulus, by the stretch and the exponent; unchecked."
 
+MIN_STRETCH, MAX_STRETCH = 0.05, 20.0
+MIN_EXPONENT, MAX_EXPONENT = 0.05, 30.0
 MAX_TERMS = 3
-LEAST_EXPONENT = 0.05
 _GRID = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 13.0, 19.0, 27.0)
 _STARTS = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Fit(Generic[Law]):
-    """A fitted law with r2, the share of the stress's variance that it explains, and the RMS of what it leaves, Pa."""
+def thesis_shape(stretch: FloatArray, exponent: float) -> FloatArray:
+    """Eq. 3 over mu, the true stress of Ogden's law. By expm1 it loses no digits towards lambda = 1."""
+    log = np.log(stretch)
+    shape: FloatArray = 2.0 / exponent * np.exp(-0.5 * exponent * log) * np.expm1(1.5 * exponent * log)
+    return shape
 
-    law: Law
+
+def ogden_shape(stretch: FloatArray, exponent: float) -> FloatArray:
+    """Engineering stress of one Ogden term over its mu."""
+    return thesis_shape(stretch, exponent) / stretch
+
+
+def stress_Pa(
+    shape: Shape, stretch: FloatArray, moduli_Pa: tuple[float, ...], exponents: tuple[float, ...]
+) -> FloatArray:
+    """The stress of a law, Pa, at these stretches; it keeps their type."""
+    terms = zip(moduli_Pa, exponents, strict=True)
+    return sum((modulus_Pa * shape(stretch, exponent) for modulus_Pa, exponent in terms), 0.0 * stretch)
+
+
+class Fit(NamedTuple):
+    """A fitted law: its moduli mu, Pa, its exponents, and r2, the share of the stress's variance that it explains."""
+
+    moduli_Pa: tuple[float, ...]
+    exponents: tuple[float, ...]
     r2: float
-    rms_Pa: float
+
+    @property
+    def shear_modulus_Pa(self) -> float:
+        """Initial shear modulus, a third of the slope at lambda = 1."""
+        return sum(self.moduli_Pa)
 
 
-def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit[Ogden]:
+def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit:
     """The shear modulus that fits best. Raises `LabError` for a curve no positive modulus fits."""
     _check(stretch, stress_Pa, 2)
-    moduli, _ = _moduli(ogden_shape, stretch, stress_Pa, (2.0,))
-    return _fit(Ogden(_positive(moduli), (2.0,)), stretch, stress_Pa)
+    return _fitted(ogden_shape, stretch, stress_Pa, (2.0,))
 
 
-def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit[Ogden]:
+def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit:
     """Ogden's law with up to `terms` terms, 1..3, of positive exponents; one whose best modulus is zero is dropped.
 
     Negative exponents are left out, because one direction of loading cannot tell them from positive ones: under tension
@@ -61,40 +86,34 @@ def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit[Ogden]:
     """
     if not 1 <= terms <= MAX_TERMS:
         raise LabError(f"terms = {terms}: allowed is 1..{MAX_TERMS}")
-    _check(stretch, stress_Pa, 2 * terms + 1)
-    moduli, exponents = _search(ogden_shape, stretch, stress_Pa, terms)
-    kept = [(modulus, exponent) for modulus, exponent in zip(moduli, exponents, strict=True) if modulus > 0.0]
-    return _fit(Ogden(tuple(pair[0] for pair in kept), tuple(pair[1] for pair in kept)), stretch, stress_Pa)
+    return _searched(ogden_shape, stretch, stress_Pa, terms)
 
 
-def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit[ThesisOgden]:
+def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit:
     """Eq. 3 of the thesis as printed, with alpha > 0. Raises `LabError` like `fit_ogden`."""
-    _check(stretch, stress_Pa, 3)
-    moduli, exponents = _search(thesis_shape, stretch, stress_Pa, 1)
-    return _fit(ThesisOgden(moduli[0], exponents[0]), stretch, stress_Pa)
+    return _searched(thesis_shape, stretch, stress_Pa, 1)
 
 
-def _search(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """(moduli, exponents) of the best fit, from the best few points of a grid."""
-    ranked = sorted(
-        ((_moduli(shape, stretch, stress_Pa, start)[1], start) for start in combinations(_GRID, terms)),
-        key=lambda pair: pair[0],
-    )
-    best_norm, best = ranked[0]
-    for _, start in ranked[:_STARTS]:
+def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit:
+    """The best fit, from the best few points of a grid."""
+    _check(stretch, stress_Pa, 2 * terms + 1)
+
+    def norm(exponents: tuple[float, ...]) -> float:
+        return _moduli(shape, stretch, stress_Pa, exponents)[1]
+
+    starts = sorted(combinations(_GRID, terms), key=norm)[:_STARTS]
+    tried = [starts[0]]
+    for start in starts:
         found = least_squares(
             lambda log: _residual(shape, stretch, stress_Pa, tuple(np.exp(log).tolist())),
             np.log(start),
-            bounds=(np.log(LEAST_EXPONENT), np.log(MAX_EXPONENT)),
+            bounds=(np.log(MIN_EXPONENT), np.log(MAX_EXPONENT)),
             x_scale=0.3,
             xtol=1e-12,
             ftol=1e-14,
         )
-        exponents = tuple(np.exp(found.x).tolist())
-        norm = _moduli(shape, stretch, stress_Pa, exponents)[1]
-        if norm < best_norm:
-            best_norm, best = norm, exponents
-    return _positive(_moduli(shape, stretch, stress_Pa, best)[0]), best
+        tried.append(tuple(np.exp(found.x).tolist()))
+    return _fitted(shape, stretch, stress_Pa, min(tried, key=norm))
 
 
 def _moduli(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> tuple[Array, float]:
@@ -106,23 +125,21 @@ def _moduli(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[flo
     return scaled * size_Pa / sizes, float(norm)
 
 
-def _residual(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> Array:
-    moduli, _ = _moduli(shape, stretch, stress_Pa, exponents)
-    model = sum(modulus * shape(stretch, exponent) for modulus, exponent in zip(moduli, exponents, strict=True))
-    difference: Array = (model - stress_Pa) / float(np.linalg.norm(stress_Pa))
-    return difference
+def _residual(shape: Shape, stretch: Array, measured_Pa: Array, exponents: tuple[float, ...]) -> Array:
+    moduli, _ = _moduli(shape, stretch, measured_Pa, exponents)
+    difference = stress_Pa(shape, stretch, tuple(moduli.tolist()), exponents) - measured_Pa
+    return difference / float(np.linalg.norm(measured_Pa))
 
 
-def _positive(moduli: Array) -> tuple[float, ...]:
+def _fitted(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> Fit:
+    """The law with these exponents."""
+    moduli, norm = _moduli(shape, stretch, stress_Pa, exponents)
     if not (moduli > 0.0).any():
         raise LabError("the stress does not rise with the stretch: no positive modulus fits")
-    return tuple(moduli.tolist())
-
-
-def _fit(law: Law, stretch: Array, stress_Pa: Array) -> Fit[Law]:
-    residual = stress_Pa - law.stress_Pa(stretch)
-    left, whole = float(np.sum(residual**2)), float(np.sum((stress_Pa - stress_Pa.mean()) ** 2))
-    return Fit(law, 1.0 - left / whole, float(np.sqrt(left / len(stress_Pa))))
+    kept = [pair for pair in zip(moduli.tolist(), exponents, strict=True) if pair[0] > 0.0]
+    kept_Pa, kept_exponents = zip(*kept, strict=True)
+    left = norm**2 * float(np.sum(stress_Pa**2))
+    return Fit(kept_Pa, kept_exponents, 1.0 - left / float(np.sum((stress_Pa - stress_Pa.mean()) ** 2)))
 
 
 def _check(stretch: Array, stress_Pa: Array, least: int) -> None:

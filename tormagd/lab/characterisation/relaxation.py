@@ -56,16 +56,15 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
     at equilibrium (the record is too short to show it).
     """
     _check(record, branches)
-    steps = np.diff(record.time_s)
     span = float(record.time_s[-1] - record.time_s[0])
-    low, high = math.log(float(steps.min()) / 3.0), math.log(3.0 * span)
-    best_norm, best = math.inf, np.empty(0)
+    low, high = math.log(float(np.diff(record.time_s).min()) / 3.0), math.log(3.0 * span)
+    fastest = max(low, math.log(span) - 2.5 * branches)
+    found = []
     for start in range(_STARTS):
         # spread over the record's decades, each start shifted by a share of the spacing
         places = (np.arange(branches) + (start + 1.0) / (_STARTS + 1.0)) / branches
-        fastest = max(low, math.log(span) - 2.5 * branches)
-        found = least_squares(
-            lambda log_times: _residual(record, np.exp(log_times)),
+        trial = least_squares(
+            lambda log_times: _fitted(record, np.exp(log_times))[1] / float(np.linalg.norm(record.force_N)),
             np.clip(fastest + places * (math.log(span) - fastest), low, high),
             bounds=(low, high),
             x_scale=0.5,
@@ -73,19 +72,16 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
             ftol=1e-12,
             max_nfev=60,
         )
-        norm = float(found.cost)
-        if norm < best_norm:
-            best_norm, best = norm, np.exp(found.x)
-    times_s = np.sort(best)
-    coefficients = _coefficients(record, times_s)
+        found.append(trial)
+    best = min(found, key=lambda trial: float(trial.cost))
+    times_s = np.sort(np.exp(best.x))
+    coefficients, left_N = _fitted(record, times_s)
     scale = float(coefficients.sum())
     if not coefficients[0] > 0.0:
         raise LabError("nothing is left at equilibrium: the record is too short to tell the slowest time from it")
     kept = coefficients[1:] / scale >= LEAST_FRACTION
-    series = PronySeries(
-        tuple((coefficients[1:][kept] / scale).tolist()), tuple(float(time_s) for time_s in times_s[kept])
-    )
-    left = float(np.sum((_columns(record, times_s) @ coefficients - record.force_N) ** 2))
+    series = PronySeries(tuple((coefficients[1:][kept] / scale).tolist()), tuple(times_s[kept].tolist()))
+    left = float(np.sum(left_N**2))
     whole = float(np.sum((record.force_N - record.force_N.mean()) ** 2))
     return RelaxationFit(series, scale, 1.0 - left / whole, math.sqrt(left / len(record.force_N)))
 
@@ -107,15 +103,11 @@ def _columns(record: RelaxationRecord, times_s: Array) -> Array:
     return columns
 
 
-def _coefficients(record: RelaxationRecord, times_s: Array) -> Array:
-    coefficients: Array = nnls(_columns(record, times_s), record.force_N)[0]
-    return coefficients
-
-
-def _residual(record: RelaxationRecord, times_s: Array) -> Array:
+def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
+    """The coefficients for these time constants, and what they leave, N."""
     columns = _columns(record, times_s)
-    difference: Array = columns @ nnls(columns, record.force_N)[0] - record.force_N
-    return difference / float(np.linalg.norm(record.force_N))
+    coefficients, _ = nnls(columns, record.force_N)
+    return coefficients, columns @ coefficients - record.force_N
 
 
 def _check(record: RelaxationRecord, branches: int) -> None:
