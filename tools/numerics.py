@@ -29,7 +29,8 @@ import json
 import multiprocessing
 import sys
 import time
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
+from itertools import count, repeat
 from typing import Any
 
 import mpmath as mp
@@ -64,24 +65,25 @@ STIFF = 0.7
 
 def evaluate(batch: Batch, x: FloatArray) -> tuple[Mask, dict[str, FloatArray]]:
     """(admissible, every quantity at the admissible x), in the precision of x."""
-    law, elastomer, geometry = batch.field, batch.elastomer, batch.geometry
+    moment_Tm = x if batch.field is None else batch.field.radial_moment_Tm(x)
+    admissible = moment_Tm <= max_radial_moment_Tm(batch.elastomer, batch.geometry)
+    return admissible, quantities(batch, x[admissible])
+
+
+def quantities(batch: Batch, x: Any) -> dict[str, Any]:
+    """Every quantity at an array of admissible x; or at a plain float, as the control loop computes it."""
+    law, device = batch.field, (batch.elastomer, batch.geometry)
     moment_Tm = x if law is None else law.radial_moment_Tm(x)
-    admissible = moment_Tm <= max_radial_moment_Tm(elastomer, geometry)
-    x, moment_Tm = x[admissible], moment_Tm[admissible]
-    values = {"moment": moment_Tm, "force": brake_force_N(moment_Tm, elastomer, geometry)}
-    values["stretch"] = stretch_minus_one(moment_Tm, elastomer, geometry)
+    values = {"moment": moment_Tm, "force": brake_force_N(moment_Tm, *device)}
+    values["stretch"] = stretch_minus_one(moment_Tm, *device)
     # at the edge of the domain the last digit of an array's force may lie above the largest force that has an inverse
-    most_N = brake_force_N(max_radial_moment_Tm(elastomer, geometry), elastomer, geometry)
-    back_Tm = radial_moment_for_force_Tm(np.minimum(values["force"], most_N), elastomer, geometry)
+    most_N = brake_force_N(max_radial_moment_Tm(*device), *device)
+    back_Tm = radial_moment_for_force_Tm(np.minimum(values["force"], most_N), *device)
     if law is None:
-        values["slope"] = d_force_d_moment(moment_Tm, elastomer, geometry)
-        values["round trip"] = back_Tm
-    else:
-        values["slope"] = d_force_d_gap(x, law, elastomer, geometry)
-        weakest_Tm = law.radial_moment_Tm(x.dtype.type(law.gap_range_mm[1]).reshape(1))
-        # the last digit of the weakest moment may come back below it, where Eq. 7 has no gap
-        values["round trip"] = law.gap_mm(np.maximum(back_Tm, weakest_Tm))
-    return admissible, values
+        return {**values, "slope": d_force_d_moment(moment_Tm, *device), "round trip": back_Tm}
+    # the last digit of the weakest moment may come back below it, where Eq. 7 has no gap
+    back_Tm = np.maximum(back_Tm, law.radial_moment_Tm(0.0 * x + law.gap_range_mm[1]))
+    return {**values, "slope": d_force_d_gap(x, law, *device), "round trip": law.gap_mm(back_Tm)}
 
 
 def check_chunk(seed: int, devices: int, references: int) -> Tally:
@@ -156,34 +158,18 @@ def _compare_with_reference(
             continue
         truth = reference(batch, x)
         tally.counts["reference_cases"] += 1
-        # so close to the bound the last digits of x decide
         if truth.admissible != bool(admissible[index]):
+            # so close to the bound the last digits of x decide
             tally.counts["misjudged"] += abs(truth.stretch - 0.05) > 1e-11
+        if not (truth.admissible and admissible[index]):
             continue
-        if not truth.admissible:
-            continue
-        plain = _plain(batch, x)
+        plain = quantities(batch, x)
         with mp.workdps(DIGITS):
             for quantity, value in truth.values.items():
                 array_value = float(values[quantity][place_among_admissible[index]])
                 error = max(float(abs(mp.mpf(computed) / value - 1)) for computed in (array_value, plain[quantity]))
                 well = np.array([8.0 * FLOAT64_EPS * truth.conditions[quantity]])
                 tally.note("float64", quantity, np.array([error]), FLOAT64_ALLOWED, well)
-
-
-def _plain(batch: Batch, x: float) -> dict[str, float]:
-    """The same quantities through plain floats, as the control loop computes them."""
-    law, device = batch.field, (batch.elastomer, batch.geometry)
-    moment_Tm = x if law is None else law.radial_moment_Tm(x)
-    values = {"force": brake_force_N(moment_Tm, *device), "stretch": stretch_minus_one(moment_Tm, *device)}
-    back_Tm = radial_moment_for_force_Tm(values["force"], *device)
-    if law is None:
-        return {**values, "slope": d_force_d_moment(moment_Tm, *device), "round trip": back_Tm}
-    return {
-        **values,
-        "slope": d_force_d_gap(x, law, *device),
-        "round trip": law.gap_mm(max(back_Tm, law.radial_moment_Tm(law.gap_range_mm[1]))),
-    }
 
 
 def stage_row(place: int, episodes: int, seed: int) -> Row:
@@ -195,10 +181,10 @@ def of_core(options: argparse.Namespace) -> dict[str, Any]:
     """What the core makes of such numbers; a part of the object that `--json` prints."""
     cases = drawn_ends(options.configurations, options.seed)
     with _pool(options.workers) as pool:
-        rows = [pool.submit(stage_row, place, options.episodes, options.seed) for place in range(len(stages()))]
-        runs = [pool.submit(became, case, options.seconds) for case in cases]
-        _wait([*rows, *runs], "core")
-    told, ends = [row.result() for row in rows], summed([run.result() for run in runs])
+        rows = pool.map(stage_row, range(len(stages())), repeat(options.episodes), repeat(options.seed))
+        runs = pool.map(became, cases, repeat(options.seconds))
+        told = list(tqdm(rows, total=len(stages()), desc="stages", disable=None))
+        ends = summed(list(tqdm(runs, total=len(cases), desc="configurations", disable=None)))
     travelled = sum(row.nonfinite + row.swallowed + row.unnamed for row in told) + ends["wrong"]
     return {
         "stage_cases": sum(row.cases for row in told),
@@ -214,11 +200,6 @@ def _pool(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 
-def _wait(tasks: list[Future[Any]], what: str) -> None:
-    for _ in tqdm(as_completed(tasks), total=len(tasks), desc=what, disable=None):
-        pass
-
-
 def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
     """The checks of the physics; a part of the object that `--json` prints."""
     started = time.perf_counter()
@@ -227,10 +208,9 @@ def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
     each = -(-references // devices)
     tally = Tally()
     with _pool(workers) as pool:
-        tasks = [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
-        _wait(tasks, "physics")
-    for task in tasks:
-        tally.add(task.result())
+        checked = pool.map(check_chunk, count(seed + 1), chunks, repeat(each))
+        for found in tqdm(checked, total=len(chunks), desc="physics", disable=None):
+            tally.add(found)
     worst = {name: [found for (kind, _), found in tally.worst.items() if kind == name] for name in PRECISIONS}
     return {name: tally.counts[name] for name in COUNTS} | {
         "worst_rel_error": {name: max((it.error for it in found), default=0.0) for name, found in worst.items()},
