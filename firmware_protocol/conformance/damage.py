@@ -12,8 +12,6 @@ from firmware_protocol.conformance.check import Check, check
 from firmware_protocol.conformance.host import ANSWER_S, PERIOD_S, SEEN_S, Beat, Host, Unmet
 
 DRIVE: Final = FUNCTION[Drive]
-RECOVERED = 3
-"Good Drives after the damage, of which the first is answered."
 SILENT = "no State, drive_counter unchanged; the good Drive after it is answered"
 
 

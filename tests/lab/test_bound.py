@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tormagd.lab.arrays import rms
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.ideal_carriage import (
     Asked,
@@ -23,7 +24,6 @@ from tormagd.lab.ideal_carriage import (
     drive_of,
     foresight_mm,
     no_delay_mm,
-    rms,
 )
 from tormagd.lab.main import main
 from tormagd.physics.relaxation import PronySeries

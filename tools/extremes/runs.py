@@ -16,7 +16,7 @@ from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
-from tormagd.safety.operating_state import Conditions, RefusedError
+from tormagd.safety.operating_state import RefusedError
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
@@ -27,7 +27,6 @@ SECTIONS = ("motor", "position", "trim", "limits", "rates", "device")
 OF_PLANT = (("encoder_counts_per_rev", 16, 1_000_000), ("supply_V", 3.0, 25.0))
 MAX_TOLD = 8
 SENT_HZ = 137.3
-READY = Conditions(True, True, True, False, False, None, 0.5)
 
 
 class End(NamedTuple):

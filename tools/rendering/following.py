@@ -16,7 +16,7 @@ from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.believe.slow_friction import believable
 from tormagd.control.believe.strength import device_bounds
 from tormagd.control.records import TimedSetpoint
-from tormagd.lab.arrays import Array
+from tormagd.lab.arrays import Array, rms
 from tormagd.lab.ideal_actuator import ideal_stepper
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.device import VirtualDevice
@@ -56,7 +56,7 @@ def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
     error = rendered_N - reference_N
     deviation = reference_N - reference_N.mean()
     return Tracking(
-        rms_N=float(np.sqrt(np.mean(error**2))),
+        rms_N=rms(error),
         variance_accounted_for=float(1.0 - np.sum(error**2) / np.sum(deviation**2)),
         worst_N=float(np.abs(error).max()),
         mean_N=float(error.mean()),

@@ -5,16 +5,14 @@ Runs are spread over any `concurrent.futures.Executor`.
 """
 
 import math
-import sys
 import time
 from collections.abc import Collection, Iterable, Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from tqdm import tqdm
 
 from rendering.following import FILE_PREVIEW_S, publisher, taught
 from rendering.hands import swinging
@@ -25,7 +23,8 @@ from tormagd.config import Config, Rates
 from tormagd.control.records import Measured, Plan, TimedSetpoint
 from tormagd.exact import plain, restore
 from tormagd.hardware.measurement import Measurement
-from tormagd.lab.arrays import Array
+from tormagd.lab.arrays import Array, rms
+from tormagd.lab.executors import finished
 from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, scene_path
 from tormagd.scenes.signal import asked
@@ -43,11 +42,8 @@ OPEN_MM = 0.1
 TIMED_S, ROUNDS = 1.0, 7
 
 
-class Begun(NamedTuple):
-    """A core, as plain data."""
-
-    stepper: Any
-    planner: Any
+Begun = tuple[Any, Any]
+"A core's stepper and planner, as plain data."
 
 
 class Tick(NamedTuple):
@@ -82,13 +78,13 @@ def run(case: Case) -> float:
     for time_s, loop in played.ticks(case.seconds):
         truth = loop.device.truth
         if loop.stepper.safety.faults:
-            return float(np.sqrt(np.mean(played.force_N**2)))
+            return rms(played.force_N)
         if time_s >= LEARN_S:
             rows.append((truth.time_s - played.begins_s, truth.force_N, truth.gap_mm))
     at_s, rendered_N, gap_mm = np.array(rows).T
     error_N = rendered_N - np.interp(at_s, played.time_s, played.force_N)
     is_least = (gap_mm >= played.core.scene.insert.gap_open_mm - OPEN_MM) & (error_N > 0.0)
-    return float(np.sqrt(np.mean(np.where(is_least, 0.0, error_N) ** 2)))
+    return rms(np.where(is_least, 0.0, error_N))
 
 
 def costs(cases: Sequence[Case]) -> list[Cost]:
@@ -114,11 +110,12 @@ def costs(cases: Sequence[Case]) -> list[Cost]:
 def _spent_us(core: Core, begun: Begun, ticks: list[Tick]) -> tuple[Array, ...]:
     """The time of every step and of every plan of a core that begins there and is given this."""
     stepper, planner = core.stepper(), core.planner()
-    restore(stepper, begun.stepper, KNOWN)
+    stepper_begun, planner_begun = begun
+    restore(stepper, stepper_begun, KNOWN)
     own = planner.believe.memory
     planner.plan(ticks[0].now_s, None, ticks[0].measured)
     branches = len(own.free), len(own.added)
-    restore(planner, begun.planner, KNOWN)
+    restore(planner, planner_begun, KNOWN)
     # with no more of the elastomer's branches than a model of its own remembers
     own.free, own.added = own.free[: branches[0]], own.added[: branches[1]]
     steps_us, plans_us = [], []
@@ -194,7 +191,7 @@ class Play:
                 setpoint, is_planned = self.publish(before_s), planner.planned is not plan
                 ticks.append(Tick(loop.now_s, loop.measurement, plan, setpoint, loop.stepper.measured, is_planned))
             elif time_s >= LEARN_S:
-                begun = Begun(plain(loop.stepper), plain(planner))
+                begun = plain(loop.stepper), plain(planner)
             before_s, plan = loop.now_s, planner.planned
         assert begun is not None, "the signal lasts longer than LEARN_S"
         return begun, ticks
@@ -221,13 +218,8 @@ def plant_of(scene: Scene, sample: str) -> PlantParameters:
 
 def run_all(cases: Collection[Case], executor: Executor, known: dict[Case, float]) -> dict[Case, float]:
     """The outcome of every case, in their order. Those that are `known` are not run again; new ones are added there."""
-    pending = {executor.submit(run, case): case for case in dict.fromkeys(cases) if case not in known}
-    try:
-        for future in tqdm(as_completed(pending), total=len(pending), unit="run", disable=not sys.stderr.isatty()):
-            known[pending[future]] = future.result()
-    finally:
-        for future in pending:
-            future.cancel()
+    for case, future in finished(executor, run, [case for case in dict.fromkeys(cases) if case not in known], "run"):
+        known[case] = future.result()
     return {case: known[case] for case in cases}
 
 

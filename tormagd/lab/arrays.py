@@ -1,4 +1,4 @@
-"""What figures stand in: arrays of numbers, which rows of one are meant, and plain data."""
+"""What figures stand in: arrays of numbers, which rows of one are meant, plain data, and the RMS."""
 
 from typing import Any
 
@@ -8,3 +8,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Json = dict[str, Any]
+
+
+def rms(values: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))

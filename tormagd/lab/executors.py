@@ -1,10 +1,16 @@
-"""Where a tool's runs are done: in processes of this machine, or on a Dask cluster."""
+"""Where a tool's runs are done, in processes of this machine or on a Dask cluster; and how they are waited for."""
 
 import argparse
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import get_context
+from typing import TypeVar
+
+from tqdm import tqdm
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
 
 
 def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> None:
@@ -28,3 +34,16 @@ def chosen(options: argparse.Namespace) -> Iterator[Executor]:
 
     with Client(options.dask) as client, client.get_executor() as cluster:
         yield cluster
+
+
+def finished(
+    executor: Executor, function: Callable[[ItemT], ResultT], items: Iterable[ItemT], unit: str
+) -> Iterator[tuple[ItemT, "Future[ResultT]"]]:
+    """Each item as its run is done, beside a bar. Whoever takes no more of them gives up what has not begun."""
+    pending = {executor.submit(function, item): item for item in items}
+    try:
+        for future in tqdm(as_completed(pending), total=len(pending), unit=unit, disable=None):
+            yield pending[future], future
+    finally:
+        for future in pending:
+            future.cancel()

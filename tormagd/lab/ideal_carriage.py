@@ -28,7 +28,7 @@ import numpy as np
 from scipy import sparse
 
 from tormagd.force_file import read_forces
-from tormagd.lab.arrays import Array, Json
+from tormagd.lab.arrays import Array, Json, rms
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.physics.errors import DomainError
@@ -431,11 +431,6 @@ def run(options: argparse.Namespace) -> Found:
         return Found(bound(plant, time_s, force_N, is_held=options.held).figures())
     except RuntimeError as error:
         raise LabError(str(error)) from error
-
-
-def rms(error_N: Array) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(error_N**2)))
 
 
 def _reached(

@@ -1,11 +1,11 @@
 """Where recordings are, in a folder or a bucket, and what each of them says: read by workers, wherever those are."""
 
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 
 import fsspec
-from tqdm import tqdm
 
 from tormagd.lab.consoles.summary import FIELDS, Summary, summarise
+from tormagd.lab.executors import finished
 from tormagd.recording.reader import read_open_recording
 
 SUFFIX = ".mcap"
@@ -41,11 +41,10 @@ def read(url: str) -> Summary | str:
 def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summary], dict[str, str]]:
     """Every file's summary, in their order, and why a file has none."""
     found: dict[str, Summary | str] = {}
-    pending = {executor.submit(read, url): name for name, url in urls.items()}
-    for future in tqdm(as_completed(pending), total=len(urls), unit="recording", disable=None):
+    for url, future in finished(executor, read, urls.values(), "recording"):
         error = future.exception()
-        found[pending[future]] = future.result() if error is None else f"the worker that read it failed: {error}"
-    ordered = [(name, found[name]) for name in urls]
+        found[url] = future.result() if error is None else f"the worker that read it failed: {error}"
+    ordered = [(name, found[url]) for name, url in urls.items()]
     return (
         {name: each for name, each in ordered if isinstance(each, Summary)},
         {name: each for name, each in ordered if isinstance(each, str)},

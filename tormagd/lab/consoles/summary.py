@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from tormagd.lab.arrays import rms
 from tormagd.recording.reader import Recording
 from tormagd.recording.series import Floats, bands, end_ns, is_enabled, series, start_ns, tracking_rms_N
 
@@ -61,7 +62,7 @@ def summarise(recording: Recording) -> Summary:
     scene = recording.described("scene", dict[str, Any]) or {}
     insert = scene.get("insert", {})
     states = {band.name: band.spans_s for band in bands(recording, "operating_state")}
-    currents_A = [_enabled(recording, name, _rms) for name in ("left_current_A", "right_current_A")]
+    currents_A = [_enabled(recording, name, rms) for name in ("left_current_A", "right_current_A")]
     drift = _enabled(recording, "device_clock_drift", np.median)
     return Summary(
         serial_number=recording.described("serial_number", int),
@@ -90,7 +91,3 @@ def _enabled(recording: Recording, name: str, figure: Callable[[Floats], Any]) -
         return None
     values = known.values[np.isfinite(known.values) & is_enabled(recording, known.t_s)]
     return float(figure(values)) if values.size else None
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

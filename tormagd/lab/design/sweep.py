@@ -6,15 +6,15 @@ another region, bound or seed it is another run, and never takes an old outcome.
 """
 
 from collections.abc import Iterable
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Literal
 
 import msgspec
-from tqdm import tqdm
 
 from tormagd.bounded_file import read_bounded
 from tormagd.lab.design.optimisation import Outcome, Run, solve
+from tormagd.lab.executors import finished
 from tormagd.physics.errors import DomainError
 
 MAX_STATE_BYTES = 64_000_000
@@ -39,16 +39,10 @@ def sweep(
     wanted = list(dict.fromkeys(runs))
     known = {} if state is None else read_state(state)
     outcomes = {run: known[run] for run in wanted if run in known}
-    pending = {executor.submit(solve, run): run for run in wanted if run not in outcomes}
-    try:
-        for future in tqdm(as_completed(pending), total=len(pending), desc="optimisation", unit="run", disable=None):
-            outcome = future.result()
-            outcomes[pending[future]] = known[pending[future]] = outcome
-            if state is not None:
-                _write_state(state, known)
-    finally:
-        for future in pending:
-            future.cancel()
+    for run, future in finished(executor, solve, [run for run in wanted if run not in known], "run"):
+        outcomes[run] = known[run] = future.result()
+        if state is not None:
+            _write_state(state, known)
     return {run: outcomes[run] for run in wanted}
 
 

@@ -89,16 +89,12 @@ class Fit(NamedTuple):
         """Of the values' 95% intervals."""
         return np.asarray(self.deviations * np.sqrt(np.diag(self.covariance)))
 
-    def half_width_of(self, function: Callable[[Array], float]) -> float:
-        """Of the 95% interval of a function of the values, by its slopes."""
-        steps = 1e-3 * np.sqrt(np.diag(self.covariance))
-        slopes = np.array(
-            [
-                (function(self.values + shift) - function(self.values - shift)) / (2.0 * step) if step > 0.0 else 0.0
-                for step, shift in zip(steps, np.diag(steps), strict=True)
-            ]
-        )
-        return self.deviations * float(np.sqrt(slopes @ self.covariance @ slopes))
+    def half_widths_of(self, function: Callable[[Array], Array]) -> Array:
+        """Of the 95% intervals of functions of the values, by their slopes."""
+        steps = np.maximum(1e-3 * np.sqrt(np.diag(self.covariance)), np.finfo(np.float64).tiny)
+        rises = [function(self.values + shift) - function(self.values - shift) for shift in np.diag(steps)]
+        slopes = np.array(rises) / (2.0 * steps[:, None])
+        return np.asarray(self.deviations * np.sqrt(np.diag(slopes.T @ self.covariance @ slopes)))
 
 
 def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
@@ -143,7 +139,8 @@ def linear(rows: Array, target: Array, blocks: Array) -> Fit:
     values, *_ = np.linalg.lstsq(scaled, target, rcond=None)
     residual = target - scaled @ values
     covariance = _sandwich(scaled, residual, blocks) / np.outer(scale, scale)
-    return Fit(values / scale, covariance, _factor(blocks, len(values)), _share(residual, target))
+    deviations = float(student.ppf(0.975, max(len(np.unique(blocks)) - len(values), 1)))
+    return Fit(values / scale, covariance, deviations, float(np.linalg.norm(residual) / np.linalg.norm(target)))
 
 
 def _sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
@@ -153,14 +150,6 @@ def _sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
     bread = np.linalg.inv(jacobian.T @ jacobian)
     count = len(labels) / max(len(labels) - jacobian.shape[1], 1)
     return np.asarray(bread @ (scores.T @ scores) @ bread * count)
-
-
-def _factor(blocks: Array, parameters: int) -> float:
-    return float(student.ppf(0.975, max(len(np.unique(blocks)) - parameters, 1)))
-
-
-def _share(residual: Array, target: Array) -> float:
-    return float(np.linalg.norm(residual) / np.linalg.norm(target))
 
 
 class Volts(NamedTuple):
@@ -329,9 +318,7 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
             return np.array([(opening - closing).mean() / 2.0, (opening + closing).mean() / 2.0])
 
         values = np.array([fitted.values[0], fitted.values[1], 1.0 - fitted.values[2], *means(fitted.values)])
-        coulomb = fitted.half_width_of(lambda values: float(means(values)[0]))
-        offset = fitted.half_width_of(lambda values: float(means(values)[1]))
-        return values, np.array([*fitted.half_widths[:3], coulomb, offset])
+        return values, np.array([*fitted.half_widths[:3], *fitted.half_widths_of(means)])
 
     return Gearbox(*_estimates(fit_in))
 

@@ -56,23 +56,18 @@ def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
 
 def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
     """The contract's four parameters: the back-EMF brakes the carriage as drag of K^2 / R does."""
-    k, resistance = windings.back_emf, windings.resistance
-    braking = k.value**2 / resistance.value
-    width = braking * math.hypot(2.0 * k.ci95 / k.value, resistance.ci95 / resistance.value)
-    viscous = Estimate(braking + gearbox.viscous.value, width + gearbox.viscous.ci95)
+    braking = _product((windings.back_emf, 2), (windings.resistance, -1))
+    viscous = Estimate(braking.value + gearbox.viscous.value, braking.ci95 + gearbox.viscous.ci95)
     return gearbox.mass, viscous, gearbox.coulomb, gearbox.offset
 
 
 def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
     """What a current shows besides: the motor as the carriage feels it, gain in N/V."""
-    k, resistance = windings.back_emf, windings.resistance
-    gain = k.value / resistance.value
-    width = gain * math.hypot(k.ci95 / k.value, resistance.ci95 / resistance.value)
     return {
-        "gain_N_V": Estimate(gain, width),
-        "resistance_ohm": resistance,
+        "gain_N_V": _product((windings.back_emf, 1), (windings.resistance, -1)),
+        "resistance_ohm": windings.resistance,
         "inductance_mH": windings.inductance.scaled(1e3),
-        "back_emf_V_s_m": k,
+        "back_emf_V_s_m": windings.back_emf,
         "friction_viscous_N_s_m": gearbox.viscous,
         "gear_efficiency": gearbox.efficiency,
         "mass_kg": gearbox.mass,
@@ -83,9 +78,12 @@ def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate
 def _time_constant(volts: Volts, motor: dict[str, Estimate] | None) -> Estimate:
     """Of the speed after a voltage step: mass R / K^2, or mass over drag where only ratios are known."""
     if motor is None:
-        factors = [(volts.mass, 1.0), (volts.viscous, -1.0)]
-    else:
-        factors = [(motor["mass_kg"], 1.0), (motor["resistance_ohm"], 1.0), (motor["back_emf_V_s_m"], -2.0)]
+        return _product((volts.mass, 1), (volts.viscous, -1))
+    return _product((motor["mass_kg"], 1), (motor["resistance_ohm"], 1), (motor["back_emf_V_s_m"], -2))
+
+
+def _product(*factors: tuple[Estimate, int]) -> Estimate:
+    """Of powers of estimates, whose errors have nothing to do with each other."""
     value = math.prod(estimate.value**power for estimate, power in factors)
     width = math.hypot(*(power * estimate.ci95 / estimate.value for estimate, power in factors))
     return Estimate(value, abs(value) * width)

@@ -184,7 +184,15 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
     found = fit_metrics(model, judging)
     noise_mae_N = MEAN_OVER_SIGMA * noise_sd_N(data)
     most_mae_N = max(MOST_MAE_OVER_NOISE * noise_mae_N, MOST_MAE_SHARE * float(np.percentile(data.force_N, 99.0)))
-    require_good(found.get("r2", -math.inf), found["mae_N"], noise_mae_N, most_mae_N)
+    r2, mae_N = found.get("r2", -math.inf), found["mae_N"]
+    if not (r2 >= LEAST_R2 and mae_N <= most_mae_N):
+        raise CalibrationError(
+            "poor_fit",
+            f"on sweeps kept from the fit R2 is {r2:.4f} (needed: {LEAST_R2:g}) and the mean error "
+            f"{mae_N * 1e3:.1f} mN (allowed: {most_mae_N * 1e3:.1f} mN; the sensor's noise alone makes "
+            f"{noise_mae_N * 1e3:.1f} mN)",
+            "nothing was saved; turn the handle more steadily, look for a loose sensor or insert, and sweep again",
+        )
     require_rising(model)
     metrics = model.metadata.metrics | {f"judged_{name}": value for name, value in found.items()}
     metrics |= {
@@ -194,19 +202,6 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
         "sweeps": float(len(numbers)),
     }
     return replace(model, metadata=msgspec.structs.replace(model.metadata, metrics=metrics))
-
-
-def require_good(r2: float, mae_N: float, noise_mae_N: float, most_mae_N: float) -> None:
-    """Raise CalibrationError (poor_fit) for an error on the sweeps kept from the fit that is over the bar; the figures
-    stand beside the force sensor's own noise."""
-    if r2 >= LEAST_R2 and mae_N <= most_mae_N:
-        return
-    raise CalibrationError(
-        "poor_fit",
-        f"on sweeps kept from the fit R2 is {r2:.4f} (needed: {LEAST_R2:g}) and the mean error {mae_N * 1e3:.1f} mN "
-        f"(allowed: {most_mae_N * 1e3:.1f} mN; the sensor's noise alone makes {noise_mae_N * 1e3:.1f} mN)",
-        "nothing was saved; turn the handle more steadily, look for a loose sensor or insert, and sweep again",
-    )
 
 
 def require_rising(model: ForceModel, points: int = 64) -> None:

@@ -49,13 +49,9 @@ class Dataset:
 
     def columns(self) -> dict[str, Array | NDArray[np.int64]]:
         """Return each column by its name, as in the file; the optional ones only where they exist."""
-        columns: dict[str, Array | NDArray[np.int64]] = dict(zip(FEATURES, self.features.T, strict=True))
-        columns["force_N"] = self.force_N
-        if self.cycle is not None:
-            columns["cycle"] = self.cycle
-        if self.time_s is not None:
-            columns["time_s"] = self.time_s
-        return columns
+        columns = (*self.features.T, self.force_N, self.cycle, self.time_s)
+        named = zip((*COLUMNS, *OPTIONAL_COLUMNS), columns, strict=True)
+        return {name: column for name, column in named if column is not None}
 
     def __len__(self) -> int:
         return len(self.force_N)
