@@ -213,34 +213,24 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
     asked = list(cases(draws))
     holds = [(name, force_N, lasts_s) for name in judging(min(draws, HELD_DRAWS)) for force_N in LOW_N]
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
-        waiting, low = [pool.submit(run, case) for case in asked], [pool.submit(low_hold, *hold) for hold in holds]
-        for future in tqdm([*waiting, *low], desc="runs", unit="run", disable=not sys.stderr.isatty()):
-            future.exception()
-    every = [(case, future.result()) for case, future in zip(asked, waiting, strict=True)]
+        low = pool.map(low_hold, *zip(*holds, strict=True))
+        runs = tqdm(pool.map(run, asked), desc="runs", total=len(asked), unit="run", disable=None)
+        every = list(zip(asked, runs, strict=True))
+        faults = [(*hold, wrong) for hold, wrong in zip(holds, low, strict=True)]
     second = [(case, figures) for case, figures in every if case.device == SECOND]
     found = [(case, figures) for case, figures in every if case.device != SECOND]
-    faults = [(*hold, future.result()) for hold, future in zip(holds, low, strict=True)]
     stepped = [figures.steps_N for case, figures in found if figures.steps_N and case.device.startswith("draw")]
     first, again, overshoot = (np.array(part) for part in zip(*stepped, strict=True))
     result: Json = {
-        "over_N": max(figures.over_N for _, figures in found),
+        **worst(found),
         "over_sample_1_N": max(figures.over_N for case, figures in found if case.device == "sample_1"),
-        "under_N": max(figures.under_N for _, figures in found),
-        "peak_N": max(figures.peak_N for _, figures in found),
-        "settled_N": max(abs(error) for _, _, error in settled(found)),
         "low_hold_faults": sum(bool(wrong) for *_, wrong in faults),
         "step_error_at_1s_N": {"median": float(np.median(np.abs(first))), "worst": float(np.abs(first).max())},
         "step_again_N": float(np.abs(again).max()),
         "overshoot_N": float(overshoot.max()),
         "slow_error_N": max(abs(error) for case, figures in found if case.hand == "1 mm/s" for error in figures.slow_N),
         "cases": len(every) + len(holds),
-        "faults": faulted(found),
-        "second": {
-            "over_N": max(figures.over_N for _, figures in second),
-            "under_N": max(figures.under_N for _, figures in second),
-            "settled_N": max(abs(error) for _, _, error in settled(second)),
-            "faults": faulted(second),
-        },
+        "second": {name: figure for name, figure in worst(second).items() if name != "peak_N"},
         "low_holds": [f"{name} at {force} N: {', '.join(wrong)}" for name, force, _, wrong in faults if wrong],
         "draws": draws,
         "low_hold_s": lasts_s,
@@ -249,9 +239,17 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
     return result, found
 
 
-def faulted(found: list[tuple[Case, Figures]]) -> list[str]:
-    """The runs that a fault ended."""
-    return [f"{case.device}, {case.hand}, {case.forces}: {', '.join(f.faults)}" for case, f in found if f.faults]
+def worst(found: list[tuple[Case, Figures]]) -> Json:
+    """The greatest figures of these runs, and which of them a fault ended."""
+    return {
+        "over_N": max(figures.over_N for _, figures in found),
+        "under_N": max(figures.under_N for _, figures in found),
+        "peak_N": max(figures.peak_N for _, figures in found),
+        "settled_N": max(abs(error) for _, _, error in settled(found)),
+        "faults": [
+            f"{case.device}, {case.hand}, {case.forces}: {', '.join(f.faults)}" for case, f in found if f.faults
+        ],
+    }
 
 
 def settled(found: list[tuple[Case, Figures]]) -> list[tuple[float, float, float]]:
@@ -313,8 +311,8 @@ def main() -> int:
     if options.models:
         return judge_models(options)
     result, found = measure(options)
-    worst = sorted(result["rows"], key=lambda shown: -shown["over_N"])[:6]
-    print(json.dumps(result) if options.json else "\n".join(lines(result | {"rows": worst})))
+    shown = sorted(result["rows"], key=lambda row: -row["over_N"])[:6]
+    print(json.dumps(result) if options.json else "\n".join(lines(result | {"rows": shown})))
     if options.picture is not None:
         picture(options.picture, result, found)
     wrong = missed(result)

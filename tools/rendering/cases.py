@@ -9,7 +9,6 @@ import itertools
 import math
 from concurrent.futures import Executor
 
-import msgspec
 import numpy as np
 
 from rendering.device_draws import SAMPLES, device, judging
@@ -38,13 +37,13 @@ from rendering.signals import (
     recorded_signals,
     with_approach,
 )
+from tormagd.assembly.build import build_core
 from tormagd.assembly.profile import profile_of
 from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Json
 from tormagd.lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
-from tormagd.safety.codes import Limit
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
@@ -62,7 +61,6 @@ CREEP_MM_S, CREPT_MM = 1.0, 10.0
 CREEP_N = (1.0, 2.0, 0.8)
 SPEEDS_MM_S, SPEED_S, SLID_S = (1.0, 42.0, 100.0, 300.0), 4.0, 1.0
 SPEEDS_N = (1.0, 2.0)
-DRIFT_MN_MIN, DRIFT_S, DRIFT_N, TURN_S = 5.0, 3600.0, 1.0, 10.0
 START_N, RAMP_S, HOLD_S = 0.6, 1.0, 1.0
 "Of the approach to a signal."
 PULSE_S, DRAWN_PULSE_S = 20.0, 15.0
@@ -180,37 +178,6 @@ def with_rail(found: Followed, worst_N: object) -> Json:
     return {"worst_N": worst_N, "railed": float(found.is_railed.mean()), "faults": found.faults}
 
 
-def drift(name: str) -> Json:
-    """A force sensor that drifts, with a handle that turns back every TURN_S, and one that never does: the worst error
-    of a second's mean, and how far the force went from when OFFSET_UNKNOWN was first shown."""
-    plant = device(name)
-    sensor = msgspec.structs.replace(plant.force_sensor, drift_mN_min=DRIFT_MN_MIN)
-    plant = msgspec.structs.replace(plant, force_sensor=sensor)
-    turns = [(TURN_S, TURNED_MM_S), (TURN_S, -TURNED_MM_S)] * round(DRIFT_S / TURN_S / 2.0)
-    result: Json = {}
-    for key, legs in (("turning", turns), ("one_way", [(DRIFT_S, TURNED_MM_S)])):
-        loop = armed_at_rest(plant, legs)
-        begins_s, unknown_s = loop.now_s, None
-        means_N, second = [], list[float]()
-        for sample in loop.run(DRIFT_S, lambda now_s: TimedSetpoint(DRIFT_N, now_s, VALID_S)):
-            if unknown_s is None and Limit.OFFSET_UNKNOWN in sample.plan.limits:
-                unknown_s = sample.time_s - begins_s
-            second.append(abs(sample.truth.force_N) - DRIFT_N)
-            if len(second) == 1_000:
-                means_N.append(sum(second, 0.0) / len(second))
-                second.clear()
-        errors_N, at = np.array(means_N), np.arange(len(means_N))
-        # the second in which the handle turned says nothing, and the first ones arrive
-        settled = (at >= 3) & (at % round(TURN_S) != 0) & (at % round(TURN_S) != round(TURN_S) - 1)
-        known_N = errors_N[: round(unknown_s)] if unknown_s is not None else errors_N
-        result[key] = {
-            "worst_N": float(np.abs(errors_N[settled]).max()),
-            "unknown_after_s": unknown_s,
-            "drifted_on_N": float(np.abs(errors_N[len(known_N) :] - known_N[-1]).max(initial=0.0)),
-        }
-    return result
-
-
 # -- how well signals are followed ----------------------------------------------------------------------------------
 
 
@@ -224,7 +191,7 @@ def track(
 ) -> Followed:
     """Plays a signal behind an approach; time counts from its first force. Carriages that lose no time move the gap
     where `is_ideal`. Raises RuntimeError for a fault."""
-    loop = armed(Config(scene=scene), plant, SteadyHand(), is_ideal=is_ideal)
+    loop = armed(build_core(Config(scene=scene)), plant, SteadyHand(), is_ideal=is_ideal)
     flat = np.array([0.0, 1.0 / RATE_HZ]), np.full(2, signal.force_N[0])
     approach_s, approach_N = with_approach(*flat, START_N, RAMP_S, HOLD_S)
     lead_s, start_s = float(approach_s[-1]), loop.now_s

@@ -9,7 +9,7 @@ import numpy as np
 
 from rendering.device_draws import device as device_of
 from rendering.hands import Legs, WaitingHand
-from tormagd.assembly.build import build_core
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
@@ -18,7 +18,7 @@ from tormagd.control.believe.strength import device_bounds
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.ideal_actuator import ideal_stepper
-from tormagd.scenes.scene import Scene, load_scene
+from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import Hand, parse_hand
 from tormagd.simulation.parameters import PlantParameters
@@ -106,20 +106,13 @@ class Followed(NamedTuple):
 
 
 def armed(
-    config: Config,
-    plant: PlantParameters,
-    hand: Hand,
-    scene: Scene | None = None,
-    shown: Learned = NOTHING_LEARNED,
-    *,
-    is_ideal: bool = False,
+    core: Core, plant: PlantParameters, hand: Hand, shown: Learned = NOTHING_LEARNED, *, is_ideal: bool = False
 ) -> ClosedLoop:
-    """A device that was homed and enabled, and counts as having `shown` so much of itself. A given `scene` takes the
-    place of the configured one; `is_ideal`: carriages that lose no time move its gap. Raises RuntimeError where the
-    device does not get that far."""
-    core, device = build_core(config, scene), VirtualDevice(plant, hand, seed=1)
+    """A device that was homed and enabled, and counts as having `shown` so much of itself. `is_ideal`: carriages that
+    lose no time move its gap. Raises RuntimeError where the device does not get that far."""
+    device = VirtualDevice(plant, hand, seed=1)
     stepper = ideal_stepper(core, device.messages.plant) if is_ideal else core.stepper()
-    loop = ClosedLoop(config, stepper, core.planner(), device)
+    loop = ClosedLoop(core.config, stepper, core.planner(), device)
     taught(loop).teach(shown)
     loop.arm()
     return loop
@@ -128,7 +121,7 @@ def armed(
 def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Learned = NOTHING_LEARNED) -> ClosedLoop:
     """The same in CORNER_SCENE with a hand that stood meanwhile, and goes along its legs from now on."""
     hand = WaitingHand()
-    loop = armed(Config(scene=CORNER_SCENE), plant, hand, shown=shown)
+    loop = armed(build_core(Config(scene=CORNER_SCENE)), plant, hand, shown)
     hand.begin(legs, loop.now_s)
     return loop
 
@@ -222,7 +215,7 @@ def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Fol
         config = msgspec.structs.replace(config, position=slow)
     # what is played is not the scene's own signal, which the daemon refuses where the gap is too slow for it
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
-    loop = armed(config, device_of(case.plant), parse_hand(case.hand), scene)
+    loop = armed(build_core(config, scene), device_of(case.plant), parse_hand(case.hand))
     start_s = loop.now_s + LEAD_IN_S
     publish = publisher(times_s + start_s, forces_N, 0.0)
     found = follow(loop, publish, LEAD_IN_S + float(times_s[-1]), start_s)

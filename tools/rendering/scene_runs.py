@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from rendering.following import FILE_PREVIEW_S, publisher, taught
+from rendering.following import FILE_PREVIEW_S, armed, publisher, taught
 from rendering.hands import swinging
 from tormagd.assembly.build import Core, build_core
 from tormagd.assembly.journal import KNOWN
@@ -28,7 +28,6 @@ from tormagd.lab.executors import finished
 from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, scene_path
 from tormagd.scenes.signal import asked
-from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
 from tormagd.toml_file import convert
@@ -150,9 +149,7 @@ class Play:
         self._learns = case.is_learning
         finger = scene.finger
         hand = swinging(scene.handle) if finger is msgspec.UNSET else PressingHand(finger.depth_mm)
-        device = VirtualDevice(plant_of(scene, case.plant), hand, seed=1)
-        self._loop = ClosedLoop(config, self.core.stepper(), self.core.planner(), device)
-        self._loop.arm()
+        self._loop = armed(self.core, plant_of(scene, case.plant), hand)
         self.time_s, self.force_N = signal_of(self.core, case.scene, LEARN_S + case.seconds, case.inference_hz)
         approach_s = APPROACH_S
         if finger is not msgspec.UNSET:
