@@ -6,8 +6,11 @@ import numpy as np
 
 from tormagd.lab.design.force_law import d_force_d_gap, radial_moment_for_force_Tm
 from tormagd.physics.errors import DomainError, Real, require
-from tormagd.physics.field import FieldLaw
-from tormagd.physics.force import Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
+from tormagd.physics.field import FieldLaw, PowerFieldLaw
+from tormagd.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
+
+CLOSED_MM, OPEN_MM = 45.0, 95.0
+"The gaps of the thesis's device."
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +34,16 @@ class Brake:
             raise DomainError("open_mm", self.open_mm, f"above closed_mm, {self.closed_mm:g}")
         strongest_Tm = max_radial_moment_Tm(self.elastomer, self.geometry)
         require("radial_moment_Tm", self.field.radial_moment_Tm(self.closed_mm), 0.0, strongest_Tm)
+
+    @classmethod
+    def as_built(cls, elastomer: Elastomer, field: FieldLaw | None = None) -> "Brake":
+        """The thesis's device with this elastomer, by the power law of the field or another."""
+        return cls(field or PowerFieldLaw(), elastomer, TORMAG, CLOSED_MM, OPEN_MM)
+
+    @property
+    def range_N(self) -> float:
+        """The most less the least force."""
+        return self.most_N - self.least_N
 
     @property
     def least_N(self) -> float:

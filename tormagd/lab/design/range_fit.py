@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tormagd.lab.design.brake import CLOSED_MM, OPEN_MM
 from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.inserts import Insert, relative_permeability
 
-CLOSED_MM, OPEN_MM = 45.0, 95.0
 MIN_EXPONENT, MAX_EXPONENT = 0.0, 3.0
 _GRID = 61
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from tormagd.lab.characterisation import constitutive
-from tormagd.lab.design.brake import Brake
+from tormagd.lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormagd.lab.design.force_law import stretch_minus_one
 from tormagd.lab.design.optimisation import Design
 from tormagd.lab.thesis.values import (
@@ -15,11 +15,10 @@ from tormagd.lab.thesis.values import (
     TABLE_2_4_MEAN_PERCENT,
     USE_CASES,
 )
-from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.physics.field import PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer
 from tormagd.physics.inserts import INSERTS
 
-CLOSED_MM, OPEN_MM = 45.0, 95.0
 SAMPLE = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
 APPENDIX_MU_R = 3.8
 
@@ -63,7 +62,7 @@ def _chapter_2() -> list[Row]:
     eq7, power = ThesisFieldLaw(), PowerFieldLaw()
     closed_Tm, open_Tm = eq7.radial_moment_Tm(CLOSED_MM), eq7.radial_moment_Tm(OPEN_MM)
     stretched = (1.206 * (200.0 - CLOSED_MM) ** 1.867 + 1256.0) * 1e-6
-    soft_N, stiff_N = (_range_N(Elastomer(g0_Pa, 4.0, 0.2)) for g0_Pa in (80e3, 280e3))
+    soft_N, stiff_N = (Brake.as_built(Elastomer(g0_Pa, 4.0, 0.2), eq7).range_N for g0_Pa in (80e3, 280e3))
     gaps = np.linspace(CLOSED_MM, OPEN_MM, 101)
     apart = np.max(np.abs(power.radial_moment_Tm(gaps) / eq7.radial_moment_Tm(gaps) - 1.0))
     soft, strong = INSERTS["MRE-10-10"], INSERTS["MRE-10-40"]
@@ -96,7 +95,7 @@ def _chapter_2() -> list[Row]:
         (
             "Eq. 28 and Eq. 33",
             "the magnetic term with opposite signs, times mu0 mu_r and divided by it",
-            f"At 45 mm (277.3 kPa, mu_r 4, mu_d 0.2) Eq. 33 gives {_brake(eq7).most_N:.2f} N, Eq. 28 "
+            f"At 45 mm (277.3 kPa, mu_r 4, mu_d 0.2) Eq. 33 gives {Brake.as_built(SAMPLE, eq7).most_N:.2f} N, Eq. 28 "
             f"{_eq_28(closed_Tm):.2f} N. Figure 2.5 has {FIGURE_2_5_N[1]} N.",
             "Eq. 33",
         ),
@@ -264,15 +263,11 @@ def _chapter_4() -> list[Row]:
     ]
 
 
-def _traction(stretch: float) -> float:
-    area = 2.0 * math.pi * TORMAG.thickness_m * TORMAG.inner_radius_m**2 * SAMPLE.friction_coefficient
-    return area / (TORMAG.roller_radius_m * stretch)
-
-
 def _eq_28(moment_Tm: float) -> float:
     stretch = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     magnetic = MU0_H_M * SAMPLE.relative_permeability * (moment_Tm / TORMAG.inner_radius_m) ** 2 / stretch**2
-    return -_traction(stretch) * (SAMPLE.shear_modulus_Pa * (1.0 - stretch**-4) + magnetic)
+    area = 2.0 * math.pi * TORMAG.thickness_m * TORMAG.inner_radius_m**2 * SAMPLE.friction_coefficient
+    return -area / (TORMAG.roller_radius_m * stretch) * (SAMPLE.shear_modulus_Pa * (1.0 - stretch**-4) + magnetic)
 
 
 def _literal_stretch(moment_Tm: float, *, appendix: bool = False) -> float:
@@ -288,18 +283,10 @@ def _literal_stretch(moment_Tm: float, *, appendix: bool = False) -> float:
     return (8.0 * g0 - gamma_1 - math.sqrt(root)) / (4.0 * g0) if root >= 0.0 else math.nan
 
 
-def _brake(law: FieldLaw, elastomer: Elastomer = SAMPLE) -> Brake:
-    return Brake(law, elastomer, TORMAG, CLOSED_MM, OPEN_MM)
-
-
-def _range_N(elastomer: Elastomer, law: FieldLaw | None = None) -> float:
-    brake = _brake(law or ThesisFieldLaw(), elastomer)
-    return brake.most_N - brake.least_N
-
-
 def _range_with_constant_b(elastomer: Elastomer) -> float:
     # the force law scales the moment with mu_r / 4; undone here
-    return _range_N(elastomer, PowerFieldLaw(coefficient=0.44 * 4.0 / elastomer.relative_permeability))
+    law = PowerFieldLaw(coefficient=0.44 * 4.0 / elastomer.relative_permeability)
+    return Brake.as_built(elastomer, law).range_N
 
 
 def _inside(design: Design, low: Design, high: Design) -> bool:

@@ -178,10 +178,7 @@ def _table_3_2(data: Json) -> str:
     speeds = ", ".join(f"{name} {speed:.2f}" for name, speed in data["gap_speed_mm_s"].items())
     rows = []
     for row in data["best"]:
-        (best, local) = (
-            max((one for one in data[key] if _same(one, row)), key=lambda one: float(one["coverage"]))
-            for key in ("starts", "local_starts")
-        )
+        best, local = (best_start(data[key], row["use_case"], row["objective"]) for key in ("starts", "local_starts"))
         rows.append(
             (
                 str(row["use_case"]),
@@ -207,13 +204,13 @@ def _table_3_2(data: Json) -> str:
         *("use case", "measure", "best of five starts", "spread, percentage points", "R_o t s_max, mm"),
         *("elastomer, cm³", "best of SLSQP, cm³"),
     )
-    corner = {number: max(_coverages(data["corner_cost_starts"], number)) for number in (1, 2)}
+    corner = [best_start(data["corner_cost_starts"], number, "corners")["coverage"] for number in (1, 2)]
     return (
         f"## Table 3.2: structural optimisation\n\n{data['note']} Gap speeds, mm/s: {speeds}. Differential evolution, "
         "then COBYQA, beside SLSQP from the same starts, which stays where a start covers nothing. At a fast gap a "
         "small elastomer covers all; at the thesis's speed the last percent costs ten to twenty times the elastomer. "
         "The thesis's cost, Eq. 39, does not measure coverage: its own minimum covers "
-        f"{percent(corner[1])} and {percent(corner[2])}, because a portrait beyond the required corner costs as much "
+        f"{percent(corner[0])} and {percent(corner[1])}, because a portrait beyond the required corner costs as much "
         "as one short of it.\n\n"
         + table(columns, rows)
         + "\n![Optimised portraits](reproduction/figure_3_4.png)\n\nThe thesis's designs under the same measures:\n\n"
@@ -221,12 +218,10 @@ def _table_3_2(data: Json) -> str:
     )
 
 
-def _same(start: Json, row: Json) -> bool:
-    return bool(start["use_case"] == row["use_case"] and start["objective"] == row["objective"])
-
-
-def _coverages(starts: list[Json], use_case: int) -> list[float]:
-    return [float(row["coverage"]) for row in starts if row["use_case"] == use_case]
+def best_start(starts: list[Json], use_case: int, objective: str) -> Json:
+    """The one of these from which most was covered."""
+    found = [each for each in starts if (each["use_case"], each["objective"]) == (use_case, objective)]
+    return max(found, key=lambda each: float(each["coverage"]))
 
 
 def _dimensions(design: Json) -> str:

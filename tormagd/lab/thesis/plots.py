@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.optimisation import Design, Problem
 from tormagd.lab.design.phase_portrait import Region
+from tormagd.lab.thesis.page import best_start
 from tormagd.lab.thesis.step_test import StepTest
 from tormagd.lab.thesis.values import AS_BUILT, USE_CASES
 
@@ -113,8 +114,7 @@ def _figure_3_4(table: Json) -> Figure:
     for row, (number, case) in zip(axes, USE_CASES.items(), strict=True):
         for axis, objective in zip(row, ("true_thesis_speed", "true"), strict=True):
             speed = table["gap_speed_mm_s"][objective]
-            found = [s for s in table["starts"] if s["use_case"] == number and s["objective"] == objective]
-            best = max(found, key=lambda start: float(start["coverage"]))
+            best = best_start(table["starts"], number, objective)
             thesis = max(case.starts, key=lambda line: line.thesis_percent).thesis
             _region(axis, case.region)
             problem = Problem(case.region, "true", speed)

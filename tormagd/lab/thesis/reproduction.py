@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tormagd.lab.arrays import Json
-from tormagd.lab.design.brake import Brake
+from tormagd.lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage
 from tormagd.lab.design.phase_portrait import PhasePortrait
 from tormagd.lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
@@ -22,7 +22,7 @@ from tormagd.lab.main import Found
 from tormagd.lab.thesis import page
 from tormagd.lab.thesis.errata import errata, table_2_4_errors
 from tormagd.lab.thesis.step_test import StepTest, step_test
-from tormagd.lab.thesis.table_2_5 import CLOSED_MM, COLUMNS, OPEN_MM, readings, table_2_5
+from tormagd.lab.thesis.table_2_5 import COLUMNS, readings, table_2_5
 from tormagd.lab.thesis.values import (
     AS_BUILT,
     FIGURE_2_5_MEASURED_N,
@@ -35,7 +35,7 @@ from tormagd.lab.thesis.values import (
 )
 from tormagd.lab.told import table
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import TORMAG, Elastomer
+from tormagd.physics.force import Elastomer
 from tormagd.physics.inserts import INSERTS, Insert, insert
 
 CONTROLLER_SPEED_MM_S = 40.0
@@ -183,9 +183,9 @@ def figure_2_5() -> Json:
     result: Json = {}
     laws: tuple[tuple[str, FieldLaw], ...] = (("eq_7", ThesisFieldLaw()), ("power", PowerFieldLaw()))
     for name, law in laws:
-        at_point = Brake(law, Elastomer(277e3, 4.0, 0.2), TORMAG, CLOSED_MM, OPEN_MM)
+        at_point = Brake.as_built(Elastomer(277e3, 4.0, 0.2), law)
         grid = [
-            [Brake(law, Elastomer(1e3 * float(g0), float(mu_r), 0.2), TORMAG, CLOSED_MM, OPEN_MM) for g0 in moduli_kPa]
+            [Brake.as_built(Elastomer(1e3 * float(g0), float(mu_r), 0.2), law) for g0 in moduli_kPa]
             for mu_r in permeabilities
         ]
         result[name] = {
@@ -210,7 +210,7 @@ def figure_2_7(tests: list[StepTest]) -> Json:
     """Settled force at each gap on the simulated device, against the force law."""
     rows = []
     for test in tests:
-        brake = Brake(PowerFieldLaw(), insert(test.insert).elastomer, TORMAG, CLOSED_MM, OPEN_MM)
+        brake = Brake.as_built(insert(test.insert).elastomer)
         analytic_N = brake.force_N(test.level_gap_mm)
         rows.append(
             {
@@ -225,9 +225,7 @@ def figure_2_7(tests: list[StepTest]) -> Json:
         )
     ranges = []
     for item in INSERTS.values():
-        least_N, most_N = Brake(PowerFieldLaw(), item.elastomer, TORMAG, CLOSED_MM, OPEN_MM).force_N(
-            np.array([OPEN_MM, CLOSED_MM])
-        )
+        least_N, most_N = Brake.as_built(item.elastomer).force_N(np.array([OPEN_MM, CLOSED_MM]))
         ranges.append(
             {
                 "insert": item.name,
@@ -275,7 +273,7 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
 def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
     rates_N_s = np.gradient(forces_N, times_s)
-    brake = Brake(PowerFieldLaw(), insert("MRE-50-40").elastomer, TORMAG, CLOSED_MM, OPEN_MM)
+    brake = Brake.as_built(insert("MRE-50-40").elastomer)
     rows = []
     for speed in gap_speeds_mm_s:
         portrait = PhasePortrait(brake, speed)

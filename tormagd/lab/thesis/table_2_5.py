@@ -7,14 +7,11 @@ a task is served from its own least force on, and a passive brake does not reach
 import math
 
 from tormagd.lab.arrays import Json
-from tormagd.lab.design.brake import Brake
+from tormagd.lab.design.brake import CLOSED_MM, Brake
 from tormagd.lab.design.selection import ForceTask, Verdict, rank
 from tormagd.lab.thesis.values import TABLE_2_5
-from tormagd.physics.field import PowerFieldLaw
-from tormagd.physics.force import TORMAG
 from tormagd.physics.inserts import INSERTS
 
-CLOSED_MM, OPEN_MM = 45.0, 95.0
 GAP_RESOLUTION_MM = 0.1
 "Where a plain position loop stands against the screws' backlash; table 2.5 of the thesis implies a little less."
 COLUMNS = (
@@ -32,9 +29,7 @@ COLUMNS = (
 def table_2_5() -> Json:
     """Every insert before every task, best first by the strict reading."""
     # the open gap is that of the device, but the law must hold beyond it where a task asks for less force
-    brakes = {
-        item.name: Brake(PowerFieldLaw(), item.elastomer, TORMAG, CLOSED_MM, OPEN_MM) for item in INSERTS.values()
-    }
+    brakes = {item.name: Brake.as_built(item.elastomer) for item in INSERTS.values()}
     steps = [
         1e-3 * resolution_mN / brakes[name].slope_N_mm(CLOSED_MM)
         for _, named in TABLE_2_5

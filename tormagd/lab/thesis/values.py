@@ -70,32 +70,28 @@ class UseCase(NamedTuple):
     starts: tuple[Start, ...]
 
 
-def _line(start: tuple[float, float, float], thesis: tuple[float, float, float], percent: float) -> Start:
-    return Start(Design(*start), Design(*thesis), percent)
-
-
 USE_CASES = {
     1: UseCase(
         # the thesis gives only the forces; a passive brake changes no zero force, so the rate there is taken as zero
         Region(0.0, 0.0, 2.5, 1.0),
         88.0,
         (
-            _line((11.0, 20.0, 95.0), (15.0, 30.0, 85.0), 96.0),
-            _line((12.0, 23.0, 140.0), (14.0, 30.0, 87.0), 100.0),
-            _line((14.0, 23.0, 200.0), (15.0, 32.0, 85.0), 100.0),
-            _line((9.0, 35.0, 175.0), (15.0, 30.0, 85.0), 99.0),
-            _line((8.0, 45.0, 60.0), (14.0, 29.0, 85.0), 97.0),
+            Start(Design(11.0, 20.0, 95.0), Design(15.0, 30.0, 85.0), 96.0),
+            Start(Design(12.0, 23.0, 140.0), Design(14.0, 30.0, 87.0), 100.0),
+            Start(Design(14.0, 23.0, 200.0), Design(15.0, 32.0, 85.0), 100.0),
+            Start(Design(9.0, 35.0, 175.0), Design(15.0, 30.0, 85.0), 99.0),
+            Start(Design(8.0, 45.0, 60.0), Design(14.0, 29.0, 85.0), 97.0),
         ),
     ),
     2: UseCase(
         Region(0.5, 0.25, 3.0, 1.0),
         91.0,
         (
-            _line((11.0, 45.0, 95.0), (14.0, 29.0, 138.0), 94.0),
-            _line((7.0, 27.0, 150.0), (14.0, 29.0, 187.0), 100.0),
-            _line((7.0, 30.0, 150.0), (15.0, 28.0, 145.0), 97.0),
-            _line((40.0, 50.0, 170.0), (15.0, 29.0, 165.0), 99.0),
-            _line((20.0, 15.0, 100.0), (15.0, 30.0, 200.0), 100.0),
+            Start(Design(11.0, 45.0, 95.0), Design(14.0, 29.0, 138.0), 94.0),
+            Start(Design(7.0, 27.0, 150.0), Design(14.0, 29.0, 187.0), 100.0),
+            Start(Design(7.0, 30.0, 150.0), Design(15.0, 28.0, 145.0), 97.0),
+            Start(Design(40.0, 50.0, 170.0), Design(15.0, 29.0, 165.0), 99.0),
+            Start(Design(20.0, 15.0, 100.0), Design(15.0, 30.0, 200.0), 100.0),
         ),
     ),
 }
