@@ -89,8 +89,7 @@ def _begin_with(injection: Injection, plant: str, bus: str, watched_s: float) ->
     rig = Rig(injection, plant, bus, 0.0)
     rig.spoil(injection)
     rig.publisher.is_silent = True
-    for _ in rig.run(CONNECTED_S):
-        pass
+    rig.rest(CONNECTED_S)
     watch = Watch(rig, {}, is_driven=False)
     if _is_taken(rig, watch, "home"):
         for sample in rig.run(ARMING_S):

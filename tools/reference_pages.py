@@ -40,15 +40,6 @@ the same.
 BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "to {}", "lt": "under {}"}
 
 
-class Key(msgspec.Struct, frozen=True):
-    """One key of the configuration; `default` as TOML has it, `why` empty where the source says nothing."""
-
-    name: str
-    default: str
-    allowed: str
-    why: str
-
-
 def main() -> int:
     """Writes both pages."""
     FOLDER.mkdir(exist_ok=True)
@@ -63,8 +54,7 @@ def configuration_page() -> str:
     for heading, kind in (*tables(config.Config, ""), *BACKENDS.items()):
         says = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
         parts.append(f"## {heading or 'At the top'}\n\n{says}\n")
-        rows = [(f"`{key.name}`", key.default, key.allowed, key.why) for key in keys(kind)]
-        parts.append(table(("key", "default", "allowed", "what and why"), rows))
+        parts.append(table(("key", "default", "allowed", "what and why"), keys(kind)))
     return "\n".join(parts)
 
 
@@ -77,12 +67,13 @@ def tables(kind: type[msgspec.Struct], path: str) -> Iterator[tuple[str, type[ms
             yield from tables(inner, f"{path}.{field.name}".removeprefix("."))
 
 
-def keys(kind: type[msgspec.Struct]) -> list[Key]:
-    """The keys of one table, without the tables in it."""
+def keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str, str]]:
+    """The keys of one table, without the tables in it: name, default as TOML has it, what is allowed, and why, which is
+    empty where the source says nothing."""
     says = _field_docs(kind)
     hints = get_type_hints(kind, include_extras=True)
     return [
-        Key(field.name, _default(field), _allowed(hints[field.name]), says.get(field.name, ""))
+        (f"`{field.name}`", _default(field), _allowed(hints[field.name]), says.get(field.name, ""))
         for field in msgspec.structs.fields(kind)
         if config.table_in(field.type) is None
     ]

@@ -135,8 +135,9 @@ def test_draws_repeat_themselves() -> None:
     assert drawn_device(4) == drawn_device(4) != drawn_device(5)
 
 
-def test_recorded_signals_are_in_the_devices_range(recordings) -> None:
-    found = recorded_signals(recordings)
+def test_recorded_signals_are_in_the_devices_range(recordings, monkeypatch) -> None:
+    monkeypatch.setenv("TORMAG_DATA", str(recordings))
+    found = recorded_signals()
     assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "haptic"}
     for signal in found:
         assert np.all(np.diff(signal.time_s) > 0.0)

@@ -7,6 +7,7 @@ then hostile ones, then healthy ones again. What is not finite afterwards, in wh
 has travelled. A stage that refused is made anew, as its owner does.
 """
 
+import contextlib
 import math
 import random
 from collections import Counter
@@ -168,14 +169,8 @@ def leaves(thing: object, path: str = "") -> Iterator[tuple[str, float]]:
         for place, each in enumerate(thing):
             yield from leaves(each, f"{path}.{place}")
     elif hasattr(thing, "__dict__") or hasattr(thing, "__mypyc_attrs__"):
-        yield from leaves(_plain(thing), path)
-
-
-def _plain(thing: object) -> object:
-    try:
-        return plain(thing)
-    except TypeError:  # it has no fields
-        return None
+        with contextlib.suppress(TypeError):  # where it has no fields
+            yield from leaves(plain(thing), path)
 
 
 def _members(came: object) -> Iterator[object]:

@@ -30,7 +30,7 @@ def recover(rig: Rig, injection: Injection, cell: Cell) -> Cell:
         tried, is_held_back = _before(rig, injection)
     rig.mend()
     mended_s = rig.loop.now_s
-    _rest(rig, MENDED_S)
+    rig.rest(MENDED_S)
     commands = next_commands(rig.safety, rig.is_homed)
     trouble = _obeyed(rig, commands, PATIENCE_S)
     back_s = rig.loop.now_s - mended_s
@@ -81,7 +81,7 @@ def _obeyed(rig: Rig, commands: tuple[Event, ...], patience_s: float) -> str:
     if not commands:
         return ""
     rig.publisher.is_silent = True
-    _rest(rig, SILENT_S)
+    rig.rest(SILENT_S)
     taken: list[str] = []
     for event in commands:
         _rest_until_ready(rig)
@@ -91,7 +91,7 @@ def _obeyed(rig: Rig, commands: tuple[Event, ...], patience_s: float) -> str:
         if refusal:
             return ", ".join((*taken, f"{event} refused: {refusal}"))
         taken.append(str(event))
-        _rest(rig, CLEARED_S if event is Event.CLEAR_FAULT else 0.0)
+        rig.rest(CLEARED_S if event is Event.CLEAR_FAULT else 0.0)
     rig.publisher.is_silent = False
     return ""
 
@@ -115,11 +115,6 @@ def _rest_until_ready(rig: Rig) -> None:
     until_s = rig.loop.now_s + PATIENCE_S
     while rig.loop.conditions().busy and rig.loop.now_s < until_s:
         rig.tick()
-
-
-def _rest(rig: Rig, duration_s: float) -> None:
-    for _ in rig.run(duration_s):
-        pass
 
 
 def _named(injection: Injection, told: set[str]) -> str:

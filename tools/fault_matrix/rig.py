@@ -92,6 +92,11 @@ class Rig:
         for _ in range(round(duration_s * self.config.rates.control_hz)):
             yield self.tick()
 
+    def rest(self, duration_s: float) -> None:
+        """Lets so much time pass."""
+        for _ in self.run(duration_s):
+            pass
+
     def spoil(self, injection: Injection) -> None:
         """Line, force sensor, host and publisher go bad now."""
         if injection.way is not None:

@@ -14,7 +14,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -49,11 +48,6 @@ class Stall(NamedTuple):
 
     start_s: float
     end_s: float
-
-    @property
-    def length_ms(self) -> float:
-        """How long it took, ms."""
-        return (self.end_s - self.start_s) * 1e3
 
 
 class Counters(NamedTuple):
@@ -154,10 +148,11 @@ class HostWatch:
             looks = self._looks
         first, last = looks[0], looks[-1]
         newest = {name: look for look in looks for name in look.waited_s}
+        within = [each for stalls in self._stalls for each in stalls if each.start_s < end_s and each.end_s > start_s]
         return Host(
             steal=(last.stolen - first.stolen) / max(last.ticks - first.ticks, 1),
             bare_kept=min((kept(stalls, start_s, end_s) for stalls in self._stalls), default=1.0),
-            bare_worst_ms=max((stall.length_ms for stall in self._within(start_s, end_s)), default=0.0),
+            bare_worst_ms=1e3 * max((stall.end_s - stall.start_s for stall in within), default=0.0),
             waited={
                 name: (look.waited_s[name] - first.waited_s.get(name, 0.0)) / max(look.time_s - first.time_s, 1e-9)
                 for name, look in newest.items()
@@ -165,10 +160,6 @@ class HostWatch:
             blocked=(last.blocked_s - first.blocked_s) / max(last.time_s - first.time_s, 1e-9),
             waited_worst_ms=1e3 * max((waited_over_s(*pair) for pair in pairwise(looks)), default=0.0),
         )
-
-    def _within(self, start_s: float, end_s: float) -> Iterator[Stall]:
-        for stalls in self._stalls:
-            yield from (stall for stall in stalls if stall.start_s < end_s and stall.end_s > start_s)
 
     def _look(self) -> None:
         while not self._ended.wait(LOOK_S):

@@ -31,7 +31,6 @@ from rendering.signals import (
     TRIM_S,
     Kind,
     Signal,
-    data_folder,
     palpation,
     pulse_signal,
     recorded_signals,
@@ -267,10 +266,10 @@ def pulse(name: str) -> Json:
 
 def signals(pool: Executor) -> Json:
     """The recorded signals and palpation on the three samples: those known ahead with preview, and all of them live."""
-    folder = data_folder()
-    if folder is None:
-        return {"rows": [], "note": "no recorded signals: TORMAG_DATA names no folder"}
-    found = [*recorded_signals(folder), *(palpation(seed) for seed in PALPATION_SEEDS)]
+    found = recorded_signals()
+    if not found:
+        return {"rows": [], "note": "no recorded signals: TORMAG_DATA names no folder of them"}
+    found += [palpation(seed) for seed in PALPATION_SEEDS]
     cases = [
         (name, signal, preview_s)
         for signal in found

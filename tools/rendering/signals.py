@@ -3,7 +3,6 @@
 Shape and rhythm are measured; where a signal is not a force, the newtons are chosen, as `scaled` says.
 """
 
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from tormagd.lab.arrays import Array
-from tormagd.lab.human_pulse import pulse_profile
+from tormagd.lab.human_pulse import pulse_profile, recorded, scaled
 
 PULSE_N = (1.4, 1.7)
 "The range of the demonstration's pulse."
@@ -66,12 +65,12 @@ def pulse_signal(duration_s: float) -> Signal:
     return Signal("pulse", f"{low_N}..{high_N} N", *pulse_profile(duration_s, low_N, high_N, RATE_HZ))
 
 
-def recorded_signals(folder: Path) -> list[Signal]:
-    """Every signal found under a data folder; those that are not there are left out."""
+def recorded_signals() -> list[Signal]:
+    """Every signal of the folder that TORMAG_DATA names; none without."""
     return [
-        *(_pulse(path, "finger pressure") for path in sorted((folder / "aac_nibp_pulse").glob("*.csv"))),
-        *(_pulse(path, "arterial pressure") for path in sorted((folder / "wfdb_mimicdb").glob("*_ABP.csv"))),
-        *(_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
+        *(_pulse(path, "finger pressure") for path in recorded("aac_nibp_pulse")),
+        *(_pulse(path, "arterial pressure") for path in recorded("wfdb_mimicdb") if path.stem.endswith("_ABP")),
+        *(_haptic(path) for path in recorded("kit_cataract_haptic")),
     ]
 
 
@@ -94,12 +93,6 @@ def _rising(since_s: Array) -> Array:
     return rising
 
 
-def data_folder() -> Path | None:
-    """The folder that TORMAG_DATA names, if it is there."""
-    name = os.environ.get("TORMAG_DATA")
-    return Path(name) if name and Path(name).is_dir() else None
-
-
 def _pulse(path: Path, what: str) -> Signal:
     raw = np.loadtxt(path, delimiter=",", skiprows=1)
     period_s = float(np.median(np.diff(raw[:, 0])))
@@ -111,11 +104,9 @@ def _pulse(path: Path, what: str) -> Signal:
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1.0 / period_s, output="sos"), values)
     time_s = np.arange(round(PULSE_S * RATE_HZ)) / RATE_HZ
     part = np.interp(time_s, np.arange(len(smooth)) * period_s, smooth)
-    low, high = PULSE_N
-    force = low + (part - part.min()) / np.ptp(part) * (high - low)
-    return Signal(
-        f"{what} {path.stem}", f"least..most to {low}..{high} N, {LOW_PASS_HZ:g} Hz", time_s, force, kind=Kind.PULSE
-    )
+    low_N, high_N = PULSE_N
+    told = f"least..most to {low_N}..{high_N} N, {LOW_PASS_HZ:g} Hz"
+    return Signal(f"{what} {path.stem}", told, time_s, scaled(part, *PULSE_N), kind=Kind.PULSE)
 
 
 def _haptic(path: Path) -> Signal:
@@ -124,7 +115,6 @@ def _haptic(path: Path) -> Signal:
     sent_s, first = np.unique(raw[:, 0], return_index=True)
     sent_s, sent_N = sent_s[sent_s <= HAPTIC_S], np.linalg.norm(raw[first, 1:4], axis=1)[sent_s <= HAPTIC_S]
     least_N, most_N = SCALED_N
-    scaled = least_N + (sent_N - sent_N.min()) / np.ptp(sent_N) * (most_N - least_N)
     time_s = np.arange(0.0, sent_s[-1], 1.0 / RATE_HZ)
-    forces = np.interp(time_s, sent_s, scaled)
+    forces = np.interp(time_s, sent_s, scaled(sent_N, *SCALED_N))
     return Signal(f"haptic scaled {path.stem}", f"|F| to {least_N}..{most_N} N", time_s, forces, kind=Kind.HAND)

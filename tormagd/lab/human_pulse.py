@@ -5,6 +5,7 @@ package heartpy ships as `data.csv`: 100 Hz, 25 s, one person. Shape and rhythm 
 """
 
 import importlib.util
+import os
 from pathlib import Path
 
 import numpy as np
@@ -42,4 +43,16 @@ def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int
     times_s = np.arange(count) / rate_hz
     # band-limited far below its sampling: a spline adds no images at 100 Hz, which the carriages would follow
     part = CubicSpline(np.arange(len(raw)) / SOURCE_HZ, smooth)(EDGE_S + times_s)
-    return times_s, least_N + (part - part.min()) / (part.max() - part.min()) * (most_N - least_N)
+    return times_s, scaled(part, least_N, most_N)
+
+
+def scaled(values: Array, least: float, most: float) -> Array:
+    """The values with their least and greatest brought to these."""
+    found: Array = least + (values - values.min()) / np.ptp(values) * (most - least)
+    return found
+
+
+def recorded(folder: str) -> list[Path]:
+    """The CSV files of a folder of measured data; none unless TORMAG_DATA names where that is."""
+    data = os.environ.get("TORMAG_DATA")
+    return sorted((Path(data) / folder).glob("*.csv")) if data else []

@@ -1,8 +1,6 @@
 """The pulse experiment of section 4.3 on the synthetic pad, and pulses rendered on a pad held for an hour."""
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +9,7 @@ from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.inverse.ordered import RowByRow
 from tormagd.inverse.solution import FieldSolver, Reach
 from tormagd.lab.arrays import Array, Mask
-from tormagd.lab.human_pulse import pulse_profile
+from tormagd.lab.human_pulse import pulse_profile, recorded, scaled
 from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
 from tormagd.lab.tactile.pads import PADS, Program, drawn_pad
 from tormagd.lab.training.grey_box import GreyBoxMemory
@@ -44,13 +42,12 @@ def pulse_shape(duration_s: float, rate_hz: int) -> Array:
 
 def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
     """Measured arterial pulses between 0 and 1, by their file's name; none unless TORMAG_DATA names their folder."""
-    folder = os.environ.get("TORMAG_DATA")
     shapes = {}
-    for path in sorted(Path(folder, "aac_nibp_pulse").glob("*.csv")) if folder else ():
+    for path in recorded("aac_nibp_pulse"):
         time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
         # six beats that end as they began
         looped = np.interp(np.arange(round(duration_s * rate_hz)) / rate_hz, time_s, pressure, period=time_s[-1])
-        shapes[path.stem] = (looped - looped.min()) / np.ptp(looped)
+        shapes[path.stem] = scaled(looped, 0.0, 1.0)
     return shapes
 
 
@@ -161,11 +158,11 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
     strangers = [course(drawn_pad(pad, seed), shape, every) for seed in OTHER_PADS]
-    recorded = {name: course(pad, other, every) for name, other in recorded_shapes(HELD_S, RATE_HZ).items()}
+    arterial = {name: course(pad, other, every) for name, other in recorded_shapes(HELD_S, RATE_HZ).items()}
     rendered = [pulse_on(own, trained) for trained in trainings]
     for trained, (scores, _) in zip(trainings, rendered, strict=True):
         scores["other_pads"] = [along.scores(aware_fields(trained, along)) for along in strangers]
-        scores["other_pulses"] = {name: along.scores(aware_fields(trained, along)) for name, along in recorded.items()}
+        scores["other_pulses"] = {name: along.scores(aware_fields(trained, along)) for name, along in arterial.items()}
     top, traces = rendered[0]
     kept = ("mlp", "mlp_thesis_search", "relaxation_aware", "noise_bound_mae_mT", "scored_share")
     by_noise = {str(trained.noise_N): scores for trained, (scores, _) in zip(trainings, rendered, strict=True)}
