@@ -27,7 +27,6 @@ from tormagd.simulation.plant import Sensor
 FORCE_N = 1.8
 SWING_N = 0.1
 OFFSET_N = 0.8
-SATURATED_N = 20.0
 "Of a broken force sensor."
 HOGGED_MS = 12
 HOGGED_EVERY_MS = 100
@@ -151,7 +150,7 @@ class BadSensor:
             "stuck": self._last_N,
             "high": true_N + OFFSET_N,
             "low": true_N - OFFSET_N,
-            "saturated": SATURATED_N,
+            "saturated": 20.0,
             "dead": 0.0,
         }
         return shown[self._how]

@@ -46,7 +46,6 @@ from tormagd.lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brak
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-RECORDED_SCENE = "coronary"
 HIGH_N, LOW_N, ABOVE_N = 2.0, 0.7, 0.1
 "Steps begin at LOW_N, or ABOVE_N over what the open gap brakes where that is more."
 ARRIVES_S, LATER_S = 0.25, 1.0
@@ -276,7 +275,7 @@ def signals(pool: Executor) -> Json:
         for preview_s in ((FILE_PREVIEW_S, 0.0) if signal.is_known_ahead else (0.0,))
         for name in SAMPLES
     ]
-    runs = [pool.submit(track, device(name), signal, RECORDED_SCENE, preview_s) for name, signal, preview_s in cases]
+    runs = [pool.submit(track, device(name), signal, "coronary", preview_s) for name, signal, preview_s in cases]
     best = {(name, signal.name): pool.submit(ideal, name, signal) for signal in found for name in SAMPLES}
     rows = []
     for (name, signal, preview_s), run in zip(cases, runs, strict=True):

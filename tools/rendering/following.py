@@ -33,7 +33,6 @@ PREVIEW_S = 0.07
 "How far a preview tells what follows."
 FILE_PREVIEW_S = 0.4
 "How far one does that plays a recording."
-CORNER_SCENE = "coronary"
 VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2
@@ -119,9 +118,9 @@ def armed(
 
 
 def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Learned = NOTHING_LEARNED) -> ClosedLoop:
-    """The same in CORNER_SCENE with a hand that stood meanwhile, and goes along its legs from now on."""
+    """The same in the scene `coronary` with a hand that stood meanwhile, and goes along its legs from now on."""
     hand = WaitingHand()
-    loop = armed(build_core(Config(scene=CORNER_SCENE)), plant, hand, shown)
+    loop = armed(build_core(Config(scene="coronary")), plant, hand, shown)
     hand.begin(legs, loop.now_s)
     return loop
 

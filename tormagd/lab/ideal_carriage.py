@@ -53,10 +53,6 @@ EXACT_N = 1e-6
 SECANT_MM_S = 5.0
 "Over which a limit is taken to be straight: turning round, it has a kink, and the carriages turn elsewhere next round."
 LEAST_BRAKING_MM_S2 = 50.0
-MOST_ITERATIONS = 1_000
-"""Of one programme: where the rounds go a little way only, the limits leave little room about the last round's way, and
-the solver takes ten times as many as at first."""
-SOLVED = ("Solved", "AlmostSolved")
 
 
 GRID_MM = 2e-3
@@ -471,7 +467,8 @@ def _least_squares(
     bounds = np.concatenate([bound for _, bound in limits])
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    settings.max_iter = MOST_ITERATIONS
+    # where the rounds go a little way only, the limits leave little room, and it takes ten times as many as at first
+    settings.max_iter = 1_000
     solver = clarabel.DefaultSolver(
         sparse.triu(matrix.T @ matrix / unit**2, format="csc"),
         matrix.T @ error / unit**2,
@@ -481,6 +478,6 @@ def _least_squares(
         settings,
     )
     solution = solver.solve()
-    if str(solution.status) not in SOLVED:
+    if str(solution.status) not in ("Solved", "AlmostSolved"):
         raise RuntimeError(f"foresight: the quadratic programme ended with {solution.status}")
     return np.array(solution.x)

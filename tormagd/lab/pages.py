@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KEY = "Figures"
-DPI = 90
 
 
 def stamp(figures: object) -> dict[str, str | None]:
@@ -30,7 +29,7 @@ def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapp
     page = "\n".join(section.rstrip() + "\n" for section in sections)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():
-        figure.savefig(folder / f"{name}.png", dpi=DPI, metadata=stamp(figures_of(page)))
+        figure.savefig(folder / f"{name}.png", dpi=90, metadata=stamp(figures_of(page)))
     path.write_text(page, encoding="utf-8")
 
 

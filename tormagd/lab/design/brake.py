@@ -69,7 +69,6 @@ class Brake:
         moment_Tm = radial_moment_for_force_Tm(force_N, self.elastomer, self.geometry)
         # the forces of the end positions must come back as those, not as a rounding beyond them
         weakest_Tm, strongest_Tm = (self.field.radial_moment_Tm(gap_mm) for gap_mm in (self.open_mm, self.closed_mm))
-        if isinstance(moment_Tm, float):
-            gap_mm = self.field.gap_mm(min(max(moment_Tm, weakest_Tm), strongest_Tm))
-            return min(max(gap_mm, self.closed_mm), self.open_mm)
-        return np.clip(self.field.gap_mm(np.clip(moment_Tm, weakest_Tm, strongest_Tm)), self.closed_mm, self.open_mm)
+        gap_mm = self.field.gap_mm(np.clip(moment_Tm, weakest_Tm, strongest_Tm))
+        found: Real = np.clip(gap_mm, self.closed_mm, self.open_mm)
+        return found

@@ -37,10 +37,7 @@ SLACK = 1e-4
 """Coverage that a smaller elastomer may cost: a hundredth of a percent."""
 _GAP_WEIGHT = 1e-4
 """Of the open gap beside the volume: decides only between volumes that are as good as equal."""
-_POPULATION = 10
 _GENERATIONS = 50
-_TRUST_RADIUS = 0.05
-_EVALUATIONS = 100
 
 
 class Design(msgspec.Struct, frozen=True):
@@ -228,7 +225,7 @@ class _Search:
             constraints=limits,
             x0=start,
             rng=np.random.default_rng(seed),
-            popsize=_POPULATION,
+            popsize=10,
             maxiter=_GENERATIONS,
             tol=1e-6,
             atol=1e-9,
@@ -237,9 +234,10 @@ class _Search:
         return np.asarray(result.x)
 
     def _refine(self, cost: Callable[[Array], float], start: Array, limits: list[Any]) -> Array:
-        options = {"initial_tr_radius": _TRUST_RADIUS, "final_tr_radius": 1e-5, "maxfev": _EVALUATIONS}
+        options = {"initial_tr_radius": 0.05, "final_tr_radius": 1e-5, "maxfev": 100}
         result = minimize(cost, start, method="COBYQA", bounds=self._bounds, constraints=limits, options=options)
-        return _better(cost, start, result) if _keeps(limits, result.x) else start
+        is_kept = all(limit.lb <= limit.fun(result.x) <= limit.ub for limit in limits)
+        return _better(cost, start, result) if is_kept else start
 
     def _at(self, function: Callable[[Problem, Design], float], x: Array, impossible: float) -> float:
         self.evaluations += 1
@@ -249,7 +247,3 @@ class _Search:
 
 def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult) -> Array:
     return np.asarray(result.x) if cost(result.x) < cost(start) else start
-
-
-def _keeps(limits: list[Any], x: Array) -> bool:
-    return all(limit.lb <= limit.fun(x) <= limit.ub for limit in limits)

@@ -10,6 +10,7 @@ test holds. A hold that latches a fault ends there. All pads are synthetic.
 import argparse
 import math
 import random
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple
@@ -61,14 +62,13 @@ Moment = tuple[float, float, Plan, str]
 def hold(case: Case) -> dict[str, Any]:
     """The greatest, the mean and the last error of the true force, as shares of the force asked, the share of time that
     each limit was there, and the fault that ended it, if any."""
-    shares, limits, last_mm, fault = [], dict[str, int](), math.nan, ""
+    shares, limits, last_mm, fault = [], Counter[str](), math.nan, ""
     for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
         if fault:
             break
         shares.append(force_N / FORCE_N - 1.0)
         last_mm = gap_mm
-        for limit in plan.limits:
-            limits[str(limit)] = limits.get(str(limit), 0) + 1
+        limits.update(map(str, plan.limits))
     absolute = np.abs(shares)
     return case._asdict() | {
         "force_error": float(absolute.max()),

@@ -7,7 +7,7 @@ import numpy as np
 
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.inverse.ordered import RowByRow
-from tormagd.inverse.solution import FieldSolver, Reach
+from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.human_pulse import pulse_profile, recorded, scaled
 from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
@@ -68,20 +68,24 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 
 def solve_all(
     solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
-) -> Array:
-    """The field for each row in turn. With `memory` each force is freed of what the pad remembers first."""
-    fields, last = [], None
+) -> list[FieldSolution]:
+    """The answer for each row in turn. With `memory` each force is freed of what the pad remembers first."""
+    answers: list[FieldSolution] = []
     for row, wanted_N in zip(features.tolist(), force_N.tolist(), strict=True):
         displacement_mm, rate_mm_s, _, cip_percent = row
         if memory is not None:
             wanted_N = memory.elastic_N(displacement_mm, rate_mm_s, wanted_N, cip_percent)
         curve = model.curve(displacement_mm, rate_mm_s, cip_percent)
-        last = solver.solve(curve, wanted_N, last).field_mT
+        answers.append(solver.solve(curve, wanted_N, answers[-1].field_mT if answers else None))
         if memory is not None:
             # what the field found can give, not what was wished
-            memory.advance(displacement_mm, rate_mm_s, last, cip_percent)
-        fields.append(last)
-    return np.array(fields)
+            memory.advance(displacement_mm, rate_mm_s, answers[-1].field_mT, cip_percent)
+    return answers
+
+
+def fields_of(answers: list[FieldSolution]) -> Array:
+    """The fields found, mT."""
+    return np.array([answer.field_mT for answer in answers])
 
 
 class Course(NamedTuple):
@@ -132,15 +136,15 @@ def aware_fields(trained: Trained, along: Course, noise_N: float = 0.0) -> Array
     """The fields that the relaxation-aware model finds for the forces, as a sensor with that noise shows them."""
     noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
     memory = GreyBoxMemory(trained.grey, along.dt_s)
-    return solve_all(nearest(), trained.grey.model, along.features, noisy_N, memory)
+    return fields_of(solve_all(nearest(), trained.grey.model, along.features, noisy_N, memory))
 
 
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
     """Scores of each way to the field, and the traces."""
     linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
-        "mlp": solve_all(nearest(), trained.model, along.features, along.force_N, None),
-        "mlp_thesis_search": solve_all(linear, trained.model, along.features, along.force_N, None),
+        "mlp": fields_of(solve_all(nearest(), trained.model, along.features, along.force_N, None)),
+        "mlp_thesis_search": fields_of(solve_all(linear, trained.model, along.features, along.force_N, None)),
         "relaxation_aware": aware_fields(trained, along),
         "relaxation_aware_noisy": aware_fields(trained, along, trained.noise_N),
     }
@@ -174,36 +178,26 @@ def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
     dt_s = 1.0 / HOLD_RATE_HZ
     rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)
     count = rising + round(duration_s * HOLD_RATE_HZ)
-    displacement_mm = np.minimum(np.arange(1, count + 1) * dt_s, FULL_INDENTATION_MM)
-    rate_mm_s = np.where(np.arange(count) < rising, 1.0, 0.0)
-    low, high = HOLD_FORCES_N
-    beats_N = low + (high - low) * pulse_shape(HELD_PULSE_S, HOLD_RATE_HZ)
+    time_s, rate_mm_s = np.arange(1.0, count + 1.0) * dt_s, np.where(np.arange(count) < rising, 1.0, 0.0)
+    pressed = Program(time_s, np.minimum(time_s, FULL_INDENTATION_MM), rate_mm_s, np.zeros(count))
+    beats_N = scaled(pulse_shape(HELD_PULSE_S, HOLD_RATE_HZ), *HOLD_FORCES_N)
     # there and back again, so that the repetition has no jump
     asked_N = np.resize(np.concatenate((beats_N, beats_N[::-1])), count - rising)
     pad = PADS[PAD_IN_USE]
-    scores = {}
-    for name, model, memory in (
-        ("without", trained.model, None),
-        ("with", trained.grey.model, GreyBoxMemory(trained.grey, dt_s)),
-    ):
-        plant = worked_pad(pad)
-        solver = nearest()
-        rendered, last, outside = np.empty(count), 0.0, 0
-        for index, place in enumerate(zip(displacement_mm.tolist(), rate_mm_s.tolist(), strict=True)):
-            if index >= rising:
-                wanted_N = float(asked_N[index - rising])
-                if memory is not None:
-                    wanted_N = memory.elastic_N(*place, wanted_N, pad.cip_percent)
-                answer = solver.solve(model.curve(*place, pad.cip_percent), wanted_N, last)
-                last, outside = answer.field_mT, outside + (answer.reach is not Reach.INSIDE)
-            if memory is not None:
-                memory.advance(*place, last, pad.cip_percent)
-            rendered[index] = plant.advance(dt_s, *place, last)
-        error = np.abs(rendered[rising:] - asked_N) / asked_N
+    features = pressed.features(pad.cip_percent)
+    grey, scores = trained.grey, {}
+    for name, model, memory in (("without", trained.model, None), ("with", grey.model, GreyBoxMemory(grey, dt_s))):
+        if memory is not None:
+            for row in features[:rising].tolist():
+                memory.advance(*row)
+        answers = solve_all(nearest(), model, features[rising:], asked_N, memory)
+        fields_mT = np.concatenate((np.zeros(rising), fields_of(answers)))
+        rendered_N = worked_pad(pad).run(*pressed._replace(field_mT=fields_mT))[rising:]
+        error = np.abs(rendered_N - asked_N) / asked_N
         scores[name] = {
             "force_error_10min": float(error[: round(TEN_MINUTES_S * HOLD_RATE_HZ)].max()),
             "force_error_1h": float(error.max()),
             "mean_force_error": float(error.mean()),
-            "out_of_reach_share": outside / len(asked_N),
+            "out_of_reach_share": sum(answer.reach is not Reach.INSIDE for answer in answers) / len(answers),
         }
     return {"duration_s": duration_s, **scores}

@@ -23,7 +23,6 @@ from tormagd.model.model_file import ForceModel, save_model
 from tormagd.simulation.parameters import PlantError, load_plant
 
 INSERT = "MRE-C"
-HIDDEN = 30
 SEED = 1
 UNSEEN_FIELDS_MT = (130.0, 230.0)
 
@@ -38,7 +37,7 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
     holds = holding_records(plant.pad, noise_N, SEED, samples=effort.hold_samples).data
     held_out = random_split(len(cycles), SEED)
     epochs, settling_epochs = effort.pad_epochs, effort.settling_epochs
-    grey = fit_grey_box(cycles, ~held_out, holds, hidden=HIDDEN, epochs=epochs, settling_epochs=settling_epochs)
+    grey = fit_grey_box(cycles, ~held_out, holds, epochs=epochs, settling_epochs=settling_epochs)
     unseen = holding_records(plant.pad, 0.0, SEED, fields_mT=UNSEEN_FIELDS_MT, samples=effort.hold_samples).data
     is_pressed = unseen.features[:, 0] > 1.0
     predicted_N = grey.predict(cycles)[held_out]
