@@ -42,7 +42,6 @@ BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "to {}", "lt": "under {}"}
 
 def main() -> int:
     """Writes both pages."""
-    FOLDER.mkdir(exist_ok=True)
     for name, page in (("configuration.md", configuration_page()), ("commands.md", commands_page())):
         (FOLDER / name).write_text(page, encoding="utf-8")
     return 0

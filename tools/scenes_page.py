@@ -1,9 +1,5 @@
-"""docs/scenes.md and its pictures, from what `required_terms.py --store` measured; nothing is measured here.
+"""docs/scenes.md and its picture, from what `required_terms.py --store` measured; nothing is measured here."""
 
-scenes_page.py [--out docs]
-"""
-
-import argparse
 import sys
 from pathlib import Path
 
@@ -16,7 +12,7 @@ from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_
 from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked
 
-PICTURE = Path("images") / "scenes.png"
+DOCS, PICTURE = ROOT / "docs", Path("images") / "scenes.png"
 DRAWN_S, DRAWN_HZ = 12.0, 100
 COLOURS = 10
 "Of Matplotlib, which then begins with them anew."
@@ -24,12 +20,8 @@ COLOURS = 10
 
 def main() -> int:
     """Writes the page; 0."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of scenes.md and images/")
-    options = parser.parse_args()
-    (options.out / PICTURE).parent.mkdir(parents=True, exist_ok=True)
-    (options.out / "scenes.md").write_text(page(), encoding="utf-8")
-    draw_asked(options.out / PICTURE)
+    (DOCS / "scenes.md").write_text(page(), encoding="utf-8")
+    draw_asked(DOCS / PICTURE)
     return 0
 
 

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from functools import cache
 
 import msgpack
-import msgspec
 
 from fault_matrix.bad_lines import BadBus, BadSerialLine, whole
 from fault_matrix.cases import SERIAL, Injection
 from tormagd.assembly.build import Core, build_core
 from tormagd.assembly.conditions import is_homed
 from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
-from tormagd.config import Config, load_config
+from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.safety.operating_state import SafetyState
@@ -43,7 +42,8 @@ class Rig:
 
     def __init__(self, injection: Injection, plant: str, bus: str, injected_s: float) -> None:
         """The device's own fault begins at `injected_s`; `spoil` begins all others."""
-        self.config, core = _coronary()
+        core = _coronary()
+        self.config = core.config
         self.most_N = core.scene.force.most_N
         faults = [parse_fault(f"{fault}@{injected_s}") for fault in (injection.device or "").split()]
         device = VirtualDevice(load_plant(plant), SteadyHand(), faults, seed=1)
@@ -125,10 +125,9 @@ class Rig:
 
 
 @cache
-def _coronary() -> tuple[Config, Core]:
+def _coronary() -> Core:
     """A core keeps nothing of what it is stepped through: one does for every rig."""
-    config = msgspec.structs.replace(load_config(None), scene="coronary")
-    return config, build_core(config)
+    return build_core(Config(scene="coronary"))
 
 
 def asked_N(now_s: float) -> float:

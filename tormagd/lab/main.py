@@ -33,28 +33,22 @@ class Found(NamedTuple):
     exit_code: int = 0
 
 
-class Command(NamedTuple):
-    """The module of `tormagd.lab`, and what it does."""
-
-    module: str
-    summary: str
-
-
 COMMANDS = {
-    "reproduce-thesis": Command("thesis.reproduction", "the thesis's tables and figures beside ours"),
-    "tactile-experiment": Command("tactile.experiment", "chapter 4 on a simulated pad: models, the pulse, holds"),
-    "tactile-hold": Command("tactile.held", "a force held on the pad for an hour, in virtual time"),
-    "characterise": Command("characterisation.command", "shear modulus and relaxation from a record"),
-    "optimise-design": Command("design.command", "the brake's geometry for a task"),
-    "bound": Command("ideal_carriage", "what a device's ideal carriages miss of a force"),
-    "bench-sweep": Command("training.bench_sweep", "training data from the simulated device on a bench"),
-    "train-model": Command("training.train_model", "a model file from training data"),
-    "tactile-model": Command("tactile.shipped", "a model file of a simulated pad"),
-    "identify-motor": Command("motor.command", "a motor and its screw from a log"),
-    "tune-position": Command("tune_position", "the gains of the position loop for a motor"),
-    "wire-log": Command("wire_log", "a session between host and device as a CAN log"),
-    "fleet": Command("consoles.command", "what the recordings of many consoles say of each"),
+    "reproduce-thesis": ("thesis.reproduction", "the thesis's tables and figures beside ours"),
+    "tactile-experiment": ("tactile.experiment", "chapter 4 on a simulated pad: models, the pulse, holds"),
+    "tactile-hold": ("tactile.held", "a force held on the pad for an hour, in virtual time"),
+    "characterise": ("characterisation.command", "shear modulus and relaxation from a record"),
+    "optimise-design": ("design.command", "the brake's geometry for a task"),
+    "bound": ("ideal_carriage", "what a device's ideal carriages miss of a force"),
+    "bench-sweep": ("training.bench_sweep", "training data from the simulated device on a bench"),
+    "train-model": ("training.train_model", "a model file from training data"),
+    "tactile-model": ("tactile.shipped", "a model file of a simulated pad"),
+    "identify-motor": ("motor.command", "a motor and its screw from a log"),
+    "tune-position": ("tune_position", "the gains of the position loop for a motor"),
+    "wire-log": ("wire_log", "a session between host and device as a CAN log"),
+    "fleet": ("consoles.command", "what the recordings of many consoles say of each"),
 }
+"The module of `tormagd.lab` that each is, and what it does."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -65,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(name, given[1:])
     wanted = name in ("-h", "--help")
     head = ["usage: tormag-lab NAME [--help] ...", ""] if wanted else [f"tormag-lab: no command {name!r}. There are:"]
-    commands = (f"  {each:20}{command.summary}" for each, command in COMMANDS.items())
+    commands = (f"  {each:20}{summary}" for each, (_, summary) in COMMANDS.items())
     write_line("\n".join([*head, *commands]), sys.stdout if wanted else sys.stderr)
     return 0 if wanted else USAGE
 
@@ -73,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(name: str, arguments: Sequence[str]) -> int:
     """Runs one command and prints what it found."""
     try:
-        module = import_module(f"tormagd.lab.{COMMANDS[name].module}")
+        module = import_module(f"tormagd.lab.{COMMANDS[name][0]}")
         parser = argparse.ArgumentParser(
             prog=f"tormag-lab {name}", description=module.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
         )

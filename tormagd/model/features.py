@@ -11,7 +11,9 @@ from tormagd.physics.errors import DomainError
 
 FEATURES = ("displacement_mm", "rate_mm_s", "field_mT", "cip_percent")
 UNITS = {"displacement_mm": "mm", "rate_mm_s": "mm/s", "field_mT": "mT", "cip_percent": "%", "force_N": "N"}
+RATE: Final = FEATURES.index("rate_mm_s")
 FIELD: Final = FEATURES.index("field_mT")
+CIP: Final = FEATURES.index("cip_percent")
 
 LARGEST: Final = 1e9
 """Bound on every input and weight: no device comes near it, and the product of two does not overflow float32."""

@@ -125,12 +125,9 @@ class PhasePortrait:
         if low >= high:
             return 0.0
         ends = np.array([low, high])
-        required, rendered = region.rate_N_s(ends), offered.rate_N_s(ends)
-        first, last = rendered - required
-        forces = ends
-        if first * last < 0.0:
-            crossing = low + (high - low) * first / (first - last)
-            forces = np.array([low, crossing, high])
+        first, last = offered.rate_N_s(ends) - region.rate_N_s(ends)
+        crossing = low + (high - low) * first / (first - last) if first * last < 0.0 else low
+        forces = np.array([low, crossing, high])
         smaller = np.minimum(region.rate_N_s(forces), offered.rate_N_s(forces))
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 

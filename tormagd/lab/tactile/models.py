@@ -13,12 +13,11 @@ from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
 from tormagd.lab.training.metrics import force_metrics, leave_cycles_out, leave_one_out, not_rising_share, random_split
-from tormagd.model.features import FEATURES
+from tormagd.model.features import CIP
 from tormagd.model.model_file import ForceModel
 from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, RATES_MM_S, TOUCHING_MM, worked_pad
 
-CIP = FEATURES.index("cip_percent")
 SCORED_SLOPE_N_MT = 0.03
 """Where the force depends less on the field than this, a field says nothing: the force error counts there."""
 SPLIT_SEED = 1

@@ -31,11 +31,8 @@ TABLE_2_4_ERRORS = {
 "The two error columns: N and percent."
 TABLE_2_4_MEAN_PERCENT, TABLE_2_4_MAX_PERCENT = 10.2, 14.7
 
-CARDIOVASCULAR_RESOLUTION_N = 0.1
-"Required in the thesis; for the other tasks it states none: a tenth of the range is taken, about the JND of force."
-
 TABLE_2_5 = (
-    (ForceTask("cardiovascular", 0.0, 1.4, CARDIOVASCULAR_RESOLUTION_N), {"MRE-10-20": 7.0}),
+    (ForceTask("cardiovascular", 0.0, 1.4, 0.1), {"MRE-10-20": 7.0}),
     (ForceTask("brain", 0.0, 0.3, 0.03), {"MRE-10-10": 5.0}),
     (ForceTask("bronchoscopy", 0.0, 0.5, 0.05), {"MRE-10-10": 5.0}),
     (ForceTask("vitreoretinal", 0.0, 0.2, 0.02), {"MRE-10-10": 5.0}),
@@ -44,7 +41,8 @@ TABLE_2_5 = (
         {"MRE-30-30": 15.0, "MRE-50-30": 20.0, "MRE-50-40": 29.0},
     ),
 )
-"Tasks, and the inserts the thesis names for each with the resolution it states, mN."
+"""Tasks, and the inserts the thesis names for each with the resolution it states, mN. It requires one of 0.1 N for the
+first and none for the others: a tenth of the range is taken, about the JND of force."""
 
 FIGURE_2_5_N = (0.46, 5.4)
 "Least and most force at mu_r = 4, G0 = 277 kPa, read off the surfaces; an earlier prototype measured the second pair."

@@ -11,7 +11,7 @@ from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.levenberg_marquardt import Training, train
 from tormagd.lab.training.metrics import fit_metrics, not_rising_share, random_split
-from tormagd.model.features import FEATURES, Element, Scaling
+from tormagd.model.features import CIP, Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata, Ranges
 from tormagd.model.network import ForceNetwork, to_model
@@ -97,7 +97,7 @@ def fit_network(
 
 
 def _box(data: Dataset, name: str) -> Ranges:
-    is_own = data.features[:, FEATURES.index("cip_percent")] == 100.0 * insert(name).cip_fraction
+    is_own = data.features[:, CIP] == 100.0 * insert(name).cip_fraction
     if is_own.sum() < 2:
         raise DomainError("insert", name, "one that there are rows of, by cip_percent")
     return data.subset(is_own).ranges()

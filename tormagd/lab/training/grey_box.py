@@ -15,11 +15,10 @@ from scipy.optimize import least_squares
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.memory import records, relaxed_N
-from tormagd.model.features import FEATURES, FIELD
+from tormagd.model.features import FIELD, RATE
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.relaxation import PronySeries
 
-RATE = FEATURES.index("rate_mm_s")
 START_TIMES_S = (1.0, 10.0, 100.0, 1000.0)
 START_FRACTION = 0.03
 TIME_SPREAD = 3.0

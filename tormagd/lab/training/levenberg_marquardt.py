@@ -33,12 +33,11 @@ GREATEST_DAMPING = 1e10
 
 
 class Epoch(NamedTuple):
-    """One accepted step: root-mean-square errors after it, and the damping it was taken with."""
+    """One accepted step, and the root-mean-square errors after it."""
 
     epoch: int
     train_rmse_N: float
     validation_rmse_N: float
-    damping: float
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ def train(
     best_weights = weights
     error = _mean_square(network, inputs, targets)
     check_error = _mean_square(network, check_inputs, check_targets)
-    best = Epoch(0, to_N * math.sqrt(error), to_N * math.sqrt(check_error), INITIAL_DAMPING)
+    best = Epoch(0, to_N * math.sqrt(error), to_N * math.sqrt(check_error))
     reference = best.validation_rmse_N  # what the patience is measured against
     history: list[Epoch] = []
     waited = 0
@@ -119,7 +118,7 @@ def train(
             break
         weights, error = candidate, candidate_error
         check_error = _mean_square(network, check_inputs, check_targets)
-        step = Epoch(epoch, to_N * math.sqrt(error), to_N * math.sqrt(check_error), damping)
+        step = Epoch(epoch, to_N * math.sqrt(error), to_N * math.sqrt(check_error))
         damping = max(damping * DAMPING_DOWN, LEAST_DAMPING)
         history.append(step)
         if step.validation_rmse_N < best.validation_rmse_N:

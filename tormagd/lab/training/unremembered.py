@@ -19,10 +19,9 @@ from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.memory import records, times_of
 from tormagd.model.displacement import MOBILISED_MM
-from tormagd.model.features import FEATURES, FIELD
+from tormagd.model.features import CIP, FIELD
 from tormagd.model.memory import Memory
 
-DISPLACEMENT, RATE, CIP = (FEATURES.index(name) for name in ("displacement_mm", "rate_mm_s", "cip_percent"))
 START_TIMES_S = (10.0, 100.0, 1000.0)
 "Those of field-step tests."
 TIME_SPREADS = (3.0, 3.0, 1.01)
