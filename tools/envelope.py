@@ -32,7 +32,7 @@ from tqdm import tqdm
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array, Json, Mask
 from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
-from tormagd.lab.pages import stamp
+from tormagd.lab.pages import stamp, subplots
 from tormagd.lab.told import lines
 from tormagd.safety.codes import Limit
 
@@ -274,10 +274,7 @@ def row(case: Case, figures: Figures) -> Json:
 
 def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None:
     """Error over handle speed and asked force, once for the own sample and once for all the others."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 5), layout="constrained")
-    own, others = figure.subplots(1, 2, sharex=True, sharey=True)
+    figure, (own, others) = subplots((11.0, 5.0), 1, 2, sharex=True, sharey=True)
     for axes, title, is_own in ((own, "sample 1", True), (others, "samples 2, 3 and draws", False)):
         points = settled([(case, figures) for case, figures in found if (case.device == "sample_1") is is_own])
         speeds, forces, errors = np.array(points).T

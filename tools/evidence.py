@@ -99,11 +99,8 @@ PARTS = {
 def main(arguments: list[str] | None = None) -> int:
     """Runs the named parts, or all; returns 0 if all held, 1 if not, 2 on a wrong command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("part", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; default all")
+    parser.add_argument("part", nargs="*", choices=PARTS, metavar="PART", help=f"of {', '.join(PARTS)}; default all")
     options = parser.parse_args(arguments)
-    unknown = [name for name in options.part if name not in PARTS]
-    if unknown:
-        parser.error(f"{', '.join(unknown)}: allowed are {', '.join(PARTS)}")
     return collect({name: PARTS[name] for name in options.part or PARTS}, FOLDER)
 
 

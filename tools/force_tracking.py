@@ -73,14 +73,12 @@ def _sizes(found: object, name: str = "") -> Iterator[tuple[str, float]]:
 def main() -> int:
     """Measures and prints; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"any of {', '.join(CASES)}; default: all")
+    which = f"any of {', '.join(CASES)}; default: all"
+    parser.add_argument("cases", nargs="*", choices=CASES, metavar="CASE", help=which)
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()
-    unknown = [case for case in options.cases if case not in CASES]
-    if unknown:
-        parser.error(f"{unknown[0]}: allowed are {', '.join(CASES)}")
     result: Json = {}
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
         for case in options.cases or CASES:

@@ -4,10 +4,9 @@ import sys
 from pathlib import Path
 
 from benchmarks.scenes import core_without
-from matplotlib.figure import Figure
 from rendering.scene_runs import ROOT
 
-from tormagd.lab.pages import stamp, table
+from tormagd.lab.pages import stamp, subplots, table
 from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_first
 from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked
@@ -155,8 +154,7 @@ def _search(scenes: tuple[MeasuredScene, ...]) -> str:
 
 def draw_asked(path: Path) -> None:
     """What the scenes ask for over time."""
-    figure = Figure(figsize=(9.0, 4.5), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((9.0, 4.5))
     for number, name in enumerate(shipped_scenes()):
         stated = load_scene(name)
         if stated.signal is None:

@@ -3,12 +3,11 @@
 from pathlib import Path
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from rendering.following import Followed, Rehearsals, tracking
 from rendering.show import PULSE_START_S, Shown
 from tormagd.lab.arrays import Array
-from tormagd.lab.pages import stamp
+from tormagd.lab.pages import stamp, subplots
 from tormagd.scenes.scene import Scene
 
 ASKED, RENDERED, OTHER, QUIET = "#222222", "#d1495b", "#2a6f97", "#8d99ae"
@@ -18,8 +17,7 @@ CLOSE_UP_S = 4.0
 def show_picture(path: Path, scene: Scene, shown: Shown, rehearsals: Rehearsals, figures: list[str]) -> None:
     """Writes a PNG, stamped with these figures: the run, a close-up, the error, the samples, the hand that stops."""
     time_s, asked_N, rendered_N = shown.time_s, shown.asked_N, shown.rendered_N
-    figure = Figure(figsize=(13, 10.5), layout="constrained")
-    axes = figure.subplots(3, 2)
+    figure, axes = subplots((13.0, 10.5), 3, 2)
     figure.suptitle("A measured human pulse, rendered as friction force by the simulated device", fontsize=14)
     _forces(axes[0, 0], time_s, asked_N, rendered_N, "Real time, plant sample 1")
     axes[0, 0].axvspan(0.0, PULSE_START_S, color="#eef0f4", zorder=0)

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -22,6 +22,14 @@ def stamp(figures: object) -> dict[str, str | None]:
 def figures_of(page: str) -> list[str]:
     """The figures of a generated page: the rows of its tables, whatever else it says."""
     return [line for line in page.splitlines() if line.startswith("|")]
+
+
+def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Figure", Any]:
+    """A figure of that size, inches, and its axes."""
+    from matplotlib.figure import Figure  # not every installation draws
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(*grid, **options)
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:

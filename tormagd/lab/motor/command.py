@@ -22,6 +22,7 @@ from tormagd.lab.main import Found
 from tormagd.lab.motor.fit import THINNED_HZ, fit_volts
 from tormagd.lab.motor.identification import identify
 from tormagd.lab.motor.log import Log, read_log
+from tormagd.lab.pages import subplots
 
 VAGUE_SHARE = 0.5
 
@@ -81,13 +82,10 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
     """Measured against simulated voltage on the half that was not fitted."""
-    from matplotlib.figure import Figure
-
     half = len(log.t_s) // 2
     fitted = fit_volts(log.part(slice(None, half)))
     time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))
-    figure = Figure(figsize=(11, 6), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
+    figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
     above.plot(time_s, measured, color="#222222", label="measured")
     above.plot(time_s, predicted, color="#d1495b", linewidth=1.0, label="from the fit of the other half")
     above.legend(frameon=False, ncols=2)

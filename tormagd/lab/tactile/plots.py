@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from tormagd.lab.arrays import Array
+from tormagd.lab.pages import subplots
 from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT, Trained
 from tormagd.lab.training.dataset import Dataset
 from tormagd.model.features import FIELD
@@ -28,8 +29,7 @@ def _last_cycle(cycles: Dataset, cip_percent: float, field_mT: float) -> Dataset
 
 
 def _fit(trained: Trained) -> Figure:
-    figure = Figure(figsize=(11.0, 3.8), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure, axes = subplots((11.0, 3.8), 1, 3)
     axes[0].set_ylabel("force, N")
     figure.suptitle("Data and network at 1 mm/s (synthetic; like figures 4.3 and 4.4)")
     cycles = trained.cycles.data
@@ -49,8 +49,7 @@ def _fit(trained: Trained) -> Figure:
 
 def _pulse(traces: dict[str, Array]) -> Figure:
     time_s = traces["time_s"]
-    figure = Figure(figsize=(11, 9), layout="constrained")
-    inputs, fields, errors = figure.subplots(3, 1, sharex=True)
+    figure, (inputs, fields, errors) = subplots((11.0, 9.0), 3, 1, sharex=True)
     inputs.plot(time_s, traces["force_N"], color="C3", lw=1, label="force, N")
     inputs.set(ylabel="force, N", title="What the searches are given (like figure 4.6; synthetic)")
     beside = inputs.twinx()

@@ -1,11 +1,9 @@
 """docs/reproduction.md, from the figures of `reproduction`."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from tormagd.lab.arrays import Json
-from tormagd.lab.pages import percent, table, write_page
-from tormagd.lab.thesis.step_test import StepTest
+from tormagd.lab.pages import percent, table
 from tormagd.lab.thesis.table_2_5 import COLUMNS, readings
 from tormagd.lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT, TABLE_4_1
 
@@ -17,13 +15,6 @@ WAYS = {
     "relaxation_aware_noisy": "with relaxation, force with noise",
 }
 "The ways from a force to a field."
-
-
-def write(folder: Path, result: Json, tests: list[StepTest]) -> None:
-    """Writes reproduction.md into `folder`, and its pictures into a folder of that name."""
-    from tormagd.lab.thesis.plots import pictures
-
-    write_page(folder / "reproduction.md", sections(result), folder / "reproduction", pictures(result, tests))
 
 
 def sections(result: Json) -> Iterator[str]:

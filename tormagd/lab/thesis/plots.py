@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.optimisation import Design, Problem
 from tormagd.lab.design.phase_portrait import Region
+from tormagd.lab.pages import subplots
 from tormagd.lab.thesis.page import best_start
 from tormagd.lab.thesis.step_test import StepTest
 from tormagd.lab.thesis.values import AS_BUILT, USE_CASES
@@ -27,13 +28,8 @@ def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
     }
 
 
-def _subplots(size: tuple[float, float], *grid: int) -> tuple[Figure, Any]:
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(*grid)
-
-
 def _table_2_4(table: Json) -> Figure:
-    figure, axes = _subplots((9.5, 4.2))
+    figure, axes = subplots((9.5, 4.2))
     rows = table["rows"]
     place = np.arange(len(rows))
     bars = (
@@ -68,7 +64,7 @@ def _figure_2_5(data: Json) -> Figure:
 
 
 def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
-    figure, (axes, ranges) = _subplots((12.0, 4.2), 1, 2)
+    figure, (axes, ranges) = subplots((12.0, 4.2), 1, 2)
     for test, row, colour in zip(tests, data["rows"], (OURS, FREE, THESIS), strict=True):
         axes.plot(test.time_s, test.force_N, color=colour, linewidth=0.9, label=f"{test.insert}, simulated device")
         for index, force in enumerate(row["analytic_N"]):
@@ -99,7 +95,7 @@ def _force_ranges(axes: Axes, rows: list[Json]) -> None:
 
 
 def _figure_3_2(table: Json) -> Figure:
-    figure, axes = _subplots((9.5, 4.0), 1, 2)
+    figure, axes = subplots((9.5, 4.0), 1, 2)
     speeds = (table["gap_speed_mm_s"]["true_thesis_speed"], table["gap_speed_mm_s"]["true"])
     for axis, (number, case) in zip(axes, USE_CASES.items(), strict=True):
         _region(axis, case.region)
@@ -110,7 +106,7 @@ def _figure_3_2(table: Json) -> Figure:
 
 
 def _figure_3_4(table: Json) -> Figure:
-    figure, axes = _subplots((9.5, 7.6), 2, 2)
+    figure, axes = subplots((9.5, 7.6), 2, 2)
     for row, (number, case) in zip(axes, USE_CASES.items(), strict=True):
         for axis, objective in zip(row, ("true_thesis_speed", "true"), strict=True):
             speed = table["gap_speed_mm_s"][objective]

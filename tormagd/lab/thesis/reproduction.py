@@ -19,6 +19,7 @@ from tormagd.lab.design.range_fit import RangeFit, fit_exponent, fit_friction, l
 from tormagd.lab.design.sweep import sweep
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.main import Found
+from tormagd.lab.pages import write_page
 from tormagd.lab.thesis import page
 from tormagd.lab.thesis.errata import errata, table_2_4_errors
 from tormagd.lab.thesis.step_test import StepTest, step_test
@@ -81,7 +82,10 @@ def run(options: argparse.Namespace) -> Found:
         "errata": errata(),
     }
     if options.out is not None:
-        page.write(options.out, result, tests)
+        from tormagd.lab.thesis.plots import pictures
+
+        folder = options.out / "reproduction"
+        write_page(options.out / "reproduction.md", page.sections(result), folder, pictures(result, tests))
     return Found(result, page.sections(result))
 
 
