@@ -93,5 +93,4 @@ def brake_N(plant: PlantParameters, rates_mm_s: Array, gaps_mm: Array) -> Array:
     law = Elastomer(elastomer.shear_modulus_kPa * 1e3, elastomer.relative_permeability, elastomer.kinetic_friction)
     stribeck = (friction.static_to_kinetic - 1.0) * np.exp(-np.square(rates / friction.stribeck_speed_mm_s))
     kinetic_N = brake_force_N(radial_moment_Tm(gaps_mm, plant), law, TORMAG)
-    found: Array = kinetic_N * (1.0 + stribeck) + friction.viscous_N_s_mm * rates
-    return found
+    return kinetic_N * (1.0 + stribeck) + friction.viscous_N_s_mm * rates

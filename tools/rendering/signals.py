@@ -89,8 +89,7 @@ def palpation(seed: int) -> Signal:
 
 
 def _rising(since_s: Array) -> Array:
-    rising: Array = 0.5 - 0.5 * np.cos(np.pi * np.clip(since_s / RISE_S, 0.0, 1.0))
-    return rising
+    return 0.5 - 0.5 * np.cos(np.pi * np.clip(since_s / RISE_S, 0.0, 1.0))
 
 
 def _pulse(path: Path, what: str) -> Signal:

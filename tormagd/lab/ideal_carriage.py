@@ -255,8 +255,7 @@ class Asked(NamedTuple):
         """The force along a way of the gap that begins with it open."""
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)
-        rendered: Array = self.scale * (fresh_N - self.relaxed_N) + self.offset_N
-        return rendered
+        return self.scale * (fresh_N - self.relaxed_N) + self.offset_N
 
 
 class Bound(NamedTuple):

@@ -45,8 +45,7 @@ def cauchy_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressur
     # I1 - lambda_i^2 is the sum of the two other squares
     elastic = 2.0 * square * (material.c10_Pa + material.c01_Pa * (np.roll(square, 1) + np.roll(square, 2)))
     maxwell = np.outer(flux_T, flux_T) / (MU0_H_M * material.relative_permeability)
-    total: Array = np.diag(elastic - pressure_Pa) + maxwell
-    return total
+    return np.diag(elastic - pressure_Pa) + maxwell
 
 
 def nominal_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressure_Pa: float) -> Array:

@@ -39,8 +39,7 @@ _STARTS = 4
 def thesis_shape(stretch: FloatArray, exponent: float) -> FloatArray:
     """Eq. 3 over mu, the true stress of Ogden's law. By expm1 it loses no digits towards lambda = 1."""
     log = np.log(stretch)
-    shape: FloatArray = 2.0 / exponent * np.exp(-0.5 * exponent * log) * np.expm1(1.5 * exponent * log)
-    return shape
+    return 2.0 / exponent * np.exp(-0.5 * exponent * log) * np.expm1(1.5 * exponent * log)
 
 
 def ogden_shape(stretch: FloatArray, exponent: float) -> FloatArray:

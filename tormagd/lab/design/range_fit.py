@@ -7,7 +7,7 @@ weighted median, found exactly; a least-squares fit answers another question.
 The one further parameter is the exponent n of the field's growth with permeability, b ~ (mu_r / 4)^n, 1 in the thesis.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
     return most_N - brake_force_N(scale * field.radial_moment_Tm(OPEN_MM), elastomer, TORMAG)
 
 
-def fit_friction(inserts: Iterable[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
+def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
     """The friction per matrix with the least mean relative error."""
     ratios: dict[int, list[float]] = {}
     for item in inserts:
@@ -56,35 +56,33 @@ def fit_friction(inserts: Iterable[Insert], field: FieldLaw, exponent: float = 1
     return RangeFit(field, {shore: _friction(values) for shore, values in ratios.items()}, exponent)
 
 
-def fit_exponent(inserts: Iterable[Insert], field: FieldLaw) -> RangeFit:
+def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
     """As `fit_friction`, with the exponent free, to 1e-4 in the exponent.
 
     The mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point.
     """
-    known = tuple(inserts)
     low, high = MIN_EXPONENT, MAX_EXPONENT
     while True:
         exponents = np.linspace(low, high, _GRID)
-        fits = [fit_friction(known, field, float(exponent)) for exponent in exponents]
-        best = min(fits, key=lambda fit: mean_relative_error(fit, known))
+        fits = [fit_friction(inserts, field, float(exponent)) for exponent in exponents]
+        best = min(fits, key=lambda fit: mean_relative_error(fit, inserts))
         step = float(exponents[1] - exponents[0])
         if step < 1e-4:
             return best
         low, high = max(MIN_EXPONENT, best.exponent - step), min(MAX_EXPONENT, best.exponent + step)
 
 
-def mean_relative_error(fit: RangeFit, inserts: Iterable[Insert]) -> float:
+def mean_relative_error(fit: RangeFit, inserts: Sequence[Insert]) -> float:
     """Mean over the inserts of `RangeFit.relative_error`."""
     return float(np.mean([fit.relative_error(item) for item in inserts]))
 
 
-def leave_one_out(inserts: Iterable[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
+def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
     """Relative error of each insert under the fit to all the others, by name."""
-    known = tuple(inserts)
     fit = fit_exponent if free_exponent else fit_friction
     return {
-        left_out.name: fit([item for item in known if item is not left_out], field).relative_error(left_out)
-        for left_out in known
+        left_out.name: fit([item for item in inserts if item is not left_out], field).relative_error(left_out)
+        for left_out in inserts
     }
 
 

@@ -100,5 +100,4 @@ def _missed(row: Json, task: Json) -> str:
 def _narrowest(task: Json) -> str:
     """The insert with the least range among those that match: whose force changes least in a gap step."""
     matching = [row for row in task["ranked"] if row["matched_share"] == 1.0]
-    narrowest: str = min(matching, key=lambda row: row["measured_range_N"], default={"insert": "none"})["insert"]
-    return narrowest
+    return min(matching, key=lambda row: row["measured_range_N"], default={"insert": "none"})["insert"]

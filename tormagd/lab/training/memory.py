@@ -1,7 +1,6 @@
 """The memory of recorded data: what a Prony series makes of a force without memory, along records of any spacing."""
 
 import itertools
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,11 +10,10 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
 
 
-def records(data: Dataset) -> Iterator[slice]:
+def records(data: Dataset) -> list[slice]:
     """The rows of each record: a new one begins wherever time goes back. Raises `DomainError` without `time_s`."""
     starts = [0, *(np.flatnonzero(np.diff(times_of(data)) < 0) + 1).tolist(), len(data)]
-    for first, last in itertools.pairwise(starts):
-        yield slice(first, last)
+    return [slice(first, last) for first, last in itertools.pairwise(starts)]
 
 
 def times_of(data: Dataset) -> Array:
