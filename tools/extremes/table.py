@@ -140,11 +140,6 @@ def measured(draw: Draw) -> Measured:
     )
 
 
-def reading(draw: Draw) -> Measurement:
-    """A measurement as the border lets it pass."""
-    return measurement(usual(draw.now_s)).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
-
-
 def setpoint(draw: Draw) -> TimedSetpoint:
     """A force of about 1.2 N, in a third of the steps with a preview."""
     preview = tuple([draw(1.2) for _ in range(8)]) if draw.steps % 3 == 0 else ()
@@ -366,8 +361,9 @@ def carriages() -> Carriages:
 
 
 def driving(stage: Carriages, draw: Draw) -> object:
-    seen, dt_s = measured(draw), elapsed_s(draw)
-    drive = stage.update(draw.now_s, dt_s, plan(draw), reading(draw), seen, False)
+    seen, dt_s, planned = measured(draw), elapsed_s(draw), plan(draw)
+    reading = measurement(usual(draw.now_s)).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
+    drive = stage.update(draw.now_s, dt_s, planned, reading, seen, False)
     return [drive, stage.reference, stage.expected]
 
 

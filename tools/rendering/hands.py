@@ -23,11 +23,9 @@ class WaitingHand:
 
     def begin(self, legs: Legs, start_s: float) -> None:
         """Goes along them from `start_s` on, and stands after the last."""
-        times_s, places_mm = [start_s], [0.0]
-        for lasts_s, speed_mm_s in legs:
-            times_s.append(times_s[-1] + lasts_s)
-            places_mm.append(places_mm[-1] + lasts_s * speed_mm_s)
-        self._goes = RecordedHand(tuple(times_s), tuple(places_mm))
+        times_s = np.cumsum([start_s, *(lasts_s for lasts_s, _ in legs)])
+        places_mm = np.cumsum([0.0, *(lasts_s * speed_mm_s for lasts_s, speed_mm_s in legs)])
+        self._goes = RecordedHand(tuple(times_s.tolist()), tuple(places_mm.tolist()))
 
     def position_mm(self, time_s: float) -> float:
         """Of the roller's surface."""

@@ -29,7 +29,7 @@ from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, scene_path
 from tormagd.scenes.signal import asked
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
-from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
+from tormagd.simulation.parameters import load_plant, with_insert
 from tormagd.toml_file import convert
 
 ROOT = Path(__file__).parents[2]
@@ -149,7 +149,10 @@ class Play:
         self._learns = case.is_learning
         finger = scene.finger
         hand = swinging(scene.handle) if finger is msgspec.UNSET else PressingHand(finger.depth_mm)
-        self._loop = armed(self.core, plant_of(scene, case.plant), hand)
+        # a pad is on the sample's carriages
+        is_pad, pad = scene.element == "tactile", case.plant.replace("sample", "pad")
+        plant = load_plant(pad) if is_pad else with_insert(load_plant(case.plant), scene.insert.name)
+        self._loop = armed(self.core, plant, hand)
         self.time_s, self.force_N = signal_of(self.core, case.scene, LEARN_S + case.seconds, case.inference_hz)
         approach_s = APPROACH_S
         if finger is not msgspec.UNSET:
@@ -204,13 +207,6 @@ def signal_of(core: Core, scene_name: str, longest_s: float, rate_hz: int) -> tu
         force_N = np.tile(force_N, math.ceil(longest_s * rate_hz / len(force_N)))[: round(longest_s * rate_hz)]
         time_s = np.arange(len(force_N)) / rate_hz
     return time_s, force_N
-
-
-def plant_of(scene: Scene, sample: str) -> PlantParameters:
-    """The sample with the scene's insert in it, or the pad on the sample's carriages."""
-    if scene.element == "tactile":
-        return load_plant(sample.replace("sample", "pad"))
-    return with_insert(load_plant(sample), scene.insert.name)
 
 
 def run_all(cases: Collection[Case], executor: Executor, known: dict[Case, float]) -> dict[Case, float]:

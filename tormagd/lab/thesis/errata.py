@@ -66,7 +66,11 @@ def _chapter_2() -> list[Row]:
     gaps = np.linspace(CLOSED_MM, OPEN_MM, 101)
     apart = np.max(np.abs(power.radial_moment_Tm(gaps) / eq7.radial_moment_Tm(gaps) - 1.0))
     soft, strong = INSERTS["MRE-10-10"], INSERTS["MRE-10-40"]
-    soft_range_N, strong_range_N = (_range_with_constant_b(item.elastomer) for item in (soft, strong))
+    # the force law scales the moment with mu_r / 4; undone here
+    undone = (PowerFieldLaw(coefficient=0.44 * 4.0 / item.elastomer.relative_permeability) for item in (soft, strong))
+    soft_range_N, strong_range_N = (
+        Brake.as_built(item.elastomer, law).range_N for item, law in zip((soft, strong), undone, strict=True)
+    )
     wrong = table_2_4_errors()
     ranges = [item.force_range for item in INSERTS.values()]
     errors_N = [abs(entry.thesis_estimate_N - entry.measured_N) for entry in ranges]
@@ -281,12 +285,6 @@ def _literal_stretch(moment_Tm: float, *, appendix: bool = False) -> float:
     gamma_2 = -over / inner**2 - weight * over * (mu_r - 1.0) * d
     root = (gamma_1 - 4.0 * g0) ** 2 - 8.0 * g0 * (gamma_1 + gamma_2)
     return (8.0 * g0 - gamma_1 - math.sqrt(root)) / (4.0 * g0) if root >= 0.0 else math.nan
-
-
-def _range_with_constant_b(elastomer: Elastomer) -> float:
-    # the force law scales the moment with mu_r / 4; undone here
-    law = PowerFieldLaw(coefficient=0.44 * 4.0 / elastomer.relative_permeability)
-    return Brake.as_built(elastomer, law).range_N
 
 
 def _inside(design: Design, low: Design, high: Design) -> bool:

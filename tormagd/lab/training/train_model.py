@@ -15,7 +15,7 @@ from tormagd.lab.training.fitting import fit_model
 from tormagd.lab.training.levenberg_marquardt import Training
 from tormagd.lab.training.unremembered import identify
 from tormagd.model.features import Element
-from tormagd.model.memory import NO_MEMORY, Memory
+from tormagd.model.memory import NO_MEMORY
 from tormagd.model.model_file import ForceModel, save_model
 from tormagd.output import write_line
 from tormagd.physics.errors import DomainError
@@ -59,7 +59,10 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
     data_sha256, memory = data.sha256(), NO_MEMORY
     if options.without_memory:
         memory, data = identify(data)
-        write_line(memory_line(memory), sys.stderr)
+        terms = zip(memory.fractions, memory.times_s, strict=True)
+        relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
+        told = f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
+        write_line(told, sys.stderr)
     model, training = fit_model(
         *data.split(options.validation_share, options.seed),
         element=options.element,
@@ -76,10 +79,3 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
     if options.rising and share > 0.0:
         raise DomainError("not_rising_share", share, "0: train with other hidden units, another seed or more data")
     return model, training
-
-
-def memory_line(memory: Memory) -> str:
-    """What was identified, for a person."""
-    terms = zip(memory.fractions, memory.times_s, strict=True)
-    relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
-    return f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
