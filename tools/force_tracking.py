@@ -73,8 +73,7 @@ def _sizes(found: object, name: str = "") -> Iterator[tuple[str, float]]:
 def main() -> int:
     """Measures and prints; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    which = f"any of {', '.join(CASES)}; default: all"
-    parser.add_argument("cases", nargs="*", choices=CASES, metavar="CASE", help=which)
+    parser.add_argument("cases", nargs="*", choices=CASES, help="default: all")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")

@@ -124,12 +124,9 @@ class BadBus(_Spoilt[CanDevice]):
 
     def __init__(self, device: CanDevice) -> None:
         super().__init__(device)
-        self._foreign_frames_ms = 0.0
+        self.foreign_frames_ms = 0.0
+        "So many another node sends a millisecond, and wins every arbitration."
         self._owed = 0.0
-
-    def fill(self, frames_ms: float) -> None:
-        """Another node sends so many frames a millisecond from now on, and wins every arbitration."""
-        self._foreign_frames_ms = frames_ms
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
         for unit in self._down(now_s, [_unit(frame)]):
@@ -139,7 +136,7 @@ class BadBus(_Spoilt[CanDevice]):
         for unit in self._down(now_s, []):
             self._device.receive(now_s, _frame(unit))
         delivered = self._device.transmit(now_s)
-        self._owed += self._foreign_frames_ms  # called once a millisecond
+        self._owed += self.foreign_frames_ms  # called once a millisecond
         while self._owed >= 1.0:
             self._owed -= 1.0
             self._device.receive(now_s, FOREIGN, FOREIGN_HOST)

@@ -101,7 +101,7 @@ class Rig:
         if injection.way is not None:
             self.line.spoil(injection.way)
         if isinstance(self.line, BadBus):
-            self.line.fill(injection.fill_frames_ms)
+            self.line.foreign_frames_ms = injection.fill_frames_ms
         plant = self.loop.simulated.plant
         if injection.sensor is not None:
             plant.force_sensor = BadSensor(plant.force_sensor, injection.sensor)
@@ -115,7 +115,7 @@ class Rig:
         """All that is wrong is put right now; what came of it stays."""
         self.line.spoil(whole)
         if isinstance(self.line, BadBus):
-            self.line.fill(0.0)
+            self.line.foreign_frames_ms = 0.0
         plant = self.loop.simulated.plant
         if isinstance(plant.force_sensor, BadSensor):
             plant.force_sensor = plant.force_sensor.mended

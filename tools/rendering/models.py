@@ -1,6 +1,5 @@
 """How near the shipped models are to devices: the brake's force over gaps and handle speeds, friction mobilised."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -60,12 +59,15 @@ def models_table(result: Json) -> str:
     return table(columns, (_cells(row) for row in result["rows"]))
 
 
-def _cells(row: Json) -> Iterator[str]:
-    yield from (row["insert"], f"{row['full_N']:.2f}", f"`{row['model']}`")
-    own = row["sample_1"]
-    yield f"{1e3 * own['mean_N']:.0f}, {1e3 * own['worst_N']:.0f}"
-    for key in ("mean_N", "worst_N", "bias_N"):
-        yield f"{1e3 * row[key]:.0f} ({100.0 * row[key] / row['full_N']:.1f}%)"
+def _cells(row: Json) -> list[str]:
+    own, full_N = row["sample_1"], row["full_N"]
+    return [
+        row["insert"],
+        f"{full_N:.2f}",
+        f"`{row['model']}`",
+        f"{1e3 * own['mean_N']:.0f}, {1e3 * own['worst_N']:.0f}",
+        *(f"{1e3 * row[key]:.0f} ({100.0 * row[key] / full_N:.1f}%)" for key in ("mean_N", "worst_N", "bias_N")),
+    ]
 
 
 def errors(

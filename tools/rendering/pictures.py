@@ -81,7 +81,6 @@ def _reversals(axes: Axes, moving: Followed) -> None:
 
 def _dress(axes: Axes, title: str, quantity: str, horizontal: str = "time, s") -> None:
     axes.set_title(title, loc="left", fontsize=10.5)
-    axes.set_ylabel(quantity)
-    axes.set_xlabel(horizontal)
+    axes.set(xlabel=horizontal, ylabel=quantity)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", alpha=0.25)

@@ -61,8 +61,7 @@ def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float
 
 def pulse_signal(duration_s: float) -> Signal:
     """The demonstration's pulse."""
-    low_N, high_N = PULSE_N
-    return Signal("pulse", f"{low_N}..{high_N} N", *pulse_profile(duration_s, low_N, high_N, RATE_HZ))
+    return Signal("pulse", f"{PULSE_N[0]}..{PULSE_N[1]} N", *pulse_profile(duration_s, *PULSE_N, RATE_HZ))
 
 
 def recorded_signals() -> list[Signal]:
@@ -103,8 +102,7 @@ def _pulse(path: Path, what: str) -> Signal:
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1.0 / period_s, output="sos"), values)
     time_s = np.arange(round(PULSE_S * RATE_HZ)) / RATE_HZ
     part = np.interp(time_s, np.arange(len(smooth)) * period_s, smooth)
-    low_N, high_N = PULSE_N
-    told = f"least..most to {low_N}..{high_N} N, {LOW_PASS_HZ:g} Hz"
+    told = f"least..most to {PULSE_N[0]}..{PULSE_N[1]} N, {LOW_PASS_HZ:g} Hz"
     return Signal(f"{what} {path.stem}", told, time_s, scaled(part, *PULSE_N), kind=Kind.PULSE)
 
 
