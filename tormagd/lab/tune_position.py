@@ -26,7 +26,6 @@ FILTER_TIMES_S = (0.002, 0.003, 0.004)
 INTEGRAL_TIMES_S = (0.1, 0.15, 0.2, 0.4)
 "A shorter integral time than 0.1 s fights stiction: the carriages begin to hunt by a count."
 LARGEST_GAIN_PER_MM = 20.0
-DIGITS = 2
 CORNER = 0.3
 CORNER_PARAMETERS = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
 PERIOD_CORNERS = (0.8, 1.0, 1.2)
@@ -90,7 +89,7 @@ def search(config: Config) -> list[Tuning]:
         while high - low > 0.02:
             middle = (low + high) / 2.0
             low, high = (middle, high) if robust(config, position, middle) else (low, middle)
-        gain = math.floor(low * 10 ** (DIGITS - 1)) / 10 ** (DIGITS - 1)
+        gain = math.floor(low * 10) / 10
         if gain > 0.0 and (kept := robust(config, position, gain)):
             found.append(Tuning(gain, integral_s, derivative_s, filter_s, *kept))
     return found

@@ -12,7 +12,7 @@ import numpy as np
 
 from tormagd.config import Position
 from tormagd.lab import executors
-from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage_as_made
+from tormagd.lab.design.optimisation import Design, Problem, Run, coverage_as_made
 from tormagd.lab.design.phase_portrait import Region
 from tormagd.lab.design.sweep import sweep
 from tormagd.lab.main import Found
@@ -23,8 +23,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab optimise-design`."""
     task = parser.add_mutually_exclusive_group(required=True)
     task.add_argument("--use-case", type=int, choices=USE_CASES, help="one of the thesis's, with its five starts")
-    names = ("LEAST_N", "LEAST_RATE", "MOST_N", "MOST_RATE")
-    task.add_argument("--region", type=float, nargs=4, metavar=names, help="required forces, N, and rates, N/s")
+    task.add_argument(
+        "--region",
+        type=float,
+        nargs=4,
+        metavar=("LEAST_N", "LEAST_RATE", "MOST_N", "MOST_RATE"),
+        help="required forces, N, and rates, N/s",
+    )
     parser.add_argument("--measure", choices=("true", "trapezoid", "corners"), default="true")
     parser.add_argument("--solver", choices=("global", "local"), default="global")
     parser.add_argument(
@@ -41,11 +46,12 @@ def run(options: argparse.Namespace) -> Found:
     """The optima, best first. Raises DomainError, OSError."""
     with executors.chosen(options) as executor:
         outcomes = sweep(_runs(options), executor, options.state)
-    ranked = sorted(outcomes.items(), key=lambda item: _merit(options.measure, item[1]))
+    by_cost = options.measure == "corners"
     rows = [
         msgspec.to_builtins(each) | {"coverage_as_made": coverage_as_made(run.problem, each.design, 0.01 * options.off)}
-        for run, each in ranked
+        for run, each in outcomes.items()
     ]
+    rows.sort(key=lambda row: (row["corner_cost"] if by_cost else -row["coverage"], row["volume_mm3"]))
     return Found({"outcomes": rows})
 
 
@@ -59,7 +65,3 @@ def _runs(options: argparse.Namespace) -> list[Run]:
     else:
         starts = [line.start for line in USE_CASES[options.use_case].starts]
     return [Run(problem, start, options.solver, options.seed) for start in starts]
-
-
-def _merit(measure: str, outcome: Outcome) -> tuple[float, float]:
-    return (outcome.corner_cost if measure == "corners" else -outcome.coverage), outcome.volume_mm3

@@ -202,23 +202,10 @@ class _Search:
         volume = self.problem.volume_mm3(self.design(x)) / self.problem.volume_mm3(self.problem.upper)
         return volume + _GAP_WEIGHT * float(x[2])
 
-    def global_minimum(self, cost: Callable[[Array], float], start: Array, seed: int) -> Array:
-        found = self._evolve(cost, start, seed, [self._margin])
-        return self._refine(cost, found, [self._margin])
-
-    def local_minimum(self, cost: Callable[[Array], float], start: Array) -> Array:
-        margin = {"type": "ineq", "fun": self._margin.fun}
-        result = minimize(cost, start, method="SLSQP", bounds=self._bounds, constraints=[margin])
-        return _better(cost, start, result)
-
-    def smallest(self, best: Array, seed: int) -> Array:
-        """The smallest among the designs that cover as much as `best`, less the slack."""
-        allowed = self.miss(best) + SLACK
-        limits = [NonlinearConstraint(self.miss, -np.inf, allowed), self._margin]
-        found = self._refine(self.size, self._evolve(self.size, best, seed, limits), limits)
-        return found if self.miss(found) <= allowed else best
-
-    def _evolve(self, cost: Callable[[Array], float], start: Array, seed: int, limits: list[Any]) -> Array:
+    def global_minimum(
+        self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
+    ) -> Array:
+        limits = [*also, self._margin]
         result = differential_evolution(
             cost,
             self._bounds,
@@ -231,7 +218,18 @@ class _Search:
             atol=1e-9,
             polish=False,
         )
-        return np.asarray(result.x)
+        return self._refine(cost, np.asarray(result.x), limits)
+
+    def local_minimum(self, cost: Callable[[Array], float], start: Array) -> Array:
+        margin = {"type": "ineq", "fun": self._margin.fun}
+        result = minimize(cost, start, method="SLSQP", bounds=self._bounds, constraints=[margin])
+        return _better(cost, start, result)
+
+    def smallest(self, best: Array, seed: int) -> Array:
+        """The smallest among the designs that cover as much as `best`, less the slack."""
+        allowed = self.miss(best) + SLACK
+        found = self.global_minimum(self.size, best, seed, NonlinearConstraint(self.miss, -np.inf, allowed))
+        return found if self.miss(found) <= allowed else best
 
     def _refine(self, cost: Callable[[Array], float], start: Array, limits: list[Any]) -> Array:
         options = {"initial_tr_radius": 0.05, "final_tr_radius": 1e-5, "maxfev": 100}

@@ -37,10 +37,8 @@ class Region(msgspec.Struct, frozen=True):
     most_rate_N_s: float
 
     def __post_init__(self) -> None:
-        for name in ("least_N", "most_N"):
-            require(name, float(getattr(self, name)), 0.0, MAX_FORCE_N)
-        for name in ("least_rate_N_s", "most_rate_N_s"):
-            require(name, float(getattr(self, name)), 0.0, MAX_RATE_N_S)
+        for name in self.__struct_fields__:
+            require(name, float(getattr(self, name)), 0.0, MAX_RATE_N_S if name.endswith("_s") else MAX_FORCE_N)
         if not self.least_N < self.most_N:
             raise DomainError("most_N", self.most_N, f"above least_N, {self.least_N:g}")
         if not self.least_rate_N_s + self.most_rate_N_s > 0.0:

@@ -37,11 +37,6 @@ class Verdict:
     """Gap at which the least force is low enough; NaN where the field law says nothing of such a gap."""
     reasons: tuple[str, ...]
 
-    @property
-    def serves(self) -> bool:
-        """Whether the insert does all that the task asks."""
-        return not self.reasons
-
 
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
     """One insert before a task, where the gap is placed in steps of `gap_resolution_mm`.
@@ -72,7 +67,7 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
 def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
     """All inserts, best first: those that serve by the finest resolution, then the others by the share they serve."""
     verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
-    return sorted(verdicts, key=lambda v: (not v.serves, -v.served_share if v.reasons else 0.0, v.resolution_N))
+    return sorted(verdicts, key=lambda v: (bool(v.reasons), -v.served_share if v.reasons else 0.0, v.resolution_N))
 
 
 def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:

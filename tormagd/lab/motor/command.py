@@ -90,9 +90,11 @@ def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
     above.plot(time_s, predicted, color="#d1495b", linewidth=1.0, label="from the fit of the other half")
     above.legend(frameon=False, ncols=2)
     above.set_ylabel("input, V")
-    error = result["holdout_voltage_nrmse"]
-    above.set_title(f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {error:.1%}; gaps where it stands", loc="left")
+    above.set_title(
+        f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {result['holdout_voltage_nrmse']:.1%}; gaps where it "
+        "stands",
+        loc="left",
+    )
     below.plot(time_s, measured - predicted, color="#2a6f97", linewidth=0.8)
-    below.set_ylabel("difference, V")
-    below.set_xlabel("time, s")
+    below.set(xlabel="time, s", ylabel="difference, V")
     figure.savefig(path, dpi=110)

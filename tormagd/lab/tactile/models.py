@@ -90,8 +90,12 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
         for part, mask in (("train", of_class & ~held), ("test", of_class & held)):
             scores = force_metrics(predicted[mask], data.force_N[mask], span_N)
             deviation = float(np.abs(predicted - data.force_N)[mask].std())
-            row[part] = {"mae_N": scores["mae_N"], "sd_N": deviation, "mae_percent": scores["mae_percent"]}
-            row[part]["r2"] = scores["r2"]
+            row[part] = {
+                "mae_N": scores["mae_N"],
+                "sd_N": deviation,
+                "mae_percent": scores["mae_percent"],
+                "r2": scores["r2"],
+            }
         rows.append(row)
     noise_N = float(np.abs(data.force_N - trained.cycles.true_force_N)[held].mean())
     thinned = data.subset(np.arange(0, len(data), effort.thin))

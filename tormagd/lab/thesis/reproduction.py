@@ -339,18 +339,27 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
     corners: list[Json] = []
     for key, run in runs.items():
         use_case, start, objective, solver = key
-        row = {"use_case": use_case, "start": start, "objective": objective, **_outcome(outcomes[run])}
+        outcome = outcomes[run]
+        row: Json = {
+            "use_case": use_case,
+            "start": start,
+            "objective": objective,
+            "design": _design(outcome.design),
+            "coverage": outcome.coverage,
+            "corner_cost": outcome.corner_cost,
+            "volume_cm3": 1e-3 * outcome.volume_mm3,
+            "seconds": outcome.seconds,
+        }
         if objective == "corners":
             corners.append({**row, "solver": solver})
         else:
             (starts if solver == "global" else local).append(row)
     designs = []
     for number, case in USE_CASES.items():
-        named = [("as built", AS_BUILT, case.initial_percent)]
-        named += [
-            (f"thesis, start {index}", line.thesis, line.thesis_percent) for index, line in enumerate(case.starts, 1)
+        found = [
+            (f"thesis, start {index}", each.thesis, each.thesis_percent) for index, each in enumerate(case.starts, 1)
         ]
-        for name, design, percent in named:
+        for name, design, percent in (("as built", AS_BUILT, case.initial_percent), *found):
             reached = {
                 objective: coverage(problem, design)
                 for objective, problem in _problems(number, gap_speed_mm_s).items()
@@ -360,8 +369,8 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
                 {"use_case": number, "name": name, "design": _design(design), "thesis": percent / 100, "ours": reached}
             )
     groups: dict[tuple[int, str], list[float]] = {}
-    for row in starts:
-        groups.setdefault((row["use_case"], row["objective"]), []).append(row["coverage"])
+    for each in starts:
+        groups.setdefault((each["use_case"], each["objective"]), []).append(each["coverage"])
     return {
         "starts": starts,
         "local_starts": local,
@@ -376,16 +385,6 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
         "note": "R_i 4 mm, bounds of Eq. 40-42, G0 300 kPa, mu_r 3.8, mu_d 0.2, power field law; use case 1 taken from "
         "(0 N, 0 N/s), because no passive brake changes a zero force. A hundredth of a percent of coverage is given up "
         "for the smallest elastomer.",
-    }
-
-
-def _outcome(outcome: Outcome) -> Json:
-    return {
-        "design": _design(outcome.design),
-        "coverage": outcome.coverage,
-        "corner_cost": outcome.corner_cost,
-        "volume_cm3": 1e-3 * outcome.volume_mm3,
-        "seconds": outcome.seconds,
     }
 
 

@@ -61,7 +61,7 @@ def _row(verdict: Verdict, task: ForceTask) -> Json:
         "insert": verdict.insert,
         "measured_range_N": measured_N,
         "matched_share": min(measured_N / (task.most_N - task.least_N), 1.0),
-        "serves": verdict.serves,
+        "serves": not verdict.reasons,
         "force_N": [verdict.least_N, verdict.most_N],
         "resolution_mN": 1e3 * verdict.resolution_N,
         "served_share": verdict.served_share,

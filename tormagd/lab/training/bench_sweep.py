@@ -15,6 +15,7 @@ import argparse
 import concurrent.futures
 import math
 from collections.abc import Sequence
+from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -104,9 +105,8 @@ def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int
     courses = [Course(names[-1], (HOLD_GAP_MM,) * HOLD_STROKES, seed + SWEEPS)]  # the longest first
     courses += [sweep_course(scene, name, seed + number) for name in names for number in range(SWEEPS)]
     with concurrent.futures.ProcessPoolExecutor() as pool:
-        waiting = [pool.submit(swept, plant, scene_name, course) for course in courses]
-        bar = tqdm(waiting, desc="records", unit="record", disable=None)
-        tables = [future.result() for future in bar]
+        made = pool.map(swept, repeat(plant), repeat(scene_name), courses)
+        tables = list(tqdm(made, total=len(courses), desc="records", unit="record", disable=None))
     time_s, *features, force_N = np.concatenate(tables).T
     cycle = np.repeat(np.arange(len(tables)), [len(rows) for rows in tables])
     return Dataset(np.column_stack(features), force_N, cycle, time_s)

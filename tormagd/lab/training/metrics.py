@@ -10,12 +10,9 @@ from tormagd.lab.training.dataset import Dataset
 from tormagd.model.features import FEATURES
 from tormagd.model.model_file import ForceModel
 
-TEST_SHARE = 0.3
-"""Of the thesis: 70 : 30."""
 
-
-def random_split(rows: int, seed: int, share: float = TEST_SHARE) -> Mask:
-    """Mask (rows) of the rows held out: `share` of them, scattered.
+def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
+    """Mask (rows) of the rows held out: `share` of them, scattered; as the thesis's, 70 : 30.
 
     Rows of a time series are nearly copies of their neighbours: this split flatters, and is for comparison only.
     """
