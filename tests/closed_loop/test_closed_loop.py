@@ -164,8 +164,7 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
     assert publish(armed, lambda time_s: 1.8, 0.8)[-1].truth.force_N == pytest.approx(1.8, abs=0.06)
     armed.command("disable")
     opened = list(armed.run(2.2))
-    assert opened[-1].truth.gap_mm == pytest.approx(OPEN_MM, abs=0.3)
-    assert faults_of(opened) == ()
+    assert (opened[-1].truth.gap_mm, faults_of(opened)) == (pytest.approx(OPEN_MM, abs=0.3), ())
     assert all(sample.output.mode is DriveMode.OFF for sample in opened)
     # disabled is not a fault: it can be armed again without homing
     armed.command("enable")
@@ -176,8 +175,7 @@ def test_stop_opens_and_has_to_be_cleared(armed: ClosedLoop) -> None:
     publish(armed, lambda time_s: 1.2, 0.8)
     armed.command("stop")
     samples = list(armed.run(2.2))
-    assert faults_of(samples) == (Fault.STOPPED,)
-    assert samples[-1].truth.gap_mm == pytest.approx(OPEN_MM, abs=0.3)
+    assert (faults_of(samples), samples[-1].truth.gap_mm) == ((Fault.STOPPED,), pytest.approx(OPEN_MM, abs=0.3))
     with pytest.raises(RefusedError):
         armed.command("enable")
     armed.command("clear-fault")

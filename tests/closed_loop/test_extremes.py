@@ -75,8 +75,10 @@ def skews_um(synchronisation: float) -> Array:
     for tick in range(1_600):
         gap_mm, speed_mm_s = (94.0 - 15e-3 * tick, -15.0) if tick < 800 else (82.0 + 15e-3 * (tick - 800), 15.0)
         samples.append(ticked(loop, gap_mm, speed_mm_s))
-    assert samples[-1].safety.operating_state is OperatingState.ENABLED
-    assert samples[-1].truth.gap_mm == pytest.approx(94.0, abs=0.1)
+    assert (samples[-1].safety.operating_state, samples[-1].truth.gap_mm) == (
+        OperatingState.ENABLED,
+        pytest.approx(94.0, abs=0.1),
+    )
     return np.array([sample.measured.skew_mm for sample in samples if sample.measured is not None]) * 1e3
 
 
@@ -93,8 +95,10 @@ def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
     loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), at_rest, seed=1))
     loop.arm(gap_plan(OPEN_MM))
     samples = on_the_way(loop, 47.0, 2_000) + on_the_way(loop, 93.0, 2_000)
-    assert samples[-1].safety.operating_state is OperatingState.ENABLED
-    assert samples[-1].truth.gap_mm == pytest.approx(93.0, abs=0.1)
+    assert (samples[-1].safety.operating_state, samples[-1].truth.gap_mm) == (
+        OperatingState.ENABLED,
+        pytest.approx(93.0, abs=0.1),
+    )
 
 
 # -- the clock -----------------------------------------------------------------------------------------------------
@@ -137,5 +141,7 @@ def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm)
     flipping = [ticked(loop, 80.0 + 10.0 * (tick % 2)) for tick in range(600)]
     assert all(79.9 < sample.truth.gap_mm < 90.1 for sample in flipping)
     after = on_the_way(loop, 85.0, 600)
-    assert after[-1].safety.operating_state is OperatingState.ENABLED
-    assert after[-1].truth.gap_mm == pytest.approx(85.0, abs=0.03)
+    assert (after[-1].safety.operating_state, after[-1].truth.gap_mm) == (
+        OperatingState.ENABLED,
+        pytest.approx(85.0, abs=0.03),
+    )

@@ -165,8 +165,7 @@ def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_of
     loop.planner.believe.zero.variance_N2 = 1.01 * UNKNOWN_SD_N**2
     LyingSensor(loop.device, lambda reading_N: reading_N + 0.1)
     samples = render(loop, ASKED_N, 3.0)
-    assert samples[-1].plan.limits == (Limit.OFFSET_UNKNOWN,)
-    assert loop.planner.believe.strength.fit == before
+    assert (samples[-1].plan.limits, loop.planner.believe.strength.fit) == ((Limit.OFFSET_UNKNOWN,), before)
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 

@@ -68,5 +68,4 @@ def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces
     frozen = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
     loop = arm("sample_3", ReversingHand(1.0), core=frozen, config=config)
     list(loop.run(2.5, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)))
-    assert loop.planner.believe.learned() == NOTHING_LEARNED
-    assert loop.stepper.move.acceleration_scale == 1.0
+    assert (loop.planner.believe.learned(), loop.stepper.move.acceleration_scale) == (NOTHING_LEARNED, 1.0)

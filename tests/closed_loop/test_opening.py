@@ -176,8 +176,7 @@ def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
     held(loop, 70.0, 1.5)
     held(loop, CLOSED_MM, 0.3)
     loop.command("disable")
-    assert named_s(loop, seconds=3.0) is None
-    assert loop.stepper.safety.faults == ()
+    assert (named_s(loop, seconds=3.0), loop.stepper.safety.faults) == (None, ())
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
     for gap_mm, closes_s, opens_s in ((94.0, 0.3, 1.0), (60.0, 1.0, 2.0)):
         loop.command("enable")

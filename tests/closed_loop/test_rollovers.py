@@ -66,8 +66,7 @@ def test_a_rollover_changes_no_duty(core: Core, recorded: list[Sample], device_s
     usual = duties(core, recorded, 0.0, 0.0)
     assert max(abs(duty.left_duty) for duty in usual) > 0.1
     for ours, duty in zip(duties(core, recorded, device_s - BEFORE_S, host_s - BEFORE_S), usual, strict=True):
-        assert ours.left_duty == pytest.approx(duty.left_duty, abs=SAME_DUTY)
-        assert ours.right_duty == pytest.approx(duty.right_duty, abs=SAME_DUTY)
+        assert (ours.left_duty, ours.right_duty) == pytest.approx((duty.left_duty, duty.right_duty), abs=SAME_DUTY)
 
 
 def stamped_s(base_ns: int) -> float:

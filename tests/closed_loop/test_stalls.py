@@ -116,8 +116,7 @@ def test_stalls_one_after_the_other(holding: ClosedLoop) -> None:
     for stall_ms in (45, 6, 30, 47, 10, 20):
         stall(holding, stall_ms)
         samples = run(holding, FORCE_N, 0.05)
-        assert samples[-1].safety.faults == ()
-        assert samples[-1].truth.force_N == pytest.approx(FORCE_N, abs=ALLOWED_N)
+        assert (samples[-1].safety.faults, samples[-1].truth.force_N) == ((), pytest.approx(FORCE_N, abs=ALLOWED_N))
 
 
 @pytest.mark.parametrize("stall_ms", LONG_MS)
@@ -126,11 +125,15 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
 ) -> None:
     stall(holding, stall_ms)
     samples = run(holding, FORCE_N, 2.0)
-    assert samples[25].safety.operating_state is OperatingState.FAULT
-    assert samples[-1].safety.faults == (Fault.HOST_STALL,)
+    assert (samples[25].safety.operating_state, samples[-1].safety.faults) == (
+        OperatingState.FAULT,
+        (Fault.HOST_STALL,),
+    )
     assert samples[-1].truth.gap_mm > OPEN_MM - 1.0
-    assert holding.measurement.mode is DeviceMode.LATCHED
-    assert holding.stepper.measure.sight.stall_s == pytest.approx(stall_ms * 1e-3 + 1e-3)
+    assert (holding.measurement.mode, holding.stepper.measure.sight.stall_s) == (
+        DeviceMode.LATCHED,
+        pytest.approx(stall_ms * 1e-3 + 1e-3),
+    )
 
 
 @pytest.mark.parametrize("stop_ms", SHORT_MS)

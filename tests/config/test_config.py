@@ -46,8 +46,13 @@ def test_no_file_and_an_empty_file_are_the_defaults(write) -> None:
 
 def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
     config = load_config(write('scene = "pulse"\n[device]\nport = "/dev/ttyACM3"\n[realtime]\ncpus = [1, 3]\n'))
-    assert (config.scene, config.device.port, config.realtime.cpus) == ("pulse", "/dev/ttyACM3", (1, 3))
-    assert (config.rates, config.device.options) == (Config().rates, {})
+    assert (config.scene, config.device.port, config.realtime.cpus, config.rates, config.device.options) == (
+        "pulse",
+        "/dev/ttyACM3",
+        (1, 3),
+        Config().rates,
+        {},
+    )
 
 
 @pytest.mark.parametrize(

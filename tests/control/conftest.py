@@ -113,10 +113,11 @@ class Bench:
         return self.driven == (DriveMode.RUN, 0.0, 0.0)
 
     @property
-    def is_opened(self) -> bool:
-        """Whether the drives are off for a fault, and the device has been asked to open."""
+    def opened_for(self) -> tuple[Fault, ...] | None:
+        """The faults for which the drives are off, and the device has been asked to open; None where it is not so."""
         is_faulty = self.stepper.safety.operating_state is OperatingState.FAULT
-        return is_faulty and self.is_off and self.output.request is DeviceRequest.RETRACT
+        is_opened = is_faulty and self.is_off and self.output.request is DeviceRequest.RETRACT
+        return self.faults if is_opened else None
 
     @property
     def there(self) -> dict[str, float]:
@@ -168,8 +169,7 @@ class Bench:
         while not self.faults:
             self.step(aim, **changes)
             assert self.ticks - start < 1_000, f"no {fault}"
-        assert self.faults == (fault,)
-        assert self.is_opened
+        assert self.opened_for == (fault,)
         return self.ticks - start
 
 

@@ -22,12 +22,6 @@ PERIOD_S = 1e-3
 CONFIG = Config()
 
 
-def test_disabled_means_off(bench) -> None:
-    output = bench.step(45.0, count=10)
-    assert bench.is_off
-    assert (output.request, output.request_number, output.limits) == (DeviceRequest.NONE, 0, ())
-
-
 def test_enabling_is_bumpless(running) -> None:
     """At the planned gap, at rest: the first duties are none, whatever was learned in an earlier run."""
     running.step(60.0, count=50)
@@ -42,8 +36,7 @@ def test_enabling_is_bumpless(running) -> None:
 def test_enabling_wants_a_measurement(bench) -> None:
     with pytest.raises(RefusedError) as caught:
         bench.command("enable")
-    assert caught.value.code == "not_fresh"
-    assert bench.stepper.safety.operating_state is OperatingState.DISABLED
+    assert (caught.value.code, bench.stepper.safety.operating_state) == ("not_fresh", OperatingState.DISABLED)
 
 
 # -- counts that jump ----------------------------------------------------------------------------------------------
@@ -57,12 +50,10 @@ def test_counts_that_jump_and_come_back_do_no_harm(running, jump_mm: float) -> N
     if abs(jump_mm) < LEAP_MM:
         assert -1.0 <= pushed.left_duty * math.copysign(1.0, jump_mm) < 0.0
     else:
-        assert running.is_held
-        assert pushed.limits == (Limit.ENCODER,)
+        assert (running.is_held, pushed.limits) == (True, (Limit.ENCODER,))
     settled = running.step(count=400)
     assert not running.faults
-    assert abs(settled.left_duty) < 0.05
-    assert abs(running.move.left.integral) < 0.05
+    assert max(abs(settled.left_duty), abs(running.move.left.integral)) < 0.05
 
 
 @pytest.mark.parametrize("side", ["left_mm", "right_mm"])
@@ -70,8 +61,7 @@ def test_counts_that_jump_and_come_back_do_no_harm(running, jump_mm: float) -> N
 def test_counts_of_either_side_that_jump_away_are_held_and_a_fault(running, side: str, jump_mm: float) -> None:
     """A lost or wrapped counter is not followed, and is a fault as soon as the device says that it was not reset. What
     is less than 1 mm is no skew."""
-    assert running.step(**{side: -7.5 + jump_mm}).limits == (Limit.ENCODER,)
-    assert running.is_held
+    assert (running.step(**{side: -7.5 + jump_mm}).limits, running.is_held) == ((Limit.ENCODER,), True)
     assert running.run_into(Fault.ENCODER, **{side: -7.5 + jump_mm}) == 1
 
 
@@ -102,8 +92,7 @@ def test_what_a_carriage_does_at_full_speed_is_no_leap(bench, speed_mm_s: float,
         bench.ticks += missing - 1
         at_mm = min(max(at_mm + missing * PERIOD_S * speed_mm_s, -24.0), 0.0)
         bench.step(left_mm=at_mm, right_mm=at_mm)
-    assert bench.stepper.measure.leap is None
-    assert not bench.faults
+    assert (bench.stepper.measure.leap, bench.faults) == (None, ())
 
 
 def test_after_an_encoder_fault_positions_are_unknown_until_the_device_has_homed(running) -> None:
@@ -150,14 +139,12 @@ def test_a_lost_link_is_a_fault_while_driven(running, names: list[str], is_betwe
         running.stepper.lose_link()
     else:
         running.silent(None)
-        assert running.is_opened
-    safety = running.stepper.safety
-    assert (safety.faults, safety.request) == ((Fault.LINK_LOST,), DeviceRequest.RETRACT)
-    assert running.stepper.measured is None
+    safety, measured = running.stepper.safety, running.stepper.measured
+    assert (safety.faults, safety.request, measured) == ((Fault.LINK_LOST,), DeviceRequest.RETRACT, None)
     running.stepper.lose_link()
     assert running.stepper.safety == safety
     running.step(count=5)
-    assert running.is_opened
+    assert running.opened_for == (Fault.LINK_LOST,)
 
 
 def test_a_lost_link_is_no_fault_while_disabled(bench) -> None:
@@ -171,8 +158,7 @@ def test_a_lost_link_is_no_fault_while_disabled(bench) -> None:
 
 def test_a_number_that_is_not_finite(running) -> None:
     running.step(math.nan)
-    assert running.faults == (Fault.NOT_FINITE,)
-    assert running.is_opened
+    assert running.opened_for == (Fault.NOT_FINITE,)
     running.command("clear-fault")
     running.step(count=3)
     running.command("enable")
@@ -188,9 +174,7 @@ FLOATS = [name for name in Measurement.__match_args__ if name.endswith(("_s", "_
 def test_a_measurement_that_is_not_finite_is_a_fault_and_goes_no_further(running, name: str, value: float) -> None:
     link = {"link": LinkQuality(**{name: value})} if name not in FLOATS else {name: value}
     running.step(79.0, **link)
-    assert running.faults == (Fault.NOT_FINITE,)
-    assert running.is_opened
-    assert running.stepper.measured is None
+    assert (running.opened_for, running.stepper.measured) == ((Fault.NOT_FINITE,), None)
 
 
 @pytest.mark.parametrize("now_s", [math.nan, math.inf, -math.inf])
@@ -199,8 +183,7 @@ def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> Non
     for late in (lambda: running.at(now_s, running.measure(9)), lambda: planner.plan(now_s, None, None)):
         with pytest.raises(DomainError, match=r"^now_s = .* is not allowed: a finite number"):
             late()
-    assert running.stepper.time_s == before_s
-    assert planner.planned.number == 0
+    assert (running.stepper.time_s, planner.planned.number) == (before_s, 0)
 
 
 # -- commands ------------------------------------------------------------------------------------------------------
@@ -208,21 +191,17 @@ def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> Non
 
 def test_disable_and_stop_open(running) -> None:
     running.command("disable")
-    assert running.step().request is DeviceRequest.RETRACT
-    assert running.is_off
-    assert not running.faults
+    assert (running.step().request, running.is_off, running.faults) == (DeviceRequest.RETRACT, True, ())
     running.command("stop")
     running.step()
-    assert running.faults == (Fault.STOPPED,)
-    assert running.is_opened
+    assert running.opened_for == (Fault.STOPPED,)
 
 
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:
     broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED, "left_mm": 0.0, "right_mm": 0.0}
     bench.step(**broken)
     bench.command("clear-fault", device_latched=True)
-    assert bench.step(**broken).request is DeviceRequest.CLEAR
-    assert bench.faults == ()
+    assert (bench.step(**broken).request, bench.faults) == (DeviceRequest.CLEAR, ())
     assert bench.run_into(Fault.DEVICE_OVERCURRENT, **broken) * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
 
 
@@ -231,8 +210,7 @@ def test_a_latched_fault_asks_once_and_stays(running) -> None:
     number = running.output.request_number
     assert running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100).request_number == number
     running.step(count=100)
-    assert running.faults == (Fault.DEVICE_SKEW,)
-    assert running.is_opened
+    assert running.opened_for == (Fault.DEVICE_SKEW,)
 
 
 # -- any input -----------------------------------------------------------------------------------------------------
@@ -327,10 +305,12 @@ def test_after_a_stall_one_drive_asks_and_moves_nothing(make_moving, elapsed_s: 
     times_s = (watch.still_s, watch.straying_s)
     received_s = later_s if has_more else moving.now_s
     old = moving.measure(moving.ticks + has_more, received_s=received_s, **moving.there)
-    assert moving.at(later_s, old, 60.0).limits == (Limit.HOST_STALL,)
-    assert moving.is_held
-    assert not moving.faults
-    assert plain(moving.move) == move
+    assert (moving.at(later_s, old, 60.0).limits, moving.is_held, moving.faults, plain(moving.move)) == (
+        (Limit.HOST_STALL,),
+        True,
+        (),
+        move,
+    )
     assert (watch.still_s, watch.straying_s) == times_s
     assert moving.stepper.measure.sight.stall_s == pytest.approx(elapsed_s)
 
@@ -345,8 +325,7 @@ def test_the_answer_to_it_is_gone_on_from_without_a_kick(make_moving, came_mm: f
     for number, at_s in enumerate((moving.now_s + 0.045, moving.now_s + 0.046), moving.ticks):
         answer = moving.measure(number, received_s=at_s, device_time_s=at_s, **moving.gap(came_mm))
         output = moving.at(at_s, answer, came_mm)
-    assert not moving.faults
-    assert moving.move.reference.gap_mm == pytest.approx(came_mm, abs=0.1)
+    assert (moving.faults, moving.move.reference.gap_mm) == ((), pytest.approx(came_mm, abs=0.1))
     assert abs(output.left_duty) < 0.6
     assert moving.move.left.integral == pytest.approx(integral, abs=0.02)
     assert Limit.HOST_STALL in output.limits
@@ -361,9 +340,8 @@ def test_without_an_answer_in_time_the_measurement_is_stale(running) -> None:
         running.silent(newest)
         assert running.driven[1:] == (0.0, 0.0)
         assert running.ticks - begun < 100
-    assert running.faults == (Fault.MEASUREMENT_STALE,)
+    assert running.opened_for == (Fault.MEASUREMENT_STALE,)
     assert running.ticks - begun == pytest.approx(2.0 * BLIND_S / PERIOD_S, abs=2)
-    assert running.is_opened
 
 
 def test_a_slow_loop_takes_no_period_of_its_own_for_a_stall(make_bench) -> None:
@@ -383,8 +361,7 @@ def test_a_silent_device_is_held_where_it_is_and_named(running) -> None:
     running.silent(newest, count=round(BLIND_S / PERIOD_S) + 1)
     held = plain(running.move)
     for _ in range(30):
-        assert running.silent(newest).limits == (Limit.DEVICE_SILENT,)
-        assert running.is_held
+        assert (running.silent(newest).limits, running.is_held) == ((Limit.DEVICE_SILENT,), True)
     assert plain(running.move) == held
     assert abs(running.move.left.integral - integral) < 0.05
     back = running.step()
@@ -402,8 +379,7 @@ def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_
     opened = {"faults": DeviceFault.COMMAND_TIMEOUT, "mode": DeviceMode.RETRACTING}
     assert running.run_into(fault, **opened) == 1
     running.step(count=300, **opened | {"mode": DeviceMode.LATCHED})
-    assert running.faults == (fault,)
-    assert running.is_opened
+    assert running.opened_for == (fault,)
 
 
 @settings(max_examples=60, deadline=None)

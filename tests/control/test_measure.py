@@ -46,8 +46,7 @@ def follow_handle(measure):
 
 def test_the_first_is_at_rest(look: Look, measure) -> None:
     measured = look(measure(3, left_mm=-10.0, right_mm=-10.5))
-    assert (measured.left_mm, measured.right_mm) == (37.5, 37.0)
-    assert (measured.gap_mm, measured.skew_mm) == (74.5, 0.5)
+    assert (measured.left_mm, measured.right_mm, measured.gap_mm, measured.skew_mm) == (37.5, 37.0, 74.5, 0.5)
     assert (measured.left_mm_s, measured.right_mm_s, measured.handle.rate_mm_s) == (0.0, 0.0, 0.0)
     assert measured.handle.displacement_mm == 0.0
 
@@ -102,8 +101,7 @@ def test_a_handle_that_nobody_hears_of_has_not_stopped(look: Look, measure, miss
 def test_one_encoder_count_is_filtered(look: Look, measure) -> None:
     """A count in a millisecond is 1.8 mm/s of noise; the filter takes three quarters of it."""
     after = look(measure(0), measure(1, left_mm=-7.5 + COUNT_MM))
-    assert after.left_mm_s == pytest.approx(COUNT_MM / 1e-3 / 4.0)
-    assert after.right_mm_s == 0.0
+    assert (after.left_mm_s, after.right_mm_s) == (pytest.approx(COUNT_MM / 1e-3 / 4.0), 0.0)
 
 
 def test_displacement_counts_from_the_reversal(follow_handle) -> None:
@@ -113,10 +111,8 @@ def test_displacement_counts_from_the_reversal(follow_handle) -> None:
 
 
 def test_displacement_saturates_where_friction_is_mobilised(follow_handle) -> None:
-    forth = [0.1 * k for k in range(51)]
-    assert follow_handle(forth).handle.displacement_mm == MOBILISED_MM
-    back = [5.0 - 0.1 * k for k in range(1, 100)]
-    assert follow_handle(forth + back).handle.displacement_mm == MOBILISED_MM
+    forth, back = [0.1 * k for k in range(51)], [5.0 - 0.1 * k for k in range(1, 100)]
+    assert [follow_handle(way).handle.displacement_mm for way in (forth, forth + back)] == [MOBILISED_MM] * 2
 
 
 @settings(max_examples=60, deadline=None)
@@ -151,10 +147,8 @@ def test_displacement_never_leaves_its_range(follow_handle, positions: list[floa
 def test_force_and_rate_are_positive_along_the_motion(follow_handle, way: float) -> None:
     """The sensor's sign is the motion's; what is measured is resistance."""
     measured = follow_handle([way * 0.05 * k for k in range(200)], force_N=way * 0.6)
-    assert measured.force_N == 0.6
-    assert measured.handle.rate_mm_s == pytest.approx(50.0, rel=0.05)
+    assert (measured.force_N, measured.handle.rate_mm_s) == (0.6, pytest.approx(50.0, rel=0.05))
 
 
 def test_whether_it_is_homed_is_the_devices_word(measure) -> None:
-    assert Look()(measure(0)).is_homed
-    assert not Look()(measure(0, switches=Switches(0))).is_homed
+    assert [Look()(measure(0, switches=seen)).is_homed for seen in (Switches.HOMED, Switches(0))] == [True, False]

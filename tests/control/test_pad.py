@@ -47,12 +47,10 @@ def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = 
 
 def test_a_finger_on_its_way_is_planned_for_at_the_scenes_depth() -> None:
     contact = Pressing(DEPTH_MM)
-    assert contact.planned(None, None) == (DEPTH_MM, 0.0)
-    assert contact.planned(None, pressed(1.0, 1.0)) == (DEPTH_MM, 0.0)
-    assert contact.planned(None, pressed(1.9, -0.5)) == (1.9, -0.5)
-    assert contact.planned(TimedSetpoint(3.5, 0.0, 0.1, 1.5, 0.25), pressed(1.9)) == (1.5, 0.25)
-    assert not contact.is_known(pressed(0.99 * PRESSED * DEPTH_MM))
-    assert contact.is_known(pressed(PRESSED * DEPTH_MM))
+    fingers, own = (None, pressed(1.0, 1.0), pressed(1.9, -0.5)), TimedSetpoint(3.5, 0.0, 0.1, 1.5, 0.25)
+    assert [contact.planned(None, finger) for finger in fingers] == [(DEPTH_MM, 0.0), (DEPTH_MM, 0.0), (1.9, -0.5)]
+    assert contact.planned(own, pressed(1.9)) == (1.5, 0.25)
+    assert [contact.is_known(pressed(share * PRESSED * DEPTH_MM)) for share in (0.99, 1.0)] == [False, True]
     assert not contact.slides
 
 
@@ -63,9 +61,11 @@ def test_a_finger_that_draws_back_is_still_pushed_out(measure) -> None:
         depth_mm = 2.0 - 0.02 * number
         drawn = measure(number, handle_mm=depth_mm, force_N=3.0)
         measured = finger.update((number - 1) * 1e-3, number * 1e-3, drawn, needs_homing=False)
-    assert measured.force_N == 3.0
-    assert measured.handle.displacement_mm == pytest.approx(depth_mm)
-    assert measured.handle.rate_mm_s == pytest.approx(-20.0, rel=0.4)
+    assert (measured.force_N, measured.handle.displacement_mm, measured.handle.rate_mm_s) == (
+        3.0,
+        pytest.approx(depth_mm),
+        pytest.approx(-20.0, rel=0.4),
+    )
 
 
 def test_a_pad_that_is_held_is_pressed_harder_as_it_relaxes(pad_core: Core) -> None:
@@ -82,8 +82,10 @@ def test_a_pad_that_is_held_is_pressed_harder_as_it_relaxes(pad_core: Core) -> N
 def test_without_the_term_nothing_is_remembered() -> None:
     without = build_core(CONFIG, msgspec.structs.replace(SCENE, terms=EVERY_TERM.without(*RELAXATION_S)))
     forgetful = held(without, 60.0)
-    assert forgetful.believe.memory.relaxed_N == 0.0
-    assert forgetful.planned.field_mT == pytest.approx(held(without, PERIOD_S).planned.field_mT, abs=0.01)
+    assert (forgetful.believe.memory.relaxed_N, forgetful.planned.field_mT) == (
+        0.0,
+        pytest.approx(held(without, PERIOD_S).planned.field_mT, abs=0.01),
+    )
 
 
 def test_a_finger_that_stands_while_the_force_rises_has_not_lost_its_encoder(pad_core: Core) -> None:

@@ -76,8 +76,7 @@ def test_without_the_rate_one_table_answers_and_no_network_is_asked(after) -> No
     assert max(differing_mm) - min(differing_mm) > 0.2
     for force_N in (0.7, 1.0, 1.5):
         plan = core.planner().plan(PERIOD_S, TimedSetpoint(force_N, PERIOD_S, 0.1), None)
-        assert plan.gap_mm == pytest.approx(core.portrait.gap_mm_at(force_N), abs=1e-6)
-        assert plan.confidence == 1.0
+        assert (plan.gap_mm, plan.confidence) == (pytest.approx(core.portrait.gap_mm_at(force_N), abs=1e-6), 1.0)
     assert Limit.F_MIN in core.planner().plan(PERIOD_S, TimedSetpoint(0.1, PERIOD_S, 0.1), None).limits
 
 
@@ -91,9 +90,11 @@ def test_scale_and_offset_are_learned_each_on_its_own(after) -> None:
     fits = {names: after(core_without(*names), 100).believe.device for names in ((), ("scale",), ("offset",))}
     assert fits[()].scale != 1.0
     assert fits[()].offset_N != 0.0
-    assert fits[("scale",)].scale == 1.0
-    assert fits[("scale",)].scale_variance == pytest.approx(UNSEEN.scale_variance)
-    assert fits[("offset",)].offset_N == 0.0
+    assert (fits[("scale",)].scale, fits[("scale",)].scale_variance, fits[("offset",)].offset_N) == (
+        1.0,
+        pytest.approx(UNSEEN.scale_variance),
+        0.0,
+    )
     for names, fit in fits.items():
         assert fit.force_N(1.0871) == pytest.approx(1.2, abs=0.04), names
     neither = after(core_without("scale", "offset"), 100).believe
@@ -122,8 +123,8 @@ def test_without_the_slope_a_force_is_held_until_the_next(told) -> None:
 
 
 def test_without_the_forecast_nothing_is_remembered(after) -> None:
-    assert plain(after(core_without(), 20).governor.forecast) != plain(Forecast())
-    assert plain(after(core_without("forecast"), 20).governor.forecast) == plain(Forecast())
+    full, without = (plain(after(core_without(*names), 20).governor.forecast) for names in ((), ("forecast",)))
+    assert full != plain(Forecast()) == without
 
 
 def test_without_the_preview_what_follows_is_not_looked_at(after, told) -> None:
@@ -193,5 +194,4 @@ def test_dry_friction_counts_both_ways_and_the_magnets_pull_where_it_opens(dutie
 
 
 def test_learning_can_be_stopped_for_a_measurement() -> None:
-    assert core_without().planner().believe.learns
-    assert not core_without(learning=False).planner().believe.learns
+    assert [core_without(learning=learns).planner().believe.learns for learns in (True, False)] == [True, False]

@@ -202,8 +202,7 @@ def test_displacement_is_what_the_daemon_calls_it():
 
 
 def test_what_ctl_may_not_import_is_equal():
-    assert calibration.COLUMNS == FILE_COLUMNS
-    assert calibrate_run.MOVING_MM_S == MOVING_MM_S
+    assert (calibration.COLUMNS, calibrate_run.MOVING_MM_S) == (FILE_COLUMNS, MOVING_MM_S)
 
 
 def test_a_sweep_file_that_is_none_says_why(tmp_path):
@@ -235,9 +234,11 @@ def ticks(count=200):
 def test_a_motor_log_has_volts_and_even_times_whatever_the_ticks_missed():
     given = ticks()
     plain = motor_log(given, "left")
-    assert plain["t_s"][:3] == pytest.approx([0.0, 1e-3, 2e-3])
-    assert plain["input_V"][:3] == pytest.approx([0.0, 0.012, 0.024])
-    assert plain["reference_mm"][0] == 40.0
+    assert (plain["t_s"][:3], plain["input_V"][:3], plain["reference_mm"][0]) == (
+        pytest.approx([0.0, 1e-3, 2e-3]),
+        pytest.approx([0.0, 0.012, 0.024]),
+        40.0,
+    )
     # a tick without news from the device, one that never came, one before the device was known
     order = np.array([0, 1, 2, *range(3, 50), *range(51, 200)])
     spoilt = {name: values[order].copy() for name, values in given.items()}
@@ -273,8 +274,11 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monk
     assert json.loads(capsys.readouterr().out)["result"]["rows"] == 299
     with out.open(newline="") as file:
         written = list(csv.DictReader(file))
-    assert list(written[0]) == ["t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm"]
-    assert (float(written[1]["t_s"]), float(written[1]["position_mm"])) == (0.001, 30.0)
+    assert (list(written[0]), float(written[1]["t_s"]), float(written[1]["position_mm"])) == (
+        ["t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm"],
+        0.001,
+        30.0,
+    )
 
 
 @pytest.mark.parametrize(

@@ -61,8 +61,12 @@ def test_a_refusal_names_command_reason_and_remedy(client, fake_daemon, code, ki
     fake_daemon.refuse("enable", code)
     with pytest.raises(kind) as refused:
         client.request("enable")
-    assert (refused.value.code, refused.value.message, refused.value.hint) == (code, "cannot enable", "do this first")
-    assert str(refused.value) == "enable: cannot enable; do this first"
+    assert (refused.value.code, refused.value.message, refused.value.hint, str(refused.value)) == (
+        code,
+        "cannot enable",
+        "do this first",
+        "enable: cannot enable; do this first",
+    )
     assert client.status().is_homed  # and the client goes on
 
 
@@ -162,8 +166,7 @@ def test_a_daemon_that_has_gone_takes_no_setpoints(run_dir, fake_daemon, kind):
 
 def test_telemetry_is_typed(client):
     newest = client.telemetry(PATIENCE_S)
-    assert newest[0].operating_state == "ENABLED"
-    assert newest[0].measured_jp == (35.0, 35.0)
+    assert (newest[0].operating_state, newest[0].measured_jp) == ("ENABLED", (35.0, 35.0))
 
 
 @pytest.mark.parametrize("call", [lambda it: it.request("status"), lambda it: it.publish(1.0)])

@@ -139,8 +139,7 @@ def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_d
     fake_daemon.says(operating_state="FAULT", faults=["STOPPED"])
     assert main(["--endpoint", fake_daemon.control, "clear-fault"]) == 0
     assert "fault cleared. tormagctl home, then enable" in capsys.readouterr().out
-    assert fake_daemon.commands[:2] == ["status", "clear-fault"]
-    assert set(fake_daemon.commands[2:]) == {"status"}
+    assert (fake_daemon.commands[:2], set(fake_daemon.commands[2:])) == (["status", "clear-fault"], {"status"})
 
 
 @pytest.mark.parametrize(
@@ -150,8 +149,7 @@ def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_d
 def test_without_a_daemon_every_command_ends_with_3(run_dir, capsys, arguments, monkeypatch):
     monkeypatch.chdir(run_dir)
     code, printed = run_json(capsys, "--endpoint", f"ipc://{run_dir}/control", "--wait", "0.05", *arguments)
-    assert code == 3
-    assert printed["error"]["code"] == "unreachable"
+    assert (code, printed["error"]["code"]) == (3, "unreachable")
     assert "start the daemon" in printed["error"]["hint"]
     assert list(run_dir.iterdir()) == []
 
@@ -182,8 +180,7 @@ def test_scenes_are_listed_and_shown(capsys):
     listed = run_json(capsys, "scene", "list")[1]["result"]["scenes"]
     assert {"coronary", "pulse", "brain"} <= {scene["name"] for scene in listed}
     shown = run_json(capsys, "scene", "show", "pulse")[1]["result"]
-    assert shown["name"] == "pulse"
-    assert shown["insert"]["gap_open_mm"] == 95.0
+    assert (shown["name"], shown["insert"]["gap_open_mm"]) == ("pulse", 95.0)
     # without a name: the configuration's
     assert run_json(capsys, "scene", "show")[1]["result"]["name"] == "coronary"
 

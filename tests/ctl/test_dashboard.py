@@ -102,8 +102,10 @@ async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
         stream = await asks.get("/live")
         assert stream.content_type == "text/event-stream"
         told = await event(stream, "status")
-        assert told["status"]["link"]["state"] == "RUNNING"
-        assert told["explained"] == {"RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}}
+        assert (told["status"]["link"]["state"], told["explained"]) == (
+            "RUNNING",
+            {"RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}},
+        )
         assert await event(stream, "portrait") == {"portrait": PORTRAIT}
         first = msgspec.convert(await event(stream, "frame"), Frame)
         then = msgspec.convert(await event(stream, "frame"), Frame)
@@ -176,12 +178,12 @@ async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Rec
 
 def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     about = recorded.about
-    assert (about["kind"], about["scene"], about["duration_s"]) == (
+    assert (about["kind"], about["scene"], about["duration_s"], about["tracking_rms_N"]) == (
         "recording",
         "pulse",
         pytest.approx(SECONDS, abs=0.1),
+        pytest.approx(0.01),
     )
-    assert about["tracking_rms_N"] == pytest.approx(0.01)
     assert msgspec.to_builtins(about["portrait"]) == {name: tuple(values) for name, values in PORTRAIT.items()}
     assert about["overview"]["limits"] == [pytest.approx((5.0, 7.0))]
     assert max(known for known in about["overview"]["high_N"] if known is not None) == pytest.approx(1.81, abs=1e-3)
@@ -189,13 +191,19 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
         assert about["explained"][code].remedy == known.remedy
     frame = recorded.frame(20.0)
     assert (frame.t_s[0], frame.t_s[-1]) == pytest.approx((START_NS * 1e-9, START_NS * 1e-9 + 20.0))
-    assert frame.asked_N[-1] == pytest.approx(1.5 + 0.3 * math.sin(48.0 * math.pi))
-    assert (frame.gap_mm[-1], frame.gap_wanted_mm[-1], frame.field_mT[-1]) == (70.0, 70.0, 120.0)
+    assert (frame.asked_N[-1], frame.gap_mm[-1], frame.gap_wanted_mm[-1], frame.field_mT[-1]) == (
+        pytest.approx(1.5 + 0.3 * math.sin(48.0 * math.pi)),
+        70.0,
+        70.0,
+        120.0,
+    )
     assert [(held.code, round(held.share, 3), held.is_now) for held in frame.held] == [("RATE", 0.1, False)]
     assert (frame.operating_state, frame.faults) == ("ENABLED", [])
     # all ticks are counted, not those alone that are drawn
-    assert sum(frame.late_counts) == pytest.approx(2_000, abs=2)
-    assert frame.late_counts[LATE_US.index(500.0)] == pytest.approx(20, abs=1)
+    assert (sum(frame.late_counts), frame.late_counts[LATE_US.index(500.0)]) == (
+        pytest.approx(2_000, abs=2),
+        pytest.approx(20, abs=1),
+    )
     assert recorded.frame(29.5).faults == ["SKEW"]
     assert frame.belief == {}  # ticks do not say
     assert [held.is_now for held in recorded.frame(6.0).held] == [True]

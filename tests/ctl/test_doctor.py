@@ -138,8 +138,11 @@ def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_t
     assert checks.build(REALTIME, Machine(good)) == checks.Finding("build", Verdict.OK, "compiled")
     monkeypatch.setattr(checks, "settle", lambda: Build(False, "no C compiler (cc) when it was installed"))
     finding = checks.build(REALTIME, Machine(good))
-    assert finding.found == f"interpreted: no C compiler (cc) when it was installed; {COST}"
-    assert (finding.verdict, finding.remedy) == (Verdict.WARN, REMEDY)
+    assert (finding.found, finding.verdict, finding.remedy) == (
+        f"interpreted: no C compiler (cc) when it was installed; {COST}",
+        Verdict.WARN,
+        REMEDY,
+    )
 
 
 def test_port_missing_taken_or_not_ours(good):
@@ -211,8 +214,7 @@ def by_rate(found: headroom.Headroom, loop: str, config: Config = REALTIME) -> d
 
 def test_a_machine_with_headroom_holds_its_rates_and_says_up_to_which(good):
     outcome = judged(REALTIME, Machine(good), measured())
-    assert outcome.exit_code == 0
-    assert (outcome.result["fail"], outcome.result["warn"]) == (0, 0)
+    assert (outcome.exit_code, outcome.result["fail"], outcome.result["warn"]) == (0, 0, 0)
     control = by_rate(measured(), "control")
     # 100 us late and 1.25 times 80 us of work in a period of 1000, 500 and 250 us
     assert [control[hz].used for hz in (1_000, 2_000, 4_000)] == [0.2, 0.4, 0.8]
@@ -227,8 +229,7 @@ def test_inference_is_held_where_a_plan_fits_beside_the_ticks():
     assert all(row.holds for row in by_rate(measured(plan_us=500.0), "inference").values())
     slow = by_rate(measured(plan_us=650.0), "inference")
     assert not slow[83].holds
-    assert slow[83].used == pytest.approx(0.75)
-    assert set(slow) == {83, 125, 250, 500, 1_000}
+    assert (slow[83].used, set(slow)) == (pytest.approx(0.75), {83, 125, 250, 500, 1_000})
 
 
 def test_what_to_change_is_what_is_fullest():

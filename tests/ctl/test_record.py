@@ -25,8 +25,7 @@ def test_record_then_plot(fake_daemon, tmp_path, capsys):
 
     assert main(["--json", "plot", str(file), "-o", str(picture)]) == 0
     drawn = json.loads(capsys.readouterr().out)["result"]
-    assert drawn["ticks"] == result["ticks"]
-    assert drawn["tracking_rms_N"] == pytest.approx(0.1 / 2**0.5, rel=0.1)
+    assert (drawn["ticks"], drawn["tracking_rms_N"]) == (result["ticks"], pytest.approx(0.1 / 2**0.5, rel=0.1))
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

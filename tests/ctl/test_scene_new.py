@@ -30,11 +30,14 @@ def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_i
     out = tmp_path / "scenes" / "mine.toml"
     out.parent.mkdir()
     code, printed = new(capsys, str(out), "--force", str(forces))
-    assert code == 0
-    assert printed["result"]["insert"] == "MRE-10-10"
+    assert (code, printed["result"]["insert"]) == (0, "MRE-10-10")
     scene = load_scene(str(out))
-    assert (scene.name, scene.force.least_N, scene.force.most_N) == ("mine", 0.31, 0.62)
-    assert scene.force.tolerance_rms_N == pytest.approx(0.016)
+    assert (scene.name, scene.force.least_N, scene.force.most_N, scene.force.tolerance_rms_N) == (
+        "mine",
+        0.31,
+        0.62,
+        pytest.approx(0.016),
+    )
     assert scene.signal.file == "../forces.csv"
     assert main(["scene", "check", str(out)]) == 0
 

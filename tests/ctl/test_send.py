@@ -36,8 +36,7 @@ def test_every_setpoint_arrives_from_the_first_on(fake_daemon, capsys):
     wait_for(fake_daemon, result["sent"])
     arrived = fake_daemon.setpoints
     assert result["sent"] + result["skipped"] == 61
-    assert len(arrived) == result["sent"]
-    assert (arrived[0].servo_cf, arrived[-1].servo_cf) == (1.0, 2.0)
+    assert (len(arrived), arrived[0].servo_cf, arrived[-1].servo_cf) == (result["sent"], 1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
     # the force belongs to the setpoint's own deadline, whatever was left out
     for setpoint in arrived:
@@ -65,8 +64,7 @@ def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
     arrived = fake_daemon.setpoints
     forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
     for setpoint in arrived:
-        assert len(setpoint.preview_N) == 5
-        assert setpoint.preview_dt_ms == 10.0
+        assert (len(setpoint.preview_N), setpoint.preview_dt_ms) == (5, 10.0)
         for after, force in enumerate(setpoint.preview_N, start=1):
             later = min(round(100.0 * after_s(setpoint, arrived[0])) + after, 20)
             assert force == pytest.approx(forces.get(later, force), abs=1e-9)
@@ -163,8 +161,7 @@ def test_between_rows_the_force_is_on_the_straight_line(tmp_path_factory, steps,
 def test_shapes_stay_between_their_two_forces_and_reach_both(name):
     waveform = shape(name, 1.2, 1.8, 2.0, 4.0)
     forces = [waveform.at(k / 1_000).force_N for k in range(4_001)]
-    assert min(forces) == pytest.approx(1.2, abs=1e-3)
-    assert max(forces) == pytest.approx(1.8, abs=1e-3)
+    assert (min(forces), max(forces)) == pytest.approx((1.2, 1.8), abs=1e-3)
 
 
 def test_shapes_have_their_frequency_and_their_step():

@@ -33,8 +33,7 @@ def is_harmless(text: str) -> bool:
 
 
 def test_a_text_is_made_one_printable_line() -> None:
-    assert printable(EVIL) == HARMLESS
-    assert printable("a ± b, 5 µs") == "a ± b, 5 µs"
+    assert (printable(EVIL), printable("a ± b, 5 µs")) == (HARMLESS, "a ± b, 5 µs")
     assert printable("\ud800") == r"\ud800"
 
 

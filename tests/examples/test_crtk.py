@@ -68,8 +68,11 @@ def test_commands_are_those_of_the_daemon_and_others_are_named():
 
 def test_telemetry_becomes_crtk_with_its_units_and_its_time():
     force = translation.fill_header(translation.fill_force(wrench(), STATE.measured_cf), STATE)
-    assert force.wrench.force.z == 1.48
-    assert (force.header.stamp.sec, force.header.stamp.nanosec) == (1_800_000_000, 250_000_000)
+    assert (force.wrench.force.z, force.header.stamp.sec, force.header.stamp.nanosec) == (
+        1.48,
+        1_800_000_000,
+        250_000_000,
+    )
     joints = translation.fill_joints(SimpleNamespace(name=[], position=[]), STATE)
     assert (joints.name, joints.position) == (["left", "right"], [0.03, 0.029])
     state = translation.fill_operating_state(SimpleNamespace(), STATE)

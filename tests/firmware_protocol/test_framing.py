@@ -113,8 +113,7 @@ def test_a_flipped_bit_in_a_frame_is_found(frame: Frame, data: st.DataObject) ->
     encoded[position] ^= 1 << data.draw(st.integers(0, 7))
     assume(encoded[position] != 0)  # that cuts the frame in two, which is another test
     decoder = FrameDecoder()
-    assert decoder.feed(bytes(encoded)) == []
-    assert decoder.statistics.corrupt == 1
+    assert (decoder.feed(bytes(encoded)), decoder.statistics.corrupt) == ([], 1)
 
 
 @pytest.mark.parametrize("start", [0, 100, 250])
@@ -198,5 +197,4 @@ def test_a_line_that_reorders_loses_what_it_lost(seed: int, lossy: bool) -> None
 )
 def test_why_a_frame_was_refused(damaged: bytes, why: str) -> None:
     decoder = FrameDecoder()
-    assert decoder.feed(damaged) == []
-    assert decoder.statistics.refused == {"frame": why}
+    assert (decoder.feed(damaged), decoder.statistics.refused) == ([], {"frame": why})

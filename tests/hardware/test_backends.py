@@ -148,8 +148,7 @@ def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
     for nonce in range(1, 8):
         port.send(Home(nonce))
     far = FrameStream()
-    assert far.unpack(bytes(taken)) == [Home(nonce) for nonce in range(1, 8)]
-    assert far.statistics.lost == 0
+    assert (far.unpack(bytes(taken)), far.statistics.lost) == ([Home(nonce) for nonce in range(1, 8)], 0)
 
 
 def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,8 +208,11 @@ def test_what_ends_a_connection_on_a_bus_is_said_with_a_remedy(
 
 def test_an_error_frame_that_is_not_bus_off_is_counted(bus: Bus) -> None:
     bus.put(PASSIVE, STATUS_FRAME)
-    assert bus.backend.receive() == [STATUS]
-    assert (bus.backend.statistics.corrupt, bus.backend.statistics.resynchronisations) == (1, 1)
+    assert (bus.backend.receive(), bus.backend.statistics.corrupt, bus.backend.statistics.resynchronisations) == (
+        [STATUS],
+        1,
+        1,
+    )
 
 
 def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> None:
@@ -259,8 +261,7 @@ def test_a_damaged_line_is_counted_and_the_next_is_read(line: Line, damaged: byt
         wait_readable(backend)
         assert backend.receive() == []
     os.write(line.far, b"t0718%s\r" % STATUS_FRAME.data.hex().encode())
-    assert next_of(backend) == [STATUS]
-    assert backend.statistics.resynchronisations == 1
+    assert (next_of(backend), backend.statistics.resynchronisations) == ([STATUS], 1)
     backend.close()
 
 

@@ -127,8 +127,7 @@ def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
     assert "reset" in link.cause
     assert link.measurement is None
     told(link, 0.022, US, status(FIRST_NONCE), Sense(0.0, 0.0, 0.0, 0.0), State(5.0, 5.0, 0.0, 1))
-    assert link.state is LinkState.RUNNING
-    assert link.measurement.left_mm == 5.0
+    assert (link.state, link.measurement.left_mm) == (LinkState.RUNNING, 5.0)
     assert [type(message) for message in link.due(0.022)] == [Retract], "opening is still wanted"
 
 
@@ -315,8 +314,14 @@ def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
         1.0, status(mode=DeviceMode.LATCHED, switches=Switches(0), faults=DeviceFault.SKEW, temperature_C=41.0)
     )
     after = link.measurement
-    assert (after.mode, after.faults, after.temperature_C) == (DeviceMode.LATCHED, DeviceFault.SKEW, 41.0)
-    assert (after.is_homed, after.is_latched, after.is_busy) == (False, True, False)
+    assert (after.mode, after.faults, after.temperature_C, after.is_homed, after.is_latched, after.is_busy) == (
+        DeviceMode.LATCHED,
+        DeviceFault.SKEW,
+        41.0,
+        False,
+        True,
+        False,
+    )
     assert (after.number, after.received_s) == (before.number, before.received_s)
 
 
@@ -391,8 +396,7 @@ def test_what_is_missing_for_a_measurement_is_said(heard, refused, missing: str)
     link = DeviceLink(0.0)
     assert not link.missing(refused), "it does not run yet"
     told(link, 0.01, US, *heard)
-    assert link.missing(refused) == missing
-    assert link.measurement is None
+    assert (link.missing(refused), link.measurement) == (missing, None)
 
 
 def test_nothing_is_missing_where_there_is_a_measurement() -> None:

@@ -56,8 +56,7 @@ def test_a_round_trip_of_any_length_is_known_after_one_hello(way_ticks: int) -> 
     trip = RoundTrip()
     assert trip.report() is None
     exchange(trip, range(1, 1_400), way_ticks)
-    assert set(trip.report().values()) == {way_ticks * 1e3}
-    assert trip.least_s == pytest.approx(way_ticks * PERIOD_S)
+    assert (set(trip.report().values()), trip.least_s) == ({way_ticks * 1e3}, pytest.approx(way_ticks * PERIOD_S))
 
 
 def test_a_lost_drive_is_made_good_by_the_next_hello() -> None:
@@ -126,8 +125,7 @@ def test_memory_is_bounded_and_the_fit_follows_the_last_half_minute() -> None:
         clock.add(tick * 0.05, device_s)
     fit = clock.fit()
     assert (fit.windows, fit.drift_ppm) == (WINDOWS, pytest.approx(-50.0, abs=0.1))
-    assert len(clock._windows) == WINDOWS
-    assert len(trip._recent) == ROUND_TRIPS
+    assert (len(clock._windows), len(trip._recent)) == (WINDOWS, ROUND_TRIPS)
 
 
 def test_nothing_is_claimed_before_there_is_enough() -> None:
@@ -138,8 +136,10 @@ def test_nothing_is_claimed_before_there_is_enough() -> None:
 @pytest.mark.parametrize("after_s", [5.0, 8.0, 15.0, 25.0])
 def test_a_clock_that_is_set_begins_a_new_line(step_s: float, after_s: float) -> None:
     fit = heard(lambda now_s: now_s * (1.0 + 30e-6) + step_s * (now_s > 30.0 - after_s), 30_000).fit()
-    assert fit.drift_ppm == pytest.approx(30.0, abs=1.0)
-    assert fit.offset_s == pytest.approx(-30.0 * 30e-6 - step_s, abs=1e-4)
+    assert (fit.drift_ppm, fit.offset_s) == (
+        pytest.approx(30.0, abs=1.0),
+        pytest.approx(-30.0 * 30e-6 - step_s, abs=1e-4),
+    )
 
 
 def test_a_clock_that_stands_still_is_a_drift_like_any_other() -> None:
@@ -247,8 +247,7 @@ def test_nothing_is_said_before_the_first_answers_have_come() -> None:
 def test_each_share_is_of_its_own_and_forgotten_after_a_second(change, name: str, share: float) -> None:
     bad = GOOD.replaced(**change)
     quality = watched([GOOD] * 3 + [bad] * 11)
-    assert getattr(quality, name) == pytest.approx(share)
-    assert quality.is_lossy
+    assert (getattr(quality, name), quality.is_lossy) == (pytest.approx(share), True)
     assert share > LOSES
     # the shares of one bad look among the ten of a second
     assert getattr(watched([GOOD] * 12 + [bad]), name) <= share / LOOKS * 2.0

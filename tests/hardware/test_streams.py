@@ -79,8 +79,7 @@ def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:
     for corrupt, frame in enumerate(
         ((99, 0, b"\x01"), (6, 1, b"\x01\x02"), (2, 2, b"\x00\x00\x00\x00\x01\x05\x00")), 1
     ):
-        assert stream.unpack(encode_frame(*frame)) == []
-        assert stream.statistics.corrupt == corrupt
+        assert (stream.unpack(encode_frame(*frame)), stream.statistics.corrupt) == ([], corrupt)
     assert stream.unpack(encode_frame(6, 3, b"\x05")) == [Home(5)]
 
 

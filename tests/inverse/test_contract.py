@@ -151,8 +151,7 @@ def test_on_a_rising_model_the_root_is_found(rising: ForceModel, name: str) -> N
         solution = searcher.solve(
             rising.curve(displacement, rate, CIP), rising.predict_one(displacement, rate, field, CIP), last
         )
-        assert solution.field_mT == pytest.approx(field, abs=accuracy)
-        assert solution.reach is Reach.INSIDE
+        assert (solution.field_mT, solution.reach) == (pytest.approx(field, abs=accuracy), Reach.INSIDE)
         assert solution.predicted_force_N == pytest.approx(
             rising.predict_one(displacement, rate, solution.field_mT, CIP), abs=1e-12
         )
@@ -197,8 +196,10 @@ def test_a_search_without_memory_answers_with_one_of_the_roots(bump: ForceModel,
 def test_the_ends_themselves_are_inside(rising: ForceModel, name: str, end: float) -> None:
     curve = rising.curve(0.5, 10, CIP)
     solution = solver(name, rising).solve(curve, curve.force_N(end), None)
-    assert solution.reach is Reach.INSIDE
-    assert solution.field_mT == pytest.approx(end, abs=0.01 if SUBJECTS[name].is_continuous else 5.0)
+    assert (solution.reach, solution.field_mT) == (
+        Reach.INSIDE,
+        pytest.approx(end, abs=0.01 if SUBJECTS[name].is_continuous else 5.0),
+    )
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
@@ -215,8 +216,7 @@ def test_out_of_reach_is_the_nearest_end_and_never_silent(rising: ForceModel, na
 @pytest.mark.parametrize("name", ANY_SHAPE)
 def test_above_the_peak_of_a_bump_is_above(bump: ForceModel, name: str) -> None:
     solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 450.0, CIP) + 0.1, 200.0)
-    assert solution.reach is Reach.ABOVE
-    assert solution.field_mT == pytest.approx(450, abs=2)
+    assert (solution.reach, solution.field_mT) == (Reach.ABOVE, pytest.approx(450, abs=2))
 
 
 @pytest.mark.parametrize("name", ANY_SHAPE)
@@ -225,8 +225,7 @@ def test_a_tie_is_resolved_by_continuity(plateau: ForceModel, name: str) -> None
     top = plateau.predict_one(0.5, 10, 740.0, CIP)
     for last in (600.0, 633.3):
         solution = solver(name, plateau).solve(plateau.curve(0.5, 10, CIP), top, last)
-        assert solution.reach is Reach.INSIDE
-        assert solution.predicted_force_N == pytest.approx(top, abs=0.02)
+        assert (solution.reach, solution.predicted_force_N) == (Reach.INSIDE, pytest.approx(top, abs=0.02))
         if name in CONTINUOUS:
             # the grid searches may move to a neighbouring grid point
             assert solution.field_mT == pytest.approx(last, abs=2.0)
@@ -339,8 +338,7 @@ def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel,
     for curve in (plateau.curve(0.5, 10, CIP), creep):
         top = curve.force_N(800.0)
         above = solver.solve(curve, top + 1, 600.0)
-        assert above.reach is Reach.ABOVE
-        assert above.field_mT == pytest.approx(600, abs=0.5)
+        assert (above.reach, above.field_mT) == (Reach.ABOVE, pytest.approx(600, abs=0.5))
     assert solver.solve(plateau.curve(0.5, 10, CIP), plateau.predict_one(0.5, 10, 800.0, CIP), 700.0).field_mT == (
         pytest.approx(700, abs=0.5)
     )
@@ -393,8 +391,10 @@ def solved(curve: ForceCurve, force_N: float, last_field_mT: float | None) -> Fi
     """The answer, as far as every answer has to be so."""
     solution = RisingSearch(RANGE_MT).solve(curve, force_N, last_field_mT)
     assert RANGE_MT[0] <= solution.field_mT <= RANGE_MT[1]
-    assert solution.predicted_force_N == curve.force_N(solution.field_mT)
-    assert solution.confidence == curve.confidence(solution.field_mT, force_N - solution.predicted_force_N)
+    assert (solution.predicted_force_N, solution.confidence) == (
+        curve.force_N(solution.field_mT),
+        curve.confidence(solution.field_mT, force_N - solution.predicted_force_N),
+    )
     assert 1 <= solution.iterations < MOST_EVALUATIONS
     return solution
 
@@ -406,8 +406,10 @@ def test_the_root_is_that_of_brent(units: Steps, share: float, last: float | Non
     force = least_N + share * (most_N - least_N)
     root = brentq(lambda field: curve.force_N(field) - force, *RANGE_MT, xtol=1e-9) if 0 < share < 1 else None
     solution = solved(curve, force, last)
-    assert solution.reach is Reach.INSIDE
-    assert solution.field_mT == pytest.approx(RANGE_MT[round(share)] if root is None else root, rel=0, abs=ACCURACY_MT)
+    assert (solution.reach, solution.field_mT) == (
+        Reach.INSIDE,
+        pytest.approx(RANGE_MT[round(share)] if root is None else root, rel=0, abs=ACCURACY_MT),
+    )
 
 
 @given(units=steps, beyond=st.floats(1e-9, 1e6), last=lasts)

@@ -68,8 +68,10 @@ def test_what_inserts_of_one_matrix_remember_is_found_in_all_their_records() -> 
         records.append((np.column_stack((displacement_mm, rate, field_mT, np.full(160, iron))), force_N))
     features, forces_N = (np.concatenate(part) for part in zip(*records, strict=True))
     memory, free = identify(Dataset(features, forces_N, np.repeat(np.arange(4), 160), np.tile(time_s, 4)))
-    assert memory.fractions == pytest.approx((fraction, 0.0, 0.0), abs=0.002)
-    assert memory.times_s[0] == pytest.approx(8.0, rel=0.05)
+    assert (memory.fractions, memory.times_s[0]) == (
+        pytest.approx((fraction, 0.0, 0.0), abs=0.002),
+        pytest.approx(8.0, rel=0.05),
+    )
     slid = features[:, 0] >= MOBILISED_MM
     fresh_N = 4.0 * (features[:, 2] / 800.0) ** 2
     assert free.force_N[slid] == pytest.approx(fresh_N[slid], rel=0.01)

@@ -96,8 +96,10 @@ def test_the_law_and_a_fitted_grey_box_need_no_torch():
 
 def test_a_missing_package_is_one_sentence_with_the_command_that_brings_it():
     done = without_heavy(COMMAND, "train-model", "data.csv", "--element", "torque", "--insert", "A", "--out", "m")
-    assert done.returncode == 2
-    assert done.stderr == "tormag-lab train-model: torch is not installed: pip install 'tormagd[lab]'\n"
+    assert (done.returncode, done.stderr) == (
+        2,
+        "tormag-lab train-model: torch is not installed: pip install 'tormagd[lab]'\n",
+    )
 
 
 def test_where_tormagd_stands_in_a_folder_of_its_own_packages_are_brought_there(monkeypatch, tmp_path):

@@ -74,12 +74,18 @@ def test_dask_workers_find_what_is_found_one_by_one(folder, scheduler, capsys, t
 def test_a_console_is_summed_up_over_its_days(folder, scheduler, capsys):
     assert main(["fleet", str(folder / "2"), "--dask", scheduler, "--json"]) == 1
     found = msgspec.convert(json.loads(capsys.readouterr().out)["consoles"][0], Console)
-    assert (found.serial_number, found.insert, found.recordings) == (2, "MRE-50-40", 3)
-    assert found.tracking_rms_N == pytest.approx(0.02)
-    assert found.limits == {"RATE": pytest.approx(0.5)}
-    assert found.trim == Drift(1.0, pytest.approx(1.08), pytest.approx(0.04))
-    assert found.current_A == Drift(0.5, 0.5, pytest.approx(0.0))
-    assert found.clock_drift_ppm is None
+    assert (found.serial_number, found.insert, found.recordings, found.tracking_rms_N, found.limits) == (
+        2,
+        "MRE-50-40",
+        3,
+        pytest.approx(0.02),
+        {"RATE": pytest.approx(0.5)},
+    )
+    assert (found.trim, found.current_A, found.clock_drift_ppm) == (
+        Drift(1.0, pytest.approx(1.08), pytest.approx(0.04)),
+        Drift(0.5, 0.5, pytest.approx(0.0)),
+        None,
+    )
 
 
 def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):

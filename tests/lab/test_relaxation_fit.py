@@ -27,23 +27,24 @@ def step() -> np.ndarray:
 
 def test_a_step_gives_the_spectrum_and_the_scale() -> None:
     fit = fit_relaxation(record(HOLD_S, step()))
-    assert fit.scale_N == pytest.approx(2.5, rel=1e-6)
-    assert fit.series.fractions == pytest.approx(SERIES.fractions, rel=1e-4)
-    assert fit.series.times_s == pytest.approx(SERIES.times_s, rel=1e-4)
+    assert (fit.scale_N, fit.series.fractions, fit.series.times_s) == (
+        pytest.approx(2.5, rel=1e-6),
+        pytest.approx(SERIES.fractions, rel=1e-4),
+        pytest.approx(SERIES.times_s, rel=1e-4),
+    )
 
 
 def test_ramps_down_and_up_give_the_same_spectrum() -> None:
     time_s = np.arange(0.0, 4000.0, 5.0)
     driving = 2.0 + np.interp(time_s, [0, 20, 800, 900, 2000, 2010, 4000], [3, 0, 0, 2, 2, -1, -1])
     fit = fit_relaxation(record(time_s, driving))
-    assert fit.series.fractions == pytest.approx(SERIES.fractions, rel=1e-3)
-    assert fit.series.times_s == pytest.approx(SERIES.times_s, rel=1e-3)
+    found, expected = ((*series.fractions, *series.times_s) for series in (fit.series, SERIES))
+    assert found == pytest.approx(expected, rel=1e-3)
 
 
 def test_noise_is_left_over_and_not_fitted() -> None:
     fit = fit_relaxation(record(HOLD_S, step(), noise_N=0.005))
-    assert fit.rms_N == pytest.approx(0.005, rel=0.15)
-    assert sum(fit.series.fractions) == pytest.approx(0.13, abs=0.01)
+    assert (fit.rms_N, sum(fit.series.fractions)) == (pytest.approx(0.005, rel=0.15), pytest.approx(0.13, abs=0.01))
     assert fit.r2 > 0.99
 
 

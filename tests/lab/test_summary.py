@@ -40,12 +40,20 @@ def written(tmp_path: Path) -> Path:
 
 def test_the_time_enabled_is_what_counts(written):
     found = summarise(read_recording(written))
-    assert (found.serial_number, found.insert, found.scene, found.is_complete) == (1234, "MRE-50-40", "pulse", True)
-    assert found.start_s == START_NS * 1e-9
+    assert (found.serial_number, found.insert, found.scene, found.is_complete, found.start_s) == (
+        1234,
+        "MRE-50-40",
+        "pulse",
+        True,
+        START_NS * 1e-9,
+    )
     assert (found.duration_s, found.enabled_s, found.tracking_rms_N) == pytest.approx((0.119, 0.05, 0.02))
-    assert found.limits_s == {"RATE": pytest.approx(0.01)}
-    assert found.faults_at_s == {"SKEW": pytest.approx(0.1)}
-    assert (found.trim, found.late_p99_us) == (1.1, 30.0)
+    assert (found.limits_s, found.faults_at_s, found.trim, found.late_p99_us) == (
+        {"RATE": pytest.approx(0.01)},
+        {"SKEW": pytest.approx(0.1)},
+        1.1,
+        30.0,
+    )
     assert (found.clock_drift_ppm, found.current_A) == pytest.approx((20.0, 0.4))
     assert found.temperature_C is None
 

@@ -52,8 +52,7 @@ def test_other_processes_give_the_same_answer(runs: list[Run], thread: Executor)
     here = sweep(runs, thread)
     with ProcessPoolExecutor(1) as pool:
         there = sweep(runs, pool)
-    assert answers(here) == answers(there)
-    assert list(here) == runs
+    assert (answers(here), list(here)) == (answers(there), runs)
     assert len({outcome.design for outcome in here.values()}) > 1
 
 
@@ -64,8 +63,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(runs: list[Run], thread: Executor,
     assert read_state(state) == {}
     first = sweep(runs[:2], thread, state)
     rest = sweep(runs, Refusing(thread, 1), state)
-    assert list(rest) == runs
-    assert {run: rest[run] for run in first} == first
+    assert (list(rest), {run: rest[run] for run in first}) == (runs, first)
     assert read_state(state) == rest
 
 

@@ -41,8 +41,7 @@ def test_from_csv_to_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert report["validation_mae_N"] < 0.015
     assert 0 < report["train_mae_percent"] < 1
     assert 0 <= report["not_rising_share"] < 0.2
-    assert report["train_rows"] == 2100
-    assert report["data_sha256"] == model.metadata.training_data_sha256
+    assert (report["train_rows"], report["data_sha256"]) == (2100, model.metadata.training_data_sha256)
     assert model.metadata.metrics["validation_r2"] == report["validation_r2"]
     assert model.predict_one(1.0, 60.0, 800.0, 40.0) == pytest.approx(4.9, abs=0.05)
 
@@ -64,10 +63,11 @@ def test_several_inserts_are_told_apart_by_their_iron(
     arguments = [*command(both, out, "--rising", "--epochs", "10"), "--insert", "MRE-50-20", "MRE-50-40"]
     assert main(arguments) == 0
     whole, strong = (load_model(out, element="torque", insert=name) for name in (None, "MRE-50-40"))
-    assert whole.metadata.insert == "MRE-50"
-    assert whole.metadata.ranges["cip_percent"] == (20.0, 40.0)
-    assert strong.metadata.ranges["cip_percent"] == (40.0, 40.0)
-    assert strong.field_range_mT[1] == pytest.approx(800.0, rel=0.01)
+    assert (whole.metadata.insert, whole.metadata.ranges["cip_percent"]) == ("MRE-50", (20.0, 40.0))
+    assert (strong.metadata.ranges["cip_percent"], strong.field_range_mT[1]) == (
+        (40.0, 40.0),
+        pytest.approx(800.0, rel=0.01),
+    )
     assert load_model(out, element="torque", insert="MRE-50-20").field_range_mT[1] == pytest.approx(400.0, rel=0.01)
     assert whole.metadata.metrics["not_rising_share"] == 0.0
     assert main([*arguments[:-1], "MRE-50-30"]) == 2

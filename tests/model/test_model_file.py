@@ -104,8 +104,7 @@ def test_round_trip_is_exact_to_the_byte(saved: Path, tmp_path: Path, model: For
     loaded = load_model(saved, element="torque", insert="MRE-50-40")
     again = tmp_path / "again.safetensors"
     save_model(again, loaded)
-    assert again.read_bytes() == saved.read_bytes()
-    assert loaded.metadata == model.metadata
+    assert (again.read_bytes(), loaded.metadata) == (saved.read_bytes(), model.metadata)
     assert loaded.predict_one(*POINT) == model.predict_one(*POINT)
     assert sorted(tmp_path.iterdir()) == [again, saved]
 
@@ -115,8 +114,7 @@ def test_others_can_read_the_file(saved: Path) -> None:
         header = file.metadata()
         assert header["element"] == "torque"
         told = [json.loads(header[name]) for name in ("features", "units", "hidden")]
-        assert told == [list(FEATURES), UNITS, 6]
-        assert header["created"] == "2024-02-29"
+        assert (told, header["created"]) == ([list(FEATURES), UNITS, 6], "2024-02-29")
         assert file.get_tensor("hidden_weight").shape == (6, 4)
 
 
@@ -319,8 +317,7 @@ def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelM
         weight[:, 2] = field_weights
         return not_rising_share(ForceModel(metadata, weight, np.array(bias), np.ones(6), 0.0), **options)
 
-    assert share([1.0] * 6, [0.0] * 6) == 0
-    assert share([-1.0] * 6, [0.0] * 6) == 1
+    assert (share([1.0] * 6, [0.0] * 6), share([-1.0] * 6, [0.0] * 6)) == (0, 1)
     # a hill: rises at -0.5, falls at +0.5 in scaled units
     assert share([8.0, -8.0, 0, 0, 0, 0], [4.0, 4, 0, 0, 0, 0], points=17) == pytest.approx(9 / 17)
 
@@ -345,8 +342,10 @@ def test_a_model_of_several_inserts_is_loaded_in_the_box_of_the_one_that_is_aske
     save_model(path, of_two)
     assert load_model(path, element="torque").metadata == of_two.metadata
     weak = load_model(path, element="torque", insert="MRE-50-20")
-    assert weak.metadata.insert == "MRE-50-20"
-    assert weak.feature_ranges == ((0.0, 1.0), (0.0, 60.0), (100.0, 400.0), (20.0, 20.0))
+    assert (weak.metadata.insert, weak.feature_ranges) == (
+        "MRE-50-20",
+        ((0.0, 1.0), (0.0, 60.0), (100.0, 400.0), (20.0, 20.0)),
+    )
     assert weak.metadata.memory == Memory(fractions=(0.05,), times_s=(8.0,), lag_mT=4.0, turn_mT=40.0)
     assert weak.predict_one(0.3, 12.0, 300.0, 20.0) == of_two.predict_one(0.3, 12.0, 300.0, 20.0)
     assert (
@@ -442,8 +441,10 @@ def test_the_force_is_that_of_the_model(either: ForceModel) -> None:
 def test_the_force_agrees_with_50_digits(either: ForceModel) -> None:
     for row in states(60).tolist():
         curve = either.curve(row[0], row[1], row[3])
-        assert curve.force_N(row[2]) == pytest.approx(float(exact_N(either, row)), rel=0, abs=1e-13 * curve.magnitude_N)
-        assert curve.force_and_slope(row[2])[0] == curve.force_N(row[2])
+        assert (curve.force_N(row[2]), curve.force_and_slope(row[2])[0]) == (
+            pytest.approx(float(exact_N(either, row)), rel=0, abs=1e-13 * curve.magnitude_N),
+            curve.force_N(row[2]),
+        )
 
 
 def test_the_slope_is_that_of_the_model(either: ForceModel) -> None:
@@ -481,8 +482,10 @@ def test_a_unit_far_from_its_step_is_shut_or_open(exponent: float, side: int) ->
     weight = np.array([[0.0, 0.0, side * exponent / 400.0, 0.0]])
     curve = Network(weight, np.zeros(1), np.array([3.0]), 0.25, known).curve(0.5, 10.0, 40.0)
     expected = 3.25 if side > 0 else 0.25
-    assert curve.force_N(400.0) == expected
-    assert curve.force_and_slope(400.0) == (expected, pytest.approx(0.0, abs=1e-300))
+    assert (curve.force_N(400.0), curve.force_and_slope(400.0)) == (
+        expected,
+        (expected, pytest.approx(0.0, abs=1e-300)),
+    )
     assert curve.forces_N(np.array([400.0])) == pytest.approx([expected], abs=1e-15)
 
 
@@ -523,8 +526,10 @@ def test_confidence_follows_its_formula(
     """The model's force span is 5.6 N; its share of iron never varied."""
     displacement, rate, field, cip = place
     curve = model.curve(displacement, rate, cip)
-    assert curve.confidence(field, error_N) == expected
-    assert curve.confidence(field, -error_N) == curve.confidence(field, error_N)
+    assert (curve.confidence(field, error_N), curve.confidence(field, -error_N)) == (
+        expected,
+        curve.confidence(field, error_N),
+    )
 
 
 # -- what a model knows of relaxation ----------------------------------------------------------------------------------

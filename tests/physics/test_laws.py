@@ -278,8 +278,10 @@ def test_what_an_insert_states_itself_goes_before_its_matrix_and_eq_5() -> None:
     own = Insert("X", 50, 0.5, 310.0, relative_permeability=5.1, friction_coefficient=0.3)
     assert own.elastomer == Elastomer(310e3, 5.1, 0.3)
     usual = Insert("X", 50, 0.25, 160.0)
-    assert usual.elastomer.relative_permeability == pytest.approx(3.0)
-    assert usual.elastomer.friction_coefficient == insert("MRE-50-10").elastomer.friction_coefficient
+    assert (usual.elastomer.relative_permeability, usual.elastomer.friction_coefficient) == (
+        pytest.approx(3.0),
+        insert("MRE-50-10").elastomer.friction_coefficient,
+    )
     with pytest.raises(DomainError, match="measured"):
         _ = usual.force_range
     with pytest.raises(DomainError, match="estimate_N"):

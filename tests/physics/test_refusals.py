@@ -177,5 +177,9 @@ def test_an_error_can_be_sent_between_processes() -> None:
         require("gap_mm", np.array([50.0, -1.0]), 0.0, 100.0)
     copy = pickle.loads(pickle.dumps(caught.value))
     assert type(copy) is DomainError
-    assert str(copy) == str(caught.value)
-    assert (copy.variable, copy.value, copy.allowed) == ("gap_mm", -1.0, "a number from 0 to 100")
+    assert (str(copy), copy.variable, copy.value, copy.allowed) == (
+        str(caught.value),
+        "gap_mm",
+        -1.0,
+        "a number from 0 to 100",
+    )

@@ -60,14 +60,14 @@ def written(tmp_path: Path) -> Path:
 
 def test_a_recording_comes_back_as_it_was_written(written):
     recording = read_recording(written)
-    assert recording.is_complete
-    assert recording.metadata["scene"] == "pulse"
+    assert (recording.is_complete, recording.metadata["scene"]) == (True, "pulse")
     assert np.array_equal(np.diff(recording.ticks.t_ns), np.full(99, 1_000_000))
-    assert recording.ticks.t_ns[0] == START_NS
-    assert recording.ticks.numbers["measured_cf"].tolist() == [1.6] * 100
+    assert (recording.ticks.t_ns[0], recording.ticks.numbers["measured_cf"].tolist()) == (START_NS, [1.6] * 100)
     assert recording.telemetry.numbers["duty.1"].tolist() == [-0.5] * 5
-    assert recording.telemetry.numbers["tick.exec_us"].tolist() == [100.0] * 5
-    assert recording.telemetry.words["limits"] == [(), ("RATE",), ("RATE",), (), ()]
+    assert (recording.telemetry.numbers["tick.exec_us"].tolist(), recording.telemetry.words["limits"]) == (
+        [100.0] * 5,
+        [(), ("RATE",), ("RATE",), (), ()],
+    )
     assert recording.telemetry.words["operating_state"][4] == ("FAULT",)
     assert np.isnan(recording.telemetry.numbers["setpoint_cf"]).all()
 
@@ -203,8 +203,12 @@ def test_gaps_and_losses_are_counted(tmp_path):
             writer.ticks(batch((ms, 0.0), columns=columns))
         for seq in (3, 4, 7, 8, 0, 1):  # 5 and 6 are lost; then the daemon restarts
             writer.telemetry(telemetry(seq, seq))
-    assert (writer.tick_count, writer.gaps, writer.telemetry_lost) == (8, 2, 2)
-    assert writer.longest_gap_ms == pytest.approx(28.1)
+    assert (writer.tick_count, writer.gaps, writer.telemetry_lost, writer.longest_gap_ms) == (
+        8,
+        2,
+        2,
+        pytest.approx(28.1),
+    )
 
 
 def test_columns_may_change_while_recording(tmp_path):
@@ -261,11 +265,12 @@ def test_another_file_is_refused_by_name(tmp_path, content):
 
 def test_quantities_come_from_the_ticks_and_else_from_telemetry(written):
     recording = read_recording(written)
-    assert series(recording, "measured_cf").values.tolist() == [1.6] * 100
-    assert series(recording, "gap_mm").values.tolist() == [71.0] * 100
+    assert (series(recording, "measured_cf").values.tolist(), series(recording, "gap_mm").values.tolist()) == (
+        [1.6] * 100,
+        [71.0] * 100,
+    )
     assert series(recording, "gap_setpoint_mm").t_s.tolist() == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
-    assert series(recording, "right_duty").values.tolist() == [-0.5] * 5
-    assert series(recording, "field_mT") is None
+    assert (series(recording, "right_duty").values.tolist(), series(recording, "field_mT")) == ([-0.5] * 5, None)
 
 
 def test_the_picture_names_what_happened(written):

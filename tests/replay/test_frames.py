@@ -101,21 +101,25 @@ def test_what_came_damaged_is_counted_and_measured_alike(core: Core, on_can: Fli
     entries = read_black_box(can_path).entries
     assert on_can.loop.stepper.safety.faults[0] is Fault.MEASUREMENT_STALE
     done = again(core, entries)
-    assert done.difference is None
-    assert done.damaged == pytest.approx(300, abs=2)
-    assert done.first_damage.time_s == pytest.approx(DAMAGED_FROM_S, abs=0.003)
-    assert done.first_damage.why == "State: CRC-8"
+    assert (done.difference, done.damaged, done.first_damage.time_s, done.first_damage.why) == (
+        None,
+        pytest.approx(300, abs=2),
+        pytest.approx(DAMAGED_FROM_S, abs=0.003),
+        "State: CRC-8",
+    )
     assert frames(can_path)[done.first_damage.frame - 1]["identifier"] == can_identifier(FUNCTION[State])
 
 
 def test_a_damaged_frame_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "read", DAMAGED_TICK)
     done = again(core, changed(box.entries, place, damaged(box.entries[place][2])), SNAPSHOT_S)
-    assert (done.damaged, done.ticks) == (1, DAMAGED_TICK - 1 - round(1e3 * SNAPSHOT_S))
-    assert done.first_damage.frame == number_of(box.entries, place - 1) + 1
+    assert (done.damaged, done.ticks, done.first_damage.frame) == (
+        1,
+        DAMAGED_TICK - 1 - round(1e3 * SNAPSHOT_S),
+        number_of(box.entries, place - 1) + 1,
+    )
     found = done.difference
-    assert (found.tick, found.field) == (DAMAGED_TICK, "measurement.number")
-    assert found.frame == number_of(box.entries, place)
+    assert (found.tick, found.field, found.frame) == (DAMAGED_TICK, "measurement.number", number_of(box.entries, place))
 
 
 def test_a_frame_that_is_missing_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
@@ -127,8 +131,12 @@ def test_a_frame_that_is_missing_is_found_in_its_place(core: Core, box: BlackBox
 def test_another_frame_that_was_written_is_found(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "wrote", DAMAGED_TICK)
     found = again(core, changed(box.entries, place, []), SNAPSHOT_S).difference
-    assert (found.tick, found.field, found.recorded) == (DAMAGED_TICK, "written", "nothing")
-    assert found.frame == number_of(box.entries, place - 1) + 1
+    assert (found.tick, found.field, found.recorded, found.frame) == (
+        DAMAGED_TICK,
+        "written",
+        "nothing",
+        number_of(box.entries, place - 1) + 1,
+    )
 
 
 def test_a_memory_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
@@ -147,5 +155,4 @@ def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, t
     entries = read_black_box(flight.write(tmp_path / "frozen.mcap")).entries
     assert [entry[1] is None for entry in entries if entry[0] == "connected"] == [True, False]
     done = again(core, entries)
-    assert (done.difference, done.ticks) == (None, 3_400)
-    assert done.frames == number_of(entries, len(entries) - 1)
+    assert (done.difference, done.ticks, done.frames) == (None, 3_400, number_of(entries, len(entries) - 1))

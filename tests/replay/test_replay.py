@@ -58,8 +58,7 @@ def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box:
     known = recorded(box, path.parent)
     assert known.config == ended.config
     done = rerun(rebuilt(known), known.columns, box.entries)
-    assert (done.difference, done.gaps) == (None, 0)
-    assert (done.ticks, done.from_s, done.snapshots) == (TICKS, 0.0, 7)
+    assert (done.difference, done.gaps, done.ticks, done.from_s, done.snapshots) == (None, 0, TICKS, 0.0, 7)
     assert (done.frames, done.damaged) == (len(frames(path)), 0)
     assert differences(known, Config()) == []
 
@@ -101,9 +100,11 @@ def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> Non
 @pytest.mark.parametrize(("from_s", "begins_s"), [(0.2, 0.0), (2.9, 2.5), (3.7, 3.5)])
 def test_it_is_from_the_middle_of_the_run(core: Core, box: BlackBoxFile, from_s: float, begins_s: float) -> None:
     done = again(core, box, from_s)
-    assert done.difference is None
-    assert done.from_s == pytest.approx(begins_s, abs=1e-9)
-    assert done.ticks == TICKS - round(1e3 * begins_s)
+    assert (done.difference, done.from_s, done.ticks) == (
+        None,
+        pytest.approx(begins_s, abs=1e-9),
+        TICKS - round(1e3 * begins_s),
+    )
 
 
 @pytest.mark.parametrize(
@@ -139,9 +140,11 @@ def test_the_other_build_replays_them_to_the_bit(fly: Any, path: Path, tmp_path:
 
 def test_a_black_box_is_drawn_like_a_recording(path: Path) -> None:
     recording = read_recording(path)
-    assert recording.is_complete
-    assert recording.ticks.t_ns.size == TICKS
-    assert recording.ticks.words["faults"][-1] == ("ENCODER",)
+    assert (recording.is_complete, recording.ticks.t_ns.size, recording.ticks.words["faults"][-1]) == (
+        True,
+        TICKS,
+        ("ENCODER",),
+    )
     assert set(recording.ticks.numbers) | set(recording.ticks.words) == set(COLUMNS)
 
 
@@ -150,8 +153,7 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     flight = fly(until_s=3.1)
     number = flight.planner.planned.number
     flight.tick(asked(flight.loop.now_s).replaced(force_N=math.nan))
-    assert flight.loop.stepper.safety.faults == (Fault.PLAN_FAILED,)
-    assert flight.planner.planned.number == number + 1
+    assert (flight.loop.stepper.safety.faults, flight.planner.planned.number) == ((Fault.PLAN_FAILED,), number + 1)
     for _ in range(499):
         flight.tick(asked(flight.loop.now_s))
     box = read_black_box(flight.write(tmp_path / "failed.mcap"))
@@ -164,16 +166,19 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     # a plan that fails here alone is no such plan
     entries = [*box.entries[: place - 1], *box.entries[place + 1 :]]
     found = again(core, msgspec.structs.replace(box, entries=entries), 3.0).difference
-    assert (found.tick, found.field, found.recorded) == (3_101, "plan", "made")
-    assert found.replayed == "failed: force_N = nan is not allowed: a finite number within +-1e+09"
+    assert (found.tick, found.field, found.recorded, found.replayed) == (
+        3_101,
+        "plan",
+        "made",
+        "failed: force_N = nan is not allowed: a finite number within +-1e+09",
+    )
 
 
 def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
     """A part was lost: 20 ticks are missing, and the rest up to the next snapshot says nothing."""
     places = list(ticks_of(COLUMNS, box.entries))
     done = rerun(core, COLUMNS, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
-    assert (done.difference, done.gaps) == (None, 1)
-    assert done.ticks == TICKS - 3_500 + 3_101
+    assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
 
 
 # -- what was changed is found -------------------------------------------------------------------------------------
@@ -193,8 +198,7 @@ def test_a_changed_number_is_found_in_its_tick(core: Core, box: BlackBoxFile, co
     record = list(ticks_of(COLUMNS, box.entries).values())[CHANGED_TICK - 1]
     entries = planted(box.entries, CHANGED_TICK, COLUMNS.index(column), getattr(record, column) + add)
     done = rerun(core, COLUMNS, entries, 3.0)
-    assert (done.difference.tick, done.difference.field) == (CHANGED_TICK, shows)
-    assert done.ticks == CHANGED_TICK - 1 - 3_000
+    assert (done.difference.tick, done.difference.field, done.ticks) == (CHANGED_TICK, shows, CHANGED_TICK - 1 - 3_000)
 
 
 def test_a_changed_setpoint_is_found_in_its_tick(core: Core, box: BlackBoxFile) -> None:

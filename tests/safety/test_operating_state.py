@@ -140,8 +140,11 @@ def test_clearing_asks_the_device_only_where_it_has_latched_too() -> None:
     assert (ours.operating_state, ours.faults, ours.request_number) == (DISABLED, (), FAULTED.request_number)
     assert ours.clearing_until_s < 0.0, "there is nothing to wait for"
     both = command(FAULTED, "clear-fault", 2.0, READY.replaced(device_latched=True))
-    assert (both.request, both.request_number) == (DeviceRequest.CLEAR, FAULTED.request_number + 1)
-    assert both.clearing_until_s == 2.0 + CLEARING_S
+    assert (both.request, both.request_number, both.clearing_until_s) == (
+        DeviceRequest.CLEAR,
+        FAULTED.request_number + 1,
+        2.0 + CLEARING_S,
+    )
 
 
 @pytest.mark.parametrize("present", [ENABLED, PAUSED])
@@ -358,8 +361,7 @@ def test_several_bits_are_several_faults() -> None:
 def test_codes_are_their_names_and_told_in_the_order_of_their_tables() -> None:
     """Clients compare text; the tables are what people read, and the order of `Fault` is the order of naming."""
     assert all(code.value == code.name for kind in (Fault, Limit) for code in kind)
-    assert tuple(FAULTS) == tuple(Fault)
-    assert tuple(LIMITS) == tuple(Limit)
+    assert (tuple(FAULTS), tuple(LIMITS)) == (tuple(Fault), tuple(Limit))
     assert all(row.shows and row.safe_ms > 0.0 for row in (*FAULTS.values(), *LIMITS.values()))
 
 

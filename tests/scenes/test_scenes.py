@@ -61,8 +61,7 @@ def test_the_thesiss_tasks_are_shipped() -> None:
 @pytest.mark.parametrize("name", shipped_scenes())
 def test_a_shipped_scene_gives_a_core_that_can_render_it(name: str) -> None:
     core = build_core(Config(scene=name))
-    assert core.scene == load_scene(name)
-    assert core.scene.name == name
+    assert (core.scene, core.scene.name) == (load_scene(name), name)
     assert core.scene.description.endswith(".")
     # a scene may like less than the device's least force, but nothing above its greatest
     assert core.portrait.min_N < core.scene.force.most_N <= core.portrait.max_N

@@ -69,8 +69,7 @@ def test_stall_torque_and_current_are_those_of_the_data_sheet() -> None:
     # up to full voltage so slowly that nothing but the torque pushes into the stop
     for step in range(steps(6.0)):
         axis.step(min(12.0, step * SUBSTEP_S * 3.0), 0.0)
-    assert axis.speed_rad_s == 0.0
-    assert axis.current_A == pytest.approx(5.5, rel=0.05)
+    assert (axis.speed_rad_s, axis.current_A) == (0.0, pytest.approx(5.5, rel=0.05))
     torque_Nm = axis.contact_N * (LEAD_M_RAD + axis.screw_friction_m)
     assert torque_Nm == pytest.approx(2.65, rel=0.10)
 

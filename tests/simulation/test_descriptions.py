@@ -46,8 +46,7 @@ def test_a_plant_loads_from_a_file_as_by_name(tmp_path) -> None:
 
 def test_assumptions_can_be_overridden_one_by_one(tmp_path) -> None:
     plant = load_plant(written(tmp_path, SAMPLE_1_TEXT + "\n[assumed]\nretract_mm_s = 5.0\n"))
-    assert plant.assumed.retract_mm_s == 5.0
-    assert plant.assumed.homing_mm_s == load_plant("sample_1").assumed.homing_mm_s
+    assert (plant.assumed.retract_mm_s, plant.assumed.homing_mm_s) == (5.0, load_plant("sample_1").assumed.homing_mm_s)
 
 
 @pytest.mark.parametrize(
@@ -144,8 +143,10 @@ def test_another_insert_keeps_what_the_sample_is_off_its_kind() -> None:
         first.elastomer.kinetic_friction,
     ) == pytest.approx((1e-3 * soft.shear_modulus_Pa, soft.relative_permeability, soft.friction_coefficient))
     second = with_insert(load_plant("sample_2"), "MRE-10-10")
-    assert second.elastomer.shear_modulus_kPa == pytest.approx(1e-3 * soft.shear_modulus_Pa * 255.0 / 277.3)
-    assert second.motor == load_plant("sample_2").motor
+    assert (second.elastomer.shear_modulus_kPa, second.motor) == (
+        pytest.approx(1e-3 * soft.shear_modulus_Pa * 255.0 / 277.3),
+        load_plant("sample_2").motor,
+    )
     assert with_insert(load_plant("sample_2"), "MRE-50-40") == load_plant("sample_2")
     with pytest.raises(DomainError, match="MRE-99-99"):
         with_insert(load_plant("sample_1"), "MRE-99-99")

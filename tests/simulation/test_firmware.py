@@ -184,8 +184,7 @@ def test_silence_opens_the_gap_and_latches() -> None:
     assert np.diff(gap_mm, prepend=stood_mm).max() / PERIOD_S < 2 * 20.0
     assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
     assert Switches.HOMED not in host.status.switches
-    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
-    assert host.device.truth.left_A == 0.0
+    assert (host.device.truth.gap_mm, host.device.truth.left_A) == (pytest.approx(95.0, abs=0.6), 0.0)
 
 
 class Ending(NamedTuple):
@@ -300,8 +299,10 @@ def test_what_is_late_goes_on_opening() -> None:
     host.run_until(3.5)
     host.beat(Beat.OFF)
     host.reaches(DeviceMode.LATCHED)
-    assert host.status.faults == DeviceFault.RETRACT_FAILED
-    assert host.device.truth.gap_mm == pytest.approx(2.0 * OPEN_MM, abs=0.3)
+    assert (host.status.faults, host.device.truth.gap_mm) == (
+        DeviceFault.RETRACT_FAILED,
+        pytest.approx(2.0 * OPEN_MM, abs=0.3),
+    )
 
 
 def test_a_fault_is_not_cleared_while_its_cause_lasts() -> None:
@@ -309,8 +310,7 @@ def test_a_fault_is_not_cleared_while_its_cause_lasts() -> None:
     host.run_until(3.5)
     stood_mm = host.device.truth.gap_mm
     host.reaches(DeviceMode.LATCHED)
-    assert host.status.supply_V == 0.0
-    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=0.02)
+    assert (host.status.supply_V, host.device.truth.gap_mm) == (0.0, pytest.approx(stood_mm, abs=0.02))
     assert host.is_refused(Clear)
 
 

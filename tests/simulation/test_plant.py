@@ -188,8 +188,7 @@ def test_time_may_be_cut_in_any_way() -> None:
     for _ in range(3000):
         pieces.advance(0.3 / 3000 / 3)
         pieces.advance(0.3 / 3000 * 2 / 3)
-    assert pieces.truth == whole.truth
-    assert pieces.sensed_force_N == whole.sensed_force_N
+    assert (pieces.truth, pieces.sensed_force_N) == (whole.truth, whole.sensed_force_N)
 
 
 # -- the pad -----------------------------------------------------------------------------------------------------------
@@ -210,9 +209,7 @@ def force_N(plant_name: str, gap_mm: float, depth_mm: float, *, seconds: float =
 def test_a_pad_pushes_harder_the_deeper_and_the_nearer_the_magnets(name: str) -> None:
     depths = [force_N(name, 70.0, depth) for depth in (0.0, 0.5, 1.0, 2.0, 4.5, 6.0)]
     gaps = [force_N(name, gap, 2.0) for gap in (95.0, 80.0, 60.0, 45.0)]
-    assert depths[0] == 0.0
-    assert depths == sorted(depths)
-    assert gaps == sorted(gaps)
+    assert (depths[0], depths, gaps) == (0.0, sorted(depths), sorted(gaps))
     assert 3.0 < gaps[0] < 3.6 < 4.1 < gaps[-1] < 4.7
     # the plates meet: deeper there is nothing to press
     assert force_N(name, 70.0, 9.0) == depths[-1]

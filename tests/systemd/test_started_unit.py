@@ -123,8 +123,7 @@ def real_time_is_granted_to_the_daemon_alone(console) -> None:
     processes = machine.run("cat", f"/sys/fs/cgroup{group}/cgroup.procs").split()
     found = {each: dict(FIFO.findall(machine.run("chrt", "--all-tasks", "--pid", each))) for each in processes}
     control = found.pop(main)
-    assert control.pop(main) == "50"
-    assert set(control.values()) == {"49"}
+    assert (control.pop(main), set(control.values())) == ("50", {"49"})
     assert found
     assert not any(found.values())
 

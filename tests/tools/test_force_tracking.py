@@ -124,9 +124,11 @@ def test_a_publisher_sends_what_follows() -> None:
     publish = publisher(times + 3.0, forces, 0.02)
     assert publish(2.999) is None
     setpoint = publish(3.0101)
-    assert setpoint.force_N == pytest.approx(forces[5])
-    assert setpoint.preview_N == pytest.approx(forces[6:16])
-    assert setpoint.preview_dt_s == 0.002
+    assert (setpoint.force_N, setpoint.preview_N, setpoint.preview_dt_s) == (
+        pytest.approx(forces[5]),
+        pytest.approx(forces[6:16]),
+        0.002,
+    )
     silent = publisher(times, forces, 0.0)(0.1)
     assert silent.preview_N == ()
 

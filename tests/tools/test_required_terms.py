@@ -80,8 +80,7 @@ def test_a_term_is_required_that_costs_more_than_its_share_learning_or_not() -> 
         Without("creep", 0.0, 0.011, NO_COST),
         Without("motor", 0.0099, -0.5, NO_COST),
     )
-    assert required(terms, 0.05, 0.2) == ("rate", "creep")
-    assert required(terms, 0.025, 0.2) == ("rate", "creep", "motor")
+    assert (required(terms, 0.05, 0.2), required(terms, 0.025, 0.2)) == (("rate", "creep"), ("rate", "creep", "motor"))
 
 
 def test_a_choice_is_good_within_the_tolerance_or_beside_the_full_model() -> None:

@@ -36,8 +36,7 @@ def test_a_force_is_found_as_bisection_finds_it(least_N: float, gains_N: list[fl
     ):
         next_to = min(bisect_right(forces_N, force_N), len(forces_N) - 1)
         gap_mm, slope_N_mm = shown.gap_and_slope_at(force_N)
-        assert slope_N_mm == shown.slope_N_mm[next_to]
-        assert gap_mm == shown.gap_mm_at(force_N)
+        assert (slope_N_mm, gap_mm) == (shown.slope_N_mm[next_to], shown.gap_mm_at(force_N))
         assert math.isclose(gap_mm, np.interp(force_N, forces_N, shown.gap_mm), rel_tol=1e-12)
         assert math.isclose(shown.slope_at_N_mm(force_N), np.interp(force_N, forces_N, shown.slope_N_mm), rel_tol=1e-9)
 

@@ -90,8 +90,7 @@ def test_range_and_reach(
 ) -> None:
     scene = Force(least_N=scene_range[0], most_N=scene_range[1], resolution_N=0.1, tolerance_rms_N=0.05)
     ask = decide(governor(scene=scene), 1.0, TimedSetpoint(asked, 1.0, VALID_S))
-    assert ask.force_N == pytest.approx(rendered)
-    assert ask.limits == limits
+    assert (ask.force_N, ask.limits) == (pytest.approx(rendered), limits)
 
 
 def test_without_a_setpoint_the_least_force_is_rendered() -> None:
@@ -108,8 +107,7 @@ def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least() -> Non
     for tick in range(1, 1_000):
         now_s = 1.1 + tick * 1e-3
         ask = decide(following, now_s, setpoint)
-        assert ask.limits == (Limit.STALE,)
-        assert ask.age_s == pytest.approx(now_s - 1.0)
+        assert (ask.limits, ask.age_s) == ((Limit.STALE,), pytest.approx(now_s - 1.0))
         assert np.all(path_N(ask) == ask.force_N)
         assert last_N - ask.force_N <= SCENE.release_N_s * 1e-3 + 1e-8
         assert ask.force_N == pytest.approx(max(0.4, 1.6 - SCENE.release_N_s * tick * 1e-3))
@@ -220,9 +218,11 @@ def test_a_slope_is_learned_and_carried_ahead(lag_s: float) -> None:
     assert path_N(ask) == pytest.approx(1.39 + AFTER_S, abs=1e-3)
     for waited_s, ahead_N in ((0.0, 1.39), (0.01, 1.40), (AHEAD_S, 1.44), (0.09, 1.44)):
         later = decide(following, 0.4 + waited_s, TimedSetpoint(1.39, 0.4, VALID_S), lag_s)
-        assert path_N(later)[0] == pytest.approx(ahead_N, abs=1e-3)
-        assert later.force_N == pytest.approx(1.39)
-        assert later.foresight == 0.0
+        assert (path_N(later)[0], later.force_N, later.foresight) == (
+            pytest.approx(ahead_N, abs=1e-3),
+            pytest.approx(1.39),
+            0.0,
+        )
 
 
 @settings(max_examples=100, deadline=None)
@@ -247,16 +247,16 @@ def test_a_jump_at_a_flat_force_gives_the_slope_renderable_there() -> None:
 def test_setpoints_with_equal_stamps_have_no_slope_between_them() -> None:
     following, _ = stream_of([1.0, 1.02, 1.04])
     slope_N_s = following.slope_N_s
-    assert decide(following, 0.031, TimedSetpoint(1.5, 0.03, VALID_S)).force_N == 1.5
-    assert following.slope_N_s == slope_N_s
+    assert (decide(following, 0.031, TimedSetpoint(1.5, 0.03, VALID_S)).force_N, following.slope_N_s) == (
+        1.5,
+        slope_N_s,
+    )
 
 
 def test_a_stamp_ahead_of_the_clock_is_of_no_age() -> None:
     following, _ = stream_of(RAMP_N)
     ask = decide(following, 0.41, TimedSetpoint(1.4, 0.45, VALID_S))
-    assert ask.age_s == pytest.approx(-0.04)
-    assert path_N(ask)[0] == pytest.approx(1.4)
-    assert ask.limits == ()
+    assert (ask.age_s, path_N(ask)[0], ask.limits) == (pytest.approx(-0.04), pytest.approx(1.4), ())
 
 
 @pytest.mark.parametrize("now_s", [1.0, 0.5, -10.0])
@@ -288,9 +288,12 @@ def swing_N(time_s: float) -> float:
 def test_a_preview_is_what_comes(seconds: float, ahead_s: float) -> None:
     """A swing that no slope foresees; the path goes along it."""
     ask = told(swing_N, seconds, ahead_s=ahead_s)
-    assert path_N(ask) == pytest.approx([swing_N(seconds + after_s) for after_s in PATH_S], abs=2e-3)
-    assert ask.force_N == ask.path_N[0]
-    assert (ask.limits, ask.foresight) == ((), 1.0)
+    assert (path_N(ask), ask.force_N, ask.limits, ask.foresight) == (
+        pytest.approx([swing_N(seconds + after_s) for after_s in PATH_S], abs=2e-3),
+        ask.path_N[0],
+        (),
+        1.0,
+    )
 
 
 def step_N(time_s: float) -> float:
@@ -305,8 +308,7 @@ def test_what_is_too_fast_is_missed_before_and_after() -> None:
     assert 1.4 < there.force_N < 1.6
     assert there.limits == (Limit.RATE,)
     long_after = told(step_N, 1.4)
-    assert path_N(long_after) == pytest.approx(1.8, abs=2e-3)
-    assert long_after.limits == ()
+    assert (path_N(long_after), long_after.limits) == (pytest.approx(1.8, abs=2e-3), ())
     # of what is not known nobody can be ahead
     assert told(step_N, 0.88, ahead_s=0.05).force_N == pytest.approx(1.2)
 

@@ -35,8 +35,7 @@ def test_a_step_is_met_in_its_middle() -> None:
     """As much too soon as too late: the gap is half way where the step is."""
     path = path_mm(60.0, [60.0] * 20 + [64.0] * 20, [1.0] * 40)
     assert (path[19], path[20]) == pytest.approx((62.0 - MOST_MM / 2.0, 62.0 + MOST_MM / 2.0))
-    assert path[:14] == pytest.approx([60.0] * 14)
-    assert path[26:] == pytest.approx([64.0] * 14)
+    assert (path[:14], path[26:]) == (pytest.approx([60.0] * 14), pytest.approx([64.0] * 14))
 
 
 def test_where_the_force_hardly_depends_on_the_gap_more_is_given_up() -> None:
@@ -47,8 +46,9 @@ def test_where_the_force_hardly_depends_on_the_gap_more_is_given_up() -> None:
 def test_the_first_gap_is_within_reach_of_the_last() -> None:
     for elapsed_s in (0.0, 0.002, 0.5):
         path = path_mm(60.0, [70.0] * 10, [1.0] * 10, elapsed_s)
-        assert path[0] == pytest.approx(min(60.0 + SPEED_MM_S * elapsed_s, 70.0))
-        assert path[1] == pytest.approx(min(path[0] + MOST_MM, 70.0))
+        assert (path[0], path[1]) == pytest.approx(
+            (min(60.0 + SPEED_MM_S * elapsed_s, 70.0), min(path[0] + MOST_MM, 70.0))
+        )
 
 
 def test_no_more_of_it_is_told_than_is_asked_for() -> None:

@@ -24,8 +24,7 @@ CREEPING = {"handle": Handle(MOBILISED_MM, 1.0, TURN, 1.0)}
 
 def test_the_device_is_learned_from_measured_over_predicted_force(core, hear, moving) -> None:
     plan = hear(core.planner(), 8.0, moving(force_N=1.2 * 1.08)).planned
-    assert plan.predicted_N == pytest.approx(1.2 * 1.08, rel=0.01)
-    assert plan.trim == pytest.approx(1.2, rel=0.02)
+    assert (plan.predicted_N, plan.trim) == (pytest.approx(1.2 * 1.08, rel=0.01), pytest.approx(1.2, rel=0.02))
     assert Limit.TRIM not in plan.limits
     # a model that is too low in force is corrected by a wider gap
     assert plan.gap_mm > hear(core.planner(), 8.0, moving()).planned.gap_mm + 3.0
@@ -182,8 +181,7 @@ def test_what_a_force_says_before_homing_and_before_break_away_is_not_predicted(
 def test_what_is_known_of_the_lag_outlasts_what_the_sensor_teaches(planner, hear, moving, changes, is_doubted) -> None:
     planner.teach(Learned(lag_s=0.02))
     believed = hear(planner, 1.2, moving(**changes)).believe
-    assert believed.sensor.is_doubted == is_doubted
-    assert (believed.read, believed.carriages.lag_s) == (299, 0.02)
+    assert (believed.sensor.is_doubted, believed.read, believed.carriages.lag_s) == (is_doubted, 299, 0.02)
 
 
 @pytest.fixture

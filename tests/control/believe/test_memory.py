@@ -92,9 +92,11 @@ def test_the_field_lags_along_its_way_and_not_in_time(follow) -> None:
     remembered = follow()
     assert remembered.lag_at_mT(500.0) == 0.0  # nothing is known yet
     remembered.field_mT, remembered.lag_mT, remembered.time_s = 400.0, 3.0, 0.0
-    assert remembered.lag_at_mT(400.0) == 3.0
-    assert remembered.lag_at_mT(2_000.0) == pytest.approx(8.0)
-    assert remembered.lag_at_mT(-2_000.0) == pytest.approx(-8.0)
+    assert (remembered.lag_at_mT(400.0), remembered.lag_at_mT(2_000.0), remembered.lag_at_mT(-2_000.0)) == (
+        3.0,
+        pytest.approx(8.0),
+        pytest.approx(-8.0),
+    )
     at_once_mT, halfway_mT = remembered.lag_at_mT(460.0), remembered.lag_at_mT(430.0)
     remembered.field_mT, remembered.lag_mT = 430.0, halfway_mT
     assert remembered.lag_at_mT(460.0) == pytest.approx(at_once_mT)
@@ -107,8 +109,7 @@ def test_an_element_without_memory_or_a_past_is_as_its_gap(follow, gaps_mm: tupl
 
 
 def test_each_can_be_left_out() -> None:
-    assert MEMORY.of(relaxes=lambda _: True, hysteresis=True) == MEMORY
-    assert MEMORY.of(relaxes=lambda _: True, hysteresis=False) == STEADY
+    assert [MEMORY.of(relaxes=lambda _: True, hysteresis=lags) for lags in (True, False)] == [MEMORY, STEADY]
     assert MEMORY.of(relaxes=lambda _: False, hysteresis=True) == Memory(lag_mT=8.0, turn_mT=80.0)
     short = MEMORY.of(relaxes=lambda time_s: time_s < 100.0, hysteresis=False)
     assert short == Memory(fractions=(0.05, 0.04), times_s=(8.0, 90.0), turn_mT=80.0)
@@ -124,8 +125,7 @@ RELAXED = 0.13
 
 def test_a_device_that_is_found_homed_has_rested_there(follow, element: Element) -> None:
     remembered = follow(found(95.0), memory=element.memory)
-    assert remembered.relaxed_N == pytest.approx(RELAXED * 0.62, rel=0.1)
-    assert remembered.lag_mT == 0.0
+    assert (remembered.relaxed_N, remembered.lag_mT) == (pytest.approx(RELAXED * 0.62, rel=0.1), 0.0)
 
 
 @pytest.mark.parametrize("rested_mm", [79.0, 44.0])

@@ -56,14 +56,12 @@ def test_it_is_learned_within_the_time_that_a_person_takes_to_notice() -> None:
 
 def test_of_a_known_device_a_creep_shows_its_static_friction_and_no_more() -> None:
     """Nothing judges the sensor at a creep: one that reads too little closes the gap by a tenth at most."""
-    assert crept(0.6, 10.0, fit=KNOWN).factor == MIN_STATIC
-    assert crept(5.0, 10.0, fit=KNOWN).factor == MAX_STATIC
+    assert [crept(share, 10.0, fit=KNOWN).factor for share in (0.6, 5.0)] == [MIN_STATIC, MAX_STATIC]
 
 
 def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:
-    assert crept(0.75, 10.0).factor_at(1.0) == pytest.approx(0.75, abs=0.01)
-    assert crept(1.35, 10.0).factor_at(1.0) == pytest.approx(1.35, abs=0.01)
-    assert crept(0.59, 10.0).factor_at(1.0) == pytest.approx(0.59, abs=0.01)
+    shares = [0.75, 1.35, 0.59]
+    assert [crept(share, 10.0).factor_at(1.0) for share in shares] == pytest.approx(shares, abs=0.01)
     assert crept(0.5, 10.0).factor == MIN_FACTOR
     assert crept(5.0, 10.0).factor <= MAX_FACTOR
 

@@ -55,8 +55,7 @@ def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
     """What relaxes is an offset: a device that is known is not believed to have become another."""
     known = shown([(1.0, 0.7), (2.0, 2.0)], 1.1, 0.0)
     drifted = shown([(1.5, 2.0)], 1.1, -0.1, known)
-    assert drifted.force_N(2.0) == pytest.approx(2.1, abs=0.02)
-    assert drifted.scale == pytest.approx(1.1, abs=0.05)
+    assert (drifted.force_N(2.0), drifted.scale) == (pytest.approx(2.1, abs=0.02), pytest.approx(1.1, abs=0.05))
 
 
 def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
@@ -121,8 +120,9 @@ def test_over_the_force_without_memory_it_says_the_same(relaxed_N: float) -> Non
     fit = DeviceFit(0.9, -0.05, 0.01, -0.004, 0.006)
     over = fit.relaxed(relaxed_N)
     for model_N in (0.5, 1.0, 2.0):
-        assert over.force_N(model_N) == pytest.approx(fit.force_N(model_N - relaxed_N))
-        assert over.deviation_N(model_N) == pytest.approx(fit.deviation_N(model_N - relaxed_N))
+        assert (over.force_N(model_N), over.deviation_N(model_N)) == pytest.approx(
+            (fit.force_N(model_N - relaxed_N), fit.deviation_N(model_N - relaxed_N))
+        )
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
@@ -131,8 +131,9 @@ def test_of_so_many_times_the_force_it_is_as_many_times_as_unsure(factor: float)
     more = fit.times(factor)
     assert (more.scale_sd, more.offset_sd_N) == pytest.approx((factor * 0.1, factor * math.sqrt(0.006)))
     for model_N in (0.5, 2.0):
-        assert more.force_N(model_N) == pytest.approx(factor * fit.force_N(model_N))
-        assert more.deviation_N(model_N) == pytest.approx(factor * fit.deviation_N(model_N))
+        assert (more.force_N(model_N), more.deviation_N(model_N)) == pytest.approx(
+            (factor * fit.force_N(model_N), factor * fit.deviation_N(model_N))
+        )
 
 
 def test_what_is_known_is_forgotten_in_its_time() -> None:
@@ -141,8 +142,11 @@ def test_what_is_known_is_forgotten_in_its_time() -> None:
     offset_lasts_s = 2.0 * OFFSET_SD_N**2 * adapts_in_s**2 / ERROR_N2_S
     left = math.exp(-2.0)
     warmed, relaxed = (forgotten(known, dt_s, adapts_in_s) for dt_s in (SCALE_LASTS_S, offset_lasts_s))
-    assert (warmed.scale, warmed.offset_N) == (known.scale, known.offset_N)
-    assert warmed.scale_variance == pytest.approx(SCALE_SD**2 + left * (0.01 - SCALE_SD**2))
+    assert (warmed.scale, warmed.offset_N, warmed.scale_variance) == (
+        known.scale,
+        known.offset_N,
+        pytest.approx(SCALE_SD**2 + left * (0.01 - SCALE_SD**2)),
+    )
     assert relaxed.offset_variance_N2 == pytest.approx(OFFSET_SD_N**2 + left * (0.002 - OFFSET_SD_N**2))
     half = forgotten(known, 0.5 * offset_lasts_s, adapts_in_s)
     twice = forgotten(half, 0.5 * offset_lasts_s, adapts_in_s)

@@ -64,8 +64,7 @@ def test_an_ordinary_homing(home: Home, zeroed: bool) -> None:
 def test_a_carriage_that_closes_is_named_before_it_has_gone_far(home: Home, left_mm: float) -> None:
     home.travel(left_mm, -15.0)
     assert home.faults[0] is Fault.WRONG_DIRECTION
-    gone_mm = [round(mm, 1) for mm in home.homing.went_back_mm]
-    assert max(gone_mm) > BACKS_OFF_MM
+    assert max(round(mm, 1) for mm in home.homing.went_back_mm) > BACKS_OFF_MM
     assert "back towards closed" in str(home.homing)
 
 

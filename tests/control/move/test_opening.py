@@ -144,9 +144,7 @@ def test_a_homing_and_a_device_that_was_away_are_no_failure(opens: Opens) -> Non
 
 
 def test_open_is_by_places_or_by_both_switches(measure) -> None:
-    near = measure(1, left_mm=-OPEN_MM, right_mm=0.1)
-    assert is_open(near, True)
-    assert not is_open(near, False)
-    assert not is_open(measure(1, left_mm=-OPEN_MM, right_mm=-OPEN_MM - 0.1), True)
-    assert is_open(measure(1, switches=BOTH), False)
-    assert not is_open(measure(1, switches=Switches.LEFT_OPEN), False)
+    near, off = (measure(1, left_mm=-OPEN_MM, right_mm=right_mm) for right_mm in (0.1, -OPEN_MM - 0.1))
+    assert (is_open(near, True), is_open(near, False), is_open(off, True)) == (True, False, False)
+    found = [is_open(measure(1, switches=switches), False) for switches in (BOTH, Switches.LEFT_OPEN)]
+    assert found == [True, False]

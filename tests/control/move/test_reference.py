@@ -49,8 +49,10 @@ def test_speed_and_acceleration_limits_hold_for_any_target(
         if is_speeding_up:
             torque = max(0.0, 1.0 - abs(last.speed_mm_s) / speeds.no_load_mm_s)
             assert abs(change) <= most * torque * (1.0 + 1e-9) + 1e-12
-        assert reference.gap_mm == pytest.approx(last.gap_mm + reference.speed_mm_s * dt_s)
-        assert reference.acceleration_mm_s2 == pytest.approx(change / dt_s, rel=1e-6, abs=1e-6)
+        assert (reference.gap_mm, reference.acceleration_mm_s2) == (
+            pytest.approx(last.gap_mm + reference.speed_mm_s * dt_s),
+            pytest.approx(change / dt_s, rel=1e-6, abs=1e-6),
+        )
 
 
 @settings(max_examples=150, deadline=None)
@@ -161,8 +163,7 @@ def test_what_is_expected_never_leaves_what_was_asked(
     reached = [gap for gap, _, _ in references]
     fastest = max(abs(speed) for _, speed, _ in references)
     assert min(reached) - 1e-9 <= expected.gap_mm <= max(reached) + 1e-9
-    assert abs(expected.speed_mm_s) <= fastest + 1e-9
-    assert abs(expected.filtered_mm_s) <= fastest + 1e-9
+    assert max(abs(expected.speed_mm_s), abs(expected.filtered_mm_s)) <= fastest + 1e-9
 
 
 def test_what_is_expected_of_a_ramp_is_late_by_the_lag() -> None:

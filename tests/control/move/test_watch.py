@@ -48,8 +48,7 @@ def test_a_stale_measurement(running) -> None:
     running.silent(newest, count=round(TIMEOUT_S / PERIOD_S) - 1)
     assert not running.faults
     running.silent(newest)
-    assert running.faults == (Fault.MEASUREMENT_STALE,)
-    assert running.is_opened
+    assert running.opened_for == (Fault.MEASUREMENT_STALE,)
 
 
 def test_a_measurement_over_a_slow_line(running) -> None:
@@ -72,8 +71,7 @@ def test_a_scene_that_does_without_the_sensor_does_without_its_messages(core, ma
     force = msgspec.structs.replace(core.scene.force, tolerance_rms_N=0.5 * core.scene.force.most_N)
     bench = make_bench(msgspec.structs.replace(core.scene, force=force)).enabled()
     bench.step(count=200)
-    assert bench.step(count=500, sensed_s=bench.now_s).limits == (Limit.SENSE_STALE,)
-    assert not bench.faults
+    assert (bench.step(count=500, sensed_s=bench.now_s).limits, bench.faults) == ((Limit.SENSE_STALE,), ())
 
 
 def test_a_status_that_stops_is_a_fault(running) -> None:
@@ -195,10 +193,9 @@ def test_carriages_that_go_the_other_way_are_named(running, target_mm: float) ->
         output = running.step(target_mm, left_mm=at_mm, right_mm=at_mm)
         at_mm -= 15.0 * output.left_duty * PERIOD_S
         assert running.ticks < 300
-    assert running.faults[0] is Fault.WRONG_DIRECTION
+    assert running.opened_for
+    assert (running.faults[0], running.stepper.safety.needs_homing) == (Fault.WRONG_DIRECTION, True)
     assert abs(at_mm + 7.5) < 2.5
-    assert running.is_opened
-    assert running.stepper.safety.needs_homing
 
 
 def test_a_carriage_that_goes_the_other_way_into_its_stop_is_named(running) -> None:
@@ -236,8 +233,7 @@ def test_too_much_force_opens_and_is_then_a_fault(running) -> None:
     ],
 )
 def test_a_wire_or_a_clock_that_is_not_what_it_should_be_is_a_limit(running, link: LinkQuality, limits) -> None:
-    assert running.step(count=50, link=link).limits == limits
-    assert not running.faults
+    assert (running.step(count=50, link=link).limits, running.faults) == (limits, ())
 
 
 @pytest.mark.parametrize(
