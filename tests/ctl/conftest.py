@@ -1,5 +1,6 @@
 """A daemon made of sockets only: it answers what a test tells it to and publishes steadily."""
 
+import json
 import math
 import tempfile
 import threading
@@ -7,13 +8,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 import msgspec
 import pytest
 import zmq
 
+from tormagd.ctl.main import main
 from tormagd_client.messages import VERSION, Setpoint, Telemetry, Tick, decode, encode
 
 COLUMNS = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "left_duty", "right_duty")
@@ -154,6 +156,7 @@ class FakeDaemon(threading.Thread):
         super().__init__(daemon=True)
         self.directory = directory
         self.control = f"ipc://{directory}/control"
+        self.at = ("--endpoint", self.control)
         self.answers: dict[str, Callable[[], dict[str, Any]]] = {
             "status": lambda: {"ok": True, "result": status(setpoints=self.taken())},
             "describe": lambda: {"ok": True, "result": DESCRIPTION},
@@ -219,6 +222,46 @@ class FakeDaemon(threading.Thread):
                 recording.send(data)
             seq += 1
         context.destroy(linger=0)
+
+
+class Ran(NamedTuple):
+    """How a command ended, and what it wrote."""
+
+    code: int
+    out: str
+    err: str
+
+    def ended(self, code: int) -> "Ran":
+        """The same, which has to have ended so."""
+        assert self.code == code, self
+        return self
+
+    @property
+    def said(self) -> dict[str, Any]:
+        """The object of `--json`, which has all its keys."""
+        found: dict[str, Any] = json.loads(self.out)
+        assert (list(found), found["ok"]) == (["command", "ok", "result", "error"], self.code == 0)
+        return found
+
+    @property
+    def result(self) -> Any:
+        return self.said["result"]
+
+    @property
+    def error(self) -> Any:
+        return self.said["error"]
+
+
+@pytest.fixture
+def ctl(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+    """Runs `tormagctl` with these arguments."""
+
+    def run(*arguments: str) -> Ran:
+        capsys.readouterr()
+        code = main(list(arguments))
+        return Ran(code, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture

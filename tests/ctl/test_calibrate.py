@@ -20,7 +20,6 @@ from tormagd.ctl import calibrate as ctl_calibrate, calibrate_motors as ctl_cali
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
 from tormagd.ctl.calibrate_run import Range
-from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
 from tormagd.lab.training import calibration
 from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
@@ -260,7 +259,7 @@ def test_a_motor_log_with_a_hole_is_refused():
         motor_log(given, "left")
 
 
-def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monkeypatch, capsys):
+def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monkeypatch, ctl):
     class Played:
         def play(self, waveform, bar):
             assert waveform.at(0.0).force_N > 0.6
@@ -270,8 +269,7 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monk
     fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0)
     out = tmp_path / "right.csv"
     arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--motors", "--side", "right"]
-    assert main([*arguments, "--out", str(out)]) == 0
-    assert json.loads(capsys.readouterr().out)["result"]["rows"] == 299
+    assert ctl(*arguments, "--out", str(out)).ended(0).result["rows"] == 299
     with out.open(newline="") as file:
         written = list(csv.DictReader(file))
     assert (list(written[0]), float(written[1]["t_s"]), float(written[1]["position_mm"])) == (
@@ -295,12 +293,11 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monk
         (("--insert", "A", "--out", "m"), "--yes"),
     ],
 )
-def test_what_cannot_be_meant_is_a_usage_error(tmp_path, monkeypatch, capsys, arguments, told):
+def test_what_cannot_be_meant_is_a_usage_error(tmp_path, monkeypatch, ctl, arguments, told):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.stdin", open("/dev/null"))  # noqa: SIM115, PTH123
     Path("there").write_text("precious")
-    assert main(["calibrate", *arguments]) == 2
-    assert told in capsys.readouterr().err
+    assert told in ctl("calibrate", *arguments).ended(2).err
     assert Path("there").read_text() == "precious"
 
 
@@ -314,13 +311,12 @@ def test_what_cannot_be_meant_is_a_usage_error(tmp_path, monkeypatch, capsys, ar
     ],
 )
 def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_moves(
-    fake_daemon, status_with, source_with, tmp_path, capsys, name, age_ms, state, told, asked
+    fake_daemon, status_with, source_with, tmp_path, ctl, name, age_ms, state, told, asked
 ):
     setpoints = status_with()["setpoints"] | {"by_source": {"a": source_with(state=state)}}
     fake_daemon.says(setpoint_age_ms=age_ms, setpoints=setpoints)
     arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", name]
-    assert main([*arguments, "--out", str(tmp_path / "m.safetensors")]) == 1
-    assert told[1] in json.loads(capsys.readouterr().out)["error"][told[0]]
+    assert told[1] in ctl(*arguments, "--out", str(tmp_path / "m.safetensors")).ended(1).error[told[0]]
     assert fake_daemon.commands == asked
 
 

@@ -1,4 +1,3 @@
-import json
 import subprocess
 import sys
 from itertools import chain, repeat
@@ -15,15 +14,6 @@ from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
 from tormagd.scenes.scene import TERMS
 from tormagd_client.messages import Status
-
-
-def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    code = main([*arguments, "--json"])
-    printed = json.loads(capsys.readouterr().out)
-    assert list(printed) == ["command", "ok", "result", "error"]
-    assert printed["ok"] == (code == 0)
-    return code, printed
-
 
 SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}
 IN_FAULT = {"operating_state": "FAULT", "faults": ["SUPPLY"], "fault_details": [SUPPLY]}
@@ -96,49 +86,45 @@ ANSWERS: dict[str, list[Row]] = {
     [(command, *row) for command, rows in ANSWERS.items() for row in rows],
 )
 def test_what_a_daemon_answers_decides_the_exit_code_and_is_told(
-    fake_daemon, capsys, command, status, result, code, words
+    fake_daemon, ctl, command, status, result, code, words
 ):
     fake_daemon.says(**status)
     name = command.removeprefix("--json ").split()[0]
     if name != "status":
         fake_daemon.answers[name] = lambda: {"ok": True, "result": result}
-    assert main(["--endpoint", fake_daemon.control, *command.split()]) == code
-    printed = "".join(capsys.readouterr())
+    printed = "".join(ctl(*fake_daemon.at, *command.split()).ended(code)[1:])
     assert [word for word in words if word not in printed] == []
     assert command != "take b" or fake_daemon.requests[-1]["args"] == {"source": "b"}
 
 
 @pytest.mark.parametrize(("code", "expected"), [("not_homed", 1), ("fault", 4), ("device_latched", 4)])
-def test_a_refusal_tells_code_message_and_hint(fake_daemon, capsys, code, expected):
+def test_a_refusal_tells_code_message_and_hint(fake_daemon, ctl, code, expected):
     """As keys for a script; for a person on stderr, with the next step last."""
     fake_daemon.refuse("enable", code)
-    exit_code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "enable")
-    assert exit_code == expected
-    assert printed["error"] == {"code": code, "message": "cannot enable", "hint": "do this first"}
-    assert main(["--endpoint", fake_daemon.control, "enable"]) == expected
-    captured = capsys.readouterr()
+    refused = ctl(*fake_daemon.at, "--json", "enable").ended(expected)
+    assert refused.error == {"code": code, "message": "cannot enable", "hint": "do this first"}
+    captured = ctl(*fake_daemon.at, "enable").ended(expected)
     assert (captured.out, captured.err) == ("", "tormagctl enable: cannot enable\n  next: do this first\n")
 
 
 @pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
-def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, command):
+def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, ctl, command):
     done = {"operating_state": DONE[command][1][0]}
     fake_daemon.answers[command] = lambda: {"ok": True, "result": done}
     at_once = ["--no-wait"] if command in ("disable", "stop") else []
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command, *at_once)
-    assert (code, printed["command"], printed["result"]) == (0, command, done)
+    printed = ctl(*fake_daemon.at, "--json", command, *at_once).said
+    assert (printed["ok"], printed["command"], printed["result"]) == (True, command, done)
     assert fake_daemon.commands == (["status", command] if command == "clear-fault" else [command])
 
 
-def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_daemon, capsys):
+def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_daemon, ctl):
     def clear():
         fake_daemon.says(operating_state="DISABLED")
         return {"ok": True, "result": {"operating_state": "DISABLED"}}
 
     fake_daemon.answers["clear-fault"] = clear
     fake_daemon.says(operating_state="FAULT", faults=["STOPPED"])
-    assert main(["--endpoint", fake_daemon.control, "clear-fault"]) == 0
-    assert "fault cleared. tormagctl home, then enable" in capsys.readouterr().out
+    assert "fault cleared. tormagctl home, then enable" in ctl(*fake_daemon.at, "clear-fault").ended(0).out
     assert (fake_daemon.commands[:2], set(fake_daemon.commands[2:])) == (["status", "clear-fault"], {"status"})
 
 
@@ -146,11 +132,10 @@ def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_d
     "arguments",
     [["status"], ["home"], ["send", "step"], ["record", "out.mcap"], ["firmware"], ["metrics"], ["dashboard"]],
 )
-def test_without_a_daemon_every_command_ends_with_3(run_dir, capsys, arguments, monkeypatch):
+def test_without_a_daemon_every_command_ends_with_3(run_dir, ctl, arguments, monkeypatch):
     monkeypatch.chdir(run_dir)
-    code, printed = run_json(capsys, "--endpoint", f"ipc://{run_dir}/control", "--wait", "0.05", *arguments)
-    assert (code, printed["error"]["code"]) == (3, "unreachable")
-    assert "start the daemon" in printed["error"]["hint"]
+    error = ctl("--endpoint", f"ipc://{run_dir}/control", "--wait", "0.05", "--json", *arguments).ended(3).error
+    assert (error["code"], "start the daemon" in error["hint"]) == ("unreachable", True)
     assert list(run_dir.iterdir()) == []
 
 
@@ -176,36 +161,33 @@ def test_usage_errors_exit_2(arguments, capsys):
     assert "usage:" in capsys.readouterr().err
 
 
-def test_scenes_are_listed_and_shown(capsys):
-    listed = run_json(capsys, "scene", "list")[1]["result"]["scenes"]
+def test_scenes_are_listed_and_shown(ctl):
+    listed = ctl("--json", "scene", "list").result["scenes"]
     assert {"coronary", "pulse", "brain"} <= {scene["name"] for scene in listed}
-    shown = run_json(capsys, "scene", "show", "pulse")[1]["result"]
+    shown = ctl("--json", "scene", "show", "pulse").result
     assert (shown["name"], shown["insert"]["gap_open_mm"]) == ("pulse", 95.0)
     # without a name: the configuration's
-    assert run_json(capsys, "scene", "show")[1]["result"]["name"] == "coronary"
+    assert ctl("--json", "scene", "show").result["name"] == "coronary"
 
 
-def test_a_scene_without_a_signal_is_shown_as_toml(tmp_path, capsys):
+def test_a_scene_without_a_signal_is_shown_as_toml(tmp_path, ctl):
     scene = tmp_path / "scene.toml"
     text = 'name = "x"\ndescription = ""\n[force]\nleast_N = 0.0\nmost_N = 2.0\nresolution_N = 0.1\n'
     scene.write_text(f'{text}tolerance_rms_N = 0.05\n[insert]\nname = "MRE-50-40"\nmodel = "torque_mre_50_40"\n')
-    assert main(["scene", "show", str(scene)]) == 0
-    shown = capsys.readouterr().out
+    shown = ctl("scene", "show", str(scene)).ended(0).out
     assert "signal" not in shown
     assert "rate = true" in shown
 
 
-def test_a_scene_is_checked_as_the_daemon_does(capsys):
-    assert main(["--json", "scene", "check", "brain"]) == 0
-    result = json.loads(capsys.readouterr().out)["result"]
+def test_a_scene_is_checked_as_the_daemon_does(ctl):
+    result = ctl("--json", "scene", "check", "brain").ended(0).result
     assert result["least_N"] == pytest.approx(0.157, abs=0.01)
     assert 0.0 < result["core_share"] < result["core_share_allowed"]
     assert result["missed_rms_N"] < 0.001
 
 
-def test_a_decision_is_explained_with_what_was_measured(capsys):
-    assert main(["scene", "explain", "brain"]) == 0
-    text = capsys.readouterr().out
+def test_a_decision_is_explained_with_what_was_measured(ctl):
+    text = ctl("scene", "explain", "brain").ended(0).out
     assert all(said in text for said in (*TERMS, "500 Hz      83 Hz", "nearest", "sample_3 learning"))
 
 
@@ -234,11 +216,9 @@ def states(status_with: Any) -> Any:
         [(False, False), (True, False)],  # over between two looks
     ],
 )
-def test_home_waits_until_the_device_is_homed(fake_daemon, capsys, states, sequence):
+def test_home_waits_until_the_device_is_homed(fake_daemon, ctl, states, sequence):
     fake_daemon.answers["status"] = states(*sequence)
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home")
-    assert code == 0
-    assert printed["result"]["seconds"] >= 0.0
+    assert ctl(*fake_daemon.at, "--json", "home").ended(0).result["seconds"] >= 0.0
     assert fake_daemon.commands == ["status", "home", *["status"] * (len(sequence) - 1)]
 
 
@@ -250,16 +230,16 @@ def test_home_waits_until_the_device_is_homed(fake_daemon, capsys, states, seque
         ([(True, False)], "5", "not_begun"),
     ],
 )
-def test_home_that_does_not_succeed_says_how(fake_daemon, capsys, monkeypatch, states, sequence, timeout, expected):
+def test_home_that_does_not_succeed_says_how(fake_daemon, ctl, monkeypatch, states, sequence, timeout, expected):
     monkeypatch.setattr("tormagd.ctl.operate.BEGIN_S", 0.2)
     fake_daemon.answers["status"] = states(*sequence)
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home", "--timeout", timeout)
-    assert (code, printed["error"]["code"]) == (1, expected)
+    ended = ctl(*fake_daemon.at, "--json", "home", "--timeout", timeout)
+    assert (ended.code, ended.error["code"]) == (1, expected)
 
 
-def test_home_no_wait_returns_at_once(fake_daemon, capsys, states):
+def test_home_no_wait_returns_at_once(fake_daemon, ctl, states):
     fake_daemon.answers["status"] = states((False, False), (False, True))
-    assert run_json(capsys, "--endpoint", fake_daemon.control, "home", "--no-wait")[0] == 0
+    assert ctl(*fake_daemon.at, "--json", "home", "--no-wait").said["ok"]
     assert fake_daemon.commands == ["status", "home"]
 
 
@@ -392,7 +372,7 @@ def test_a_command_loads_only_what_it_needs(command, run_dir):
     assert ran.stderr.splitlines()[-1] == "[]"
 
 
-def test_a_black_box_is_fetched_once_it_is_written(fake_daemon, status_with, capsys, tmp_path):
+def test_a_black_box_is_fetched_once_it_is_written(fake_daemon, status_with, ctl, tmp_path):
     original, copy = tmp_path / "20260101T000000.000Z-REQUEST.mcap", tmp_path / "mine.mcap"
     original.write_bytes(b"what is in it")
     boxes = iter([{"newest": "an older one"}, {"newest": original.name}])
@@ -401,25 +381,23 @@ def test_a_black_box_is_fetched_once_it_is_written(fake_daemon, status_with, cap
         "ok": True,
         "result": status_with(black_box={"folder": str(tmp_path)} | next(boxes)),
     }
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "blackbox", str(copy))
-    assert (code, printed["result"]) == (0, {"file": str(copy), "original": str(original)})
+    fetch = (*fake_daemon.at, "--json", "blackbox", str(copy))
+    assert ctl(*fetch).ended(0).result == {"file": str(copy), "original": str(original)}
     assert copy.read_bytes() == b"what is in it"
     # nothing is overwritten, and nothing asked for
     asked = list(fake_daemon.commands)
-    assert run_json(capsys, "--endpoint", fake_daemon.control, "blackbox", str(copy))[0] == 2
-    assert fake_daemon.commands == asked
+    assert (ctl(*fetch).code, fake_daemon.commands) == (2, asked)
 
 
-def test_a_black_box_that_cannot_be_had_says_why(fake_daemon, capsys, tmp_path):
+def test_a_black_box_that_cannot_be_had_says_why(fake_daemon, ctl, tmp_path):
     fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/nowhere/a.mcap"}}
     fake_daemon.says(black_box={"folder": "/nowhere", "refusal": "/nowhere/a.mcap: No space left on device"})
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "blackbox")
-    assert (code, printed["error"]["code"]) == (1, "not_written")
-    assert "No space left" in printed["error"]["message"]
+    fetch = (*fake_daemon.at, "--json", "blackbox")
+    error = ctl(*fetch).ended(1).error
+    assert (error["code"], "No space left" in error["message"]) == ("not_written", True)
     fake_daemon.refuse("blackbox", "no_black_box")
-    assert run_json(capsys, "--endpoint", fake_daemon.control, "blackbox")[1]["error"]["code"] == "no_black_box"
+    assert ctl(*fetch).error["code"] == "no_black_box"
     fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/nowhere/b.mcap"}}
     fake_daemon.says(black_box={"newest": "b.mcap"})
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "blackbox", str(tmp_path / "a.mcap"))
-    assert (code, printed["error"]["code"]) == (2, "usage")
-    assert "/nowhere/b.mcap on the daemon's machine" in printed["error"]["hint"]
+    error = ctl(*fetch, str(tmp_path / "a.mcap")).ended(2).error
+    assert (error["code"], "/nowhere/b.mcap on the daemon's machine" in error["hint"]) == ("usage", True)

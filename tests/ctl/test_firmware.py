@@ -1,20 +1,18 @@
 """`tormagctl firmware`: the link's report as it is, and as text."""
 
-import json
 import sys
 from typing import Any, get_args, get_type_hints
 
 import msgspec
 import pytest
 
-from tormagd.ctl.main import main
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import firmware_text
 from tormagd_client.messages import LinkReport
 
 
 @pytest.fixture
-def text(status_with: Any, capsys: pytest.CaptureFixture[str]) -> Any:
+def text(status_with: Any) -> Any:
     link = status_with()["link"]
     return lambda **changes: firmware_text(msgspec.convert(link | changes, LinkReport), Colour(sys.stdout))
 
@@ -47,10 +45,8 @@ def test_nothing_known_is_no_error(text: Any) -> None:
     assert "None" not in shown
 
 
-def test_the_keys_of_json_are_the_links(fake_daemon: Any, status_with: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_keys_of_json_are_the_links(fake_daemon: Any, status_with: Any, ctl: Any) -> None:
     known = status_with()["link"] | {"of a newer daemon": 1}
     fake_daemon.says(link=known)
-    assert main(["--endpoint", fake_daemon.control, "--json", "firmware"]) == 0
-    assert json.loads(capsys.readouterr().out)["result"] == known
-    assert main(["--endpoint", fake_daemon.control, "firmware"]) == 0
-    assert "RUNNING" in capsys.readouterr().out
+    assert ctl(*fake_daemon.at, "--json", "firmware").ended(0).result == known
+    assert "RUNNING" in ctl(*fake_daemon.at, "firmware").ended(0).out

@@ -1,6 +1,5 @@
 """`tormagctl keys`, and clients that show a key: to a daemon made of guarded sockets only."""
 
-import json
 import stat
 import threading
 from collections.abc import Iterator
@@ -22,14 +21,8 @@ from tormagd_client.errors import UnreachableError
 from tormagd_client.messages import VERSION
 
 
-def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    capsys.readouterr()
-    code = main(["--json", *arguments])
-    return code, json.loads(capsys.readouterr().out)
-
-
 @pytest.fixture
-def keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+def keys(tmp_path: Path) -> Path:
     assert main(["keys", "generate", str(tmp_path / "keys"), "--operate", "console", "--publish", "robot"]) == 0
     return tmp_path / "keys"
 
@@ -44,32 +37,27 @@ def test_one_command_makes_the_server_its_clients_and_the_lists(keys: Path) -> N
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)
 
 
-def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, ctl: Any) -> None:
     before = (keys / "server.key_secret").read_bytes()
-    code, printed = run_json(capsys, "keys", "generate", str(keys), "--observe", "screen")
-    assert code == 0
-    assert [made["name"] for made in printed["result"]["made"]] == ["screen"]
+    printed = ctl("--json", "keys", "generate", str(keys), "--observe", "screen").ended(0)
+    assert [made["name"] for made in printed.result["made"]] == ["screen"]
     for arguments in ((), ("--observe", "screen"), ("--publish", "server"), ("--client", "robot")):
-        assert main(["keys", "generate", str(keys), *arguments]) == 2
-        assert "exists: keys are never overwritten" in capsys.readouterr().err
+        assert "exists: keys are never overwritten" in ctl("keys", "generate", str(keys), *arguments).ended(2).err
     assert (keys / "server.key_secret").read_bytes() == before
 
 
-def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, printed = run_json(capsys, "keys", "generate", str(tmp_path / "mine"), "--client", "robot")
-    assert code == 0
+def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, ctl: Any) -> None:
+    printed = ctl("--json", "keys", "generate", str(tmp_path / "mine"), "--client", "robot").ended(0)
     assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == ["robot.key", "robot.key_secret"]
-    (made,) = printed["result"]["made"]
-    assert run_json(capsys, "keys", "show", made["public"])[1]["result"]["keys"] == [
-        {"name": "robot", "fingerprint": made["fingerprint"]}
-    ]
+    (made,) = printed.result["made"]
+    shown = {"name": "robot", "fingerprint": made["fingerprint"]}
+    assert ctl("--json", "keys", "show", made["public"]).result["keys"] == [shown]
     assert main(["keys", "generate", str(tmp_path), "--client", "a", "--publish", "b"]) == 2
     assert not list(tmp_path.glob("*.key*"))
 
 
-def test_a_folder_of_keys_is_shown(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["keys", "show", str(keys / "publish")]) == 0
-    assert capsys.readouterr().out.endswith("  robot\n")
+def test_a_folder_of_keys_is_shown(keys: Path, ctl: Any) -> None:
+    assert ctl("keys", "show", str(keys / "publish")).ended(0).out.endswith("  robot\n")
     assert main(["keys", "show", "/nowhere"]) == 2
 
 
@@ -105,13 +93,11 @@ def guarded(keys: Path) -> Iterator[str]:
 
 
 def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
-    keys: Path, guarded: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    keys: Path, guarded: str, ctl: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     mine, server = str(keys / "console.key_secret"), str(keys / "server.key")
-    code, printed = run_json(
-        capsys, "--endpoint", guarded, "--key", mine, "--server-key", server, "disable", "--no-wait"
-    )
-    assert (code, printed["result"]) == (0, {"operating_state": "DISABLED"})
+    shown = ("--endpoint", guarded, "--key", mine, "--server-key", server, "--json")
+    assert ctl(*shown, "disable", "--no-wait").ended(0).result == {"operating_state": "DISABLED"}
     config = tmp_path / "client.toml"
     config.write_text(
         f'[endpoints]\ncontrol = "{guarded}"\n[endpoints.curve]\nclient_secret = "{mine}"\nserver_public = "{server}"\n'
@@ -123,12 +109,11 @@ def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
 
 
 def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
-    keys: Path, guarded: str, capsys: pytest.CaptureFixture[str]
+    keys: Path, guarded: str, ctl: Any
 ) -> None:
     for arguments in ((), ("--key", str(keys / "robot.key_secret"), "--server-key", str(keys / "server.key"))):
-        code, printed = run_json(capsys, "--endpoint", guarded, "--wait", "0.3", *arguments, "disable", "--no-wait")
-        assert (code, printed["error"]["code"]) == (3, "unreachable")
-        assert "--key and --server-key" in printed["error"]["hint"]
+        error = ctl("--endpoint", guarded, "--wait", "0.3", "--json", *arguments, "disable", "--no-wait").ended(3).error
+        assert (error["code"], "--key and --server-key" in error["hint"]) == ("unreachable", True)
 
 
 async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever(guarded: str) -> None:
@@ -154,10 +139,7 @@ async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever
     ],
     ids=range(4),
 )
-def test_a_key_that_is_no_good_is_a_usage_error(
-    keys: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], named: str
-) -> None:
+def test_a_key_that_is_no_good_is_a_usage_error(keys: Path, ctl: Any, arguments: tuple[str, ...], named: str) -> None:
     placed = [each.replace("KEYS", str(keys)) for each in arguments]
-    code, printed = run_json(capsys, "--endpoint", "tcp://192.0.2.1:5555", *placed, "status")
-    assert code == 2
-    assert named in printed["error"]["message"] + printed["error"]["hint"]
+    error = ctl("--endpoint", "tcp://192.0.2.1:5555", "--json", *placed, "status").ended(2).error
+    assert named in error["message"] + error["hint"]

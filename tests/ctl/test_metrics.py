@@ -54,9 +54,8 @@ def full(
     return fake_daemon
 
 
-def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(["--endpoint", *arguments, "metrics"]) == 0
-    return capsys.readouterr().out
+def printed(ctl: Any, *arguments: str) -> str:
+    return ctl("--endpoint", *arguments, "metrics").ended(0).out
 
 
 SHOWN: list[tuple[str, dict[str, str], Any]] = [
@@ -78,14 +77,14 @@ SHOWN: list[tuple[str, dict[str, str], Any]] = [
 ]
 
 
-def test_the_status_is_there_in_base_units(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    families = read(printed(capsys, full.control))
+def test_the_status_is_there_in_base_units(full: Any, ctl: Any) -> None:
+    families = read(printed(ctl, full.control))
     for name, labels, expected in SHOWN:
         assert value(families, f"tormag_{name}", **labels) == expected, name
 
 
-def test_names_and_types_keep_to_the_conventions(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    for name, family in read(printed(capsys, full.control)).items():
+def test_names_and_types_keep_to_the_conventions(full: Any, ctl: Any) -> None:
+    for name, family in read(printed(ctl, full.control)).items():
         assert re.fullmatch(r"tormag(_[a-z]+)*", name)
         assert family.documentation
         assert family.type in ("gauge", "counter"), name
@@ -98,10 +97,10 @@ def test_names_and_types_keep_to_the_conventions(full: Any, capsys: pytest.Captu
 
 
 @pytest.mark.skipif(PROMTOOL is None, reason="no promtool here: it comes with Debian's package prometheus")
-def test_prometheus_s_own_parser_finds_no_fault(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_prometheus_s_own_parser_finds_no_fault(full: Any, ctl: Any) -> None:
     checked = subprocess.run(
         [str(PROMTOOL), "check", "metrics"],
-        input=printed(capsys, full.control),
+        input=printed(ctl, full.control),
         text=True,
         capture_output=True,
         check=False,
@@ -109,14 +108,13 @@ def test_prometheus_s_own_parser_finds_no_fault(full: Any, capsys: pytest.Captur
     assert (checked.returncode, checked.stdout, checked.stderr) == (0, "", "")
 
 
-def test_what_is_not_known_has_no_sample(fake_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_known_has_no_sample(fake_daemon: Any, ctl: Any) -> None:
     fake_daemon.says(measured_cf=None, gap_mm=None, faults=[])
-    families = read(printed(capsys, fake_daemon.control))
+    families = read(printed(ctl, fake_daemon.control))
     assert "tormag_force_measured_newtons" not in families
     assert not families["tormag_fault"].samples
     assert all(math.isfinite(sample.value) for family in families.values() for sample in family.samples)
-    assert main(["--endpoint", fake_daemon.control, "--json", "metrics"]) == 0
-    assert read(json.loads(capsys.readouterr().out)["result"]["metrics"]).keys() == families.keys()
+    assert read(ctl(*fake_daemon.at, "--json", "metrics").ended(0).result["metrics"]).keys() == families.keys()
 
 
 def test_a_scrape_asks_anew_and_says_when_the_daemon_has_gone(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,8 +143,8 @@ def test_a_scrape_asks_anew_and_says_when_the_daemon_has_gone(full: Any, capsys:
     assert (scraped[2].keys(), full.commands) == ({"tormag_up"}, ["status"] * 3)
 
 
-def test_the_board_asks_for_what_there_is(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    known = {sample.name for family in read(printed(capsys, full.control)).values() for sample in family.samples}
+def test_the_board_asks_for_what_there_is(full: Any, ctl: Any) -> None:
+    known = {sample.name for family in read(printed(ctl, full.control)).values() for sample in family.samples}
     board = json.loads(BOARD.read_text(encoding="utf-8"))
     asked = [target["expr"] for panel in board["panels"] for target in panel["targets"]]
     assert {name for expression in asked for name in re.findall(r"tormag_[a-z_]+", expression)} <= known

@@ -1,20 +1,19 @@
 """What `tormagctl ports` finds, on a directory that stands for the machine, and on this machine's own pty."""
 
 import fcntl
-import json
 import os
 import subprocess
 import sys
 import tty
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
 from tormagd.config import Config, Device
 from tormagd.ctl.machine import Machine
-from tormagd.ctl.main import main
 from tormagd.ctl.ports import Holder, ports, survey
 
 FTDI = SimpleNamespace(
@@ -120,9 +119,7 @@ def test_a_configured_port_that_is_not_there_is_said(root: Path, monkeypatch: py
     assert "no serial port" in ports(Config(device=Device(port="can0")), root).text
 
 
-def test_a_real_lock_of_a_real_process_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_real_lock_of_a_real_process_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ctl: Any) -> None:
     """Another process holds a pty as the daemon holds its port."""
     far, near = os.openpty()
     tty.setraw(near)
@@ -137,8 +134,7 @@ def test_a_real_lock_of_a_real_process_is_found(
         assert holder.stdout.readline() == b"held\n"
         with pytest.raises(BlockingIOError):
             fcntl.flock(near, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        assert main(["--config", str(config), "--json", "ports"]) == 0
-        result = json.loads(capsys.readouterr().out)["result"]
+        result = ctl("--config", str(config), "--json", "ports").ended(0).result
         assert set(result) == {"serial", "can", "hidden_processes"}
         (entry,) = [each for each in result["serial"] if each["is_configured"]]
         assert {"process_id": holder.pid, "name": Machine(Path("/")).process_name(holder.pid), "is_locking": True} in (

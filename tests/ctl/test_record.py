@@ -13,77 +13,68 @@ from tormagd.ctl.main import main
 from tormagd.recording.reader import read_recording
 
 
-def test_record_then_plot(fake_daemon, tmp_path, capsys):
+def test_record_then_plot(fake_daemon, tmp_path, ctl):
     file, picture = tmp_path / "a.mcap", tmp_path / "a.png"
-    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "0.3"]) == 0
-    result = json.loads(capsys.readouterr().out)["result"]
+    result = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "0.3").ended(0).result
     recording = read_recording(file)
     assert recording.is_complete
     assert recording.ticks.t_ns.size == result["ticks"] > 0
     assert recording.telemetry.t_ns.size == result["telemetry"] > 0
     assert (result["gaps"], result["ticks_lost"], result["telemetry_lost"], result["unreadable"]) == (0, 0, 0, 0)
 
-    assert main(["--json", "plot", str(file), "-o", str(picture)]) == 0
-    drawn = json.loads(capsys.readouterr().out)["result"]
+    drawn = ctl("--json", "plot", str(file), "-o", str(picture)).ended(0).result
     assert (drawn["ticks"], drawn["tracking_rms_N"]) == (result["ticks"], pytest.approx(0.1 / 2**0.5, rel=0.1))
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_plot_of_a_cut_recording_says_so(fake_daemon, tmp_path, capsys):
+def test_the_plot_of_a_cut_recording_says_so(fake_daemon, tmp_path, ctl):
     file = tmp_path / "a.mcap"
     assert main(["--endpoint", fake_daemon.control, "record", str(file), "--duration", "0.3"]) == 0
     file.write_bytes(file.read_bytes()[:-40])
-    capsys.readouterr()
-    assert main(["plot", str(file), "-o", str(tmp_path / "a.png")]) == 0
-    assert "a.mcap was cut short" in capsys.readouterr().out
+    assert "a.mcap was cut short" in ctl("plot", str(file), "-o", str(tmp_path / "a.png")).ended(0).out
 
 
-def test_a_daemon_that_does_not_say_what_it_runs_is_not_recorded(fake_daemon, tmp_path, capsys):
+def test_a_daemon_that_does_not_say_what_it_runs_is_not_recorded(fake_daemon, tmp_path, ctl):
     fake_daemon.answers["describe"] = lambda: {"ok": True, "result": {"version": "0.0.9"}}
-    assert main(["--endpoint", fake_daemon.control, "record", str(tmp_path / "a.mcap")]) == 3
-    assert "the description of tormagd 0.0.9" in capsys.readouterr().err
+    assert "the description of tormagd 0.0.9" in ctl(*fake_daemon.at, "record", str(tmp_path / "a.mcap")).ended(3).err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_silent_end_is_a_gap_and_a_daemon_that_has_gone(fake_daemon, tmp_path, capsys):
+def test_a_silent_end_is_a_gap_and_a_daemon_that_has_gone(fake_daemon, tmp_path, ctl):
     file = tmp_path / "a.mcap"
     silencer = threading.Timer(0.3, lambda: setattr(fake_daemon, "is_silent", True))
     silencer.start()
-    code = main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "2"])
-    printed = json.loads(capsys.readouterr().out)
-    assert (code, printed["ok"], printed["result"]["gaps"]) == (3, False, 1)
-    assert printed["result"]["longest_gap_ms"] == pytest.approx(printed["result"]["silent_ms"])
-    assert printed["result"]["silent_ms"] > 1_000.0
-    assert read_recording(file).ticks.t_ns.size == printed["result"]["ticks"]
+    found = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "2").ended(3).result
+    assert (found["gaps"], found["longest_gap_ms"]) == (1, pytest.approx(found["silent_ms"]))
+    assert found["silent_ms"] > 1_000.0
+    assert read_recording(file).ticks.t_ns.size == found["ticks"]
 
 
-def test_lost_ticks_are_counted_and_are_no_success(fake_daemon, tmp_path, capsys):
+def test_lost_ticks_are_counted_and_are_no_success(fake_daemon, tmp_path, ctl):
     fake_daemon.rubbish += [
         msgpack.packb({"v": 1, "columns": ("t_ns", "tick"), "rows": [[2**60 + number, number]]})
         for number in (3, 4, 8, 9, 0, 1, 2)  # 5, 6 and 7 are lost; then the daemon restarts; and so on
     ]
-    code = main(["--endpoint", fake_daemon.control, "--json", "record", str(tmp_path / "a.mcap"), "--duration", "0.3"])
-    result = json.loads(capsys.readouterr().out)["result"]
-    assert (code, result["ticks_lost"] % 3) == (1, 0)
-    assert result["ticks_lost"] > 0
+    arguments = ("record", str(tmp_path / "a.mcap"), "--duration", "0.3")
+    lost = ctl(*fake_daemon.at, "--json", *arguments).ended(1).result["ticks_lost"]
+    assert lost in range(3, 3_000, 3)
 
 
-def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, capsys):
+def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, ctl):
     file = tmp_path / "a.mcap"
     file.write_text("precious")
-    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(file)]) == 2
-    assert "exists" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert "exists" in ctl(*fake_daemon.at, "--json", "record", str(file)).ended(2).error["message"]
     assert file.read_text() == "precious"
 
 
-def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, capsys):
-    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(tmp_path), "--duration", "0.1"]) == 0
+def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, ctl):
+    made = ctl(*fake_daemon.at, "--json", "record", str(tmp_path), "--duration", "0.1").ended(0).result
     (file,) = tmp_path.iterdir()
-    assert json.loads(capsys.readouterr().out)["result"]["file"] == str(file)
+    assert made["file"] == str(file)
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap", file.name)
 
 
-def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, capsys):
+def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, ctl):
     good = {"v": 1, "columns": ["t_ns", "x"], "rows": [[2**60, 1.0]]}
     fake_daemon.rubbish += [
         b"\xc1",
@@ -95,8 +86,7 @@ def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, capsys):
         msgpack.packb(good | {"rows": [[1.5, 1.0]]}),
     ]
     file = tmp_path / "a.mcap"
-    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "0.6"]) == 0
-    captured = capsys.readouterr()
+    captured = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "0.6").ended(0)
     assert json.loads(captured.out)["result"]["unreadable"] >= 7
     assert captured.err.count("left out a message") == 1
     assert read_recording(file).is_complete

@@ -1,7 +1,6 @@
 """`scene new`: what it makes of a recorded force, or of answers, the daemon takes; what can be no scene is told."""
 
 import io
-import json
 import math
 import sys
 from pathlib import Path
@@ -20,17 +19,12 @@ def recording(path: Path, least_N: float, most_N: float, rate_hz: float) -> Path
     return path
 
 
-def new(capsys, *arguments: str) -> tuple[int, dict]:
-    code = main(["scene", "new", *arguments, "--json"])
-    return code, json.loads(capsys.readouterr().out)
-
-
-def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_it(tmp_path, capsys):
+def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_it(tmp_path, ctl):
     forces = recording(tmp_path / "forces.csv", 0.31, 0.62, 0.3)
     out = tmp_path / "scenes" / "mine.toml"
     out.parent.mkdir()
-    code, printed = new(capsys, str(out), "--force", str(forces))
-    assert (code, printed["result"]["insert"]) == (0, "MRE-10-10")
+    made = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(0).result
+    assert made["insert"] == "MRE-10-10"
     scene = load_scene(str(out))
     assert (scene.name, scene.force.least_N, scene.force.most_N, scene.force.tolerance_rms_N) == (
         "mine",
@@ -43,11 +37,10 @@ def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_i
 
 
 @pytest.mark.parametrize(("rate_hz", "insert", "is_told"), [(0.1, "MRE-50-40", False), (4.5, "MRE-10-20", True)])
-def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(tmp_path, capsys, rate_hz, insert, is_told):
+def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(tmp_path, ctl, rate_hz, insert, is_told):
     """A weak device does not give 1.7 N with MRE-10-20, whose model gives 1.9."""
     forces, out = recording(tmp_path / "forces.csv", 1.4, 1.7, rate_hz), tmp_path / "mine.toml"
-    assert main(["scene", "new", str(out), "--force", str(forces)]) == 0
-    assert ("a weak device" in capsys.readouterr().out) == is_told
+    assert ("a weak device" in ctl("scene", "new", str(out), "--force", str(forces)).ended(0).out) == is_told
     assert load_scene(str(out)).insert.name == insert
 
 
@@ -60,12 +53,12 @@ def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(tmp_path, ca
     ],
 )
 def test_a_force_that_no_insert_renders_is_refused_and_leaves_no_file(
-    tmp_path, capsys, least_N, most_N, rate_hz, code, words
+    tmp_path, ctl, least_N, most_N, rate_hz, code, words
 ):
     out = tmp_path / "mine.toml"
-    ended, printed = new(capsys, str(out), "--force", str(recording(tmp_path / "f.csv", least_N, most_N, rate_hz)))
-    assert ended == code
-    assert all(word in printed["error"]["message"] for word in words)
+    forces = recording(tmp_path / "f.csv", least_N, most_N, rate_hz)
+    error = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(code).error
+    assert all(word in error["message"] for word in words)
     assert not out.exists()
 
 
@@ -74,10 +67,8 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, capsys, monkeypatch):
+def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, ctl, monkeypatch):
     monkeypatch.setattr(sys, "stdin", Terminal("A vein is held open.\n\n1.5\nmuch\n0.06\n" + "\n" * 6))
-    code, printed = new(capsys, str(tmp_path / "vein.toml"))
-    assert code == 0
-    scene = load_scene(printed["result"]["file"])
+    scene = load_scene(ctl("scene", "new", str(tmp_path / "vein.toml"), "--json").ended(0).result["file"])
     assert (scene.description, scene.force.most_N, scene.force.tolerance_rms_N) == ("A vein is held open.", 1.5, 0.06)
     assert (scene.force.resolution_N, scene.signal.bandwidth_hz) == (0.12, 0.2)

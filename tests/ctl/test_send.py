@@ -1,4 +1,3 @@
-import json
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,9 +11,8 @@ from tormagd.force_file import ForceFileError
 from tormagd_client.messages import Setpoint
 
 
-def send(daemon, capsys, *arguments: str) -> dict:
-    assert main(["--endpoint", daemon.control, "--json", "send", *arguments]) == 0
-    return json.loads(capsys.readouterr().out)["result"]
+def send(daemon, ctl, *arguments: str) -> dict:
+    return ctl("--endpoint", daemon.control, "--json", "send", *arguments).ended(0).result
 
 
 def wait_for(daemon, count: int) -> None:
@@ -31,8 +29,8 @@ def after_s(setpoint: Setpoint, first: Setpoint) -> float:
     return (setpoint.stamp_ns - first.stamp_ns) * 1e-9
 
 
-def test_every_setpoint_arrives_from_the_first_on(fake_daemon, capsys):
-    result = send(fake_daemon, capsys, "ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
+def test_every_setpoint_arrives_from_the_first_on(fake_daemon, ctl):
+    result = send(fake_daemon, ctl, "ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
     wait_for(fake_daemon, result["sent"])
     arrived = fake_daemon.setpoints
     assert result["sent"] + result["skipped"] == 61
@@ -45,10 +43,10 @@ def test_every_setpoint_arrives_from_the_first_on(fake_daemon, capsys):
     assert [setpoint.seq for setpoint in arrived] == list(range(result["sent"]))
 
 
-def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
+def test_a_second_run_of_the_same_source_is_newer(fake_daemon, ctl):
     options = ("step", "--duration", "0.02", "--source", "me", "--valid-for-ms", "70")
-    first = send(fake_daemon, capsys, *options)
-    second = send(fake_daemon, capsys, *options)
+    first = send(fake_daemon, ctl, *options)
+    second = send(fake_daemon, ctl, *options)
     wait_for(fake_daemon, first["sent"] + second["sent"])
     numbers = [(setpoint.session, setpoint.seq) for setpoint in fake_daemon.setpoints]
     assert numbers[0][1] == numbers[first["sent"]][1] == 0
@@ -56,10 +54,10 @@ def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
     assert {(s.source, s.valid_for_ms) for s in fake_daemon.setpoints} == {("me", 70.0)}
 
 
-def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
+def test_a_preview_is_what_will_be_sent(fake_daemon, ctl):
     wait_for(
         fake_daemon,
-        send(fake_daemon, capsys, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")["sent"],
+        send(fake_daemon, ctl, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")["sent"],
     )
     arrived = fake_daemon.setpoints
     forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
@@ -68,24 +66,26 @@ def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
         for after, force in enumerate(setpoint.preview_N, start=1):
             later = min(round(100.0 * after_s(setpoint, arrived[0])) + after, 20)
             assert force == pytest.approx(forces.get(later, force), abs=1e-9)
-    assert main(["--endpoint", fake_daemon.control, "send", "sine", "--rate", "1000", "--preview-ms", "300"]) == 2
-    assert "--preview-ms = 300" in capsys.readouterr().err
+    assert (
+        "--preview-ms = 300"
+        in ctl(*fake_daemon.at, "send", "sine", "--rate", "1000", "--preview-ms", "300").ended(2).err
+    )
 
 
-def test_a_file_is_sent_with_its_handle_motion(fake_daemon, capsys, tmp_path):
+def test_a_file_is_sent_with_its_handle_motion(fake_daemon, ctl, tmp_path):
     file = tmp_path / "task.csv"
     file.write_text("t_s,force_N,displacement_mm,rate_mm_s\n10,1,0,5\n10.1,2,2,5\n")
-    result = send(fake_daemon, capsys, str(file), "--rate", "100")
+    result = send(fake_daemon, ctl, str(file), "--rate", "100")
     wait_for(fake_daemon, result["sent"])
     assert result["sent"] + result["skipped"] == 11
     last = fake_daemon.setpoints[-1]
     assert (last.servo_cf, last.displacement_mm, last.rate_mm_s) == pytest.approx((2.0, 2.0, 5.0))
 
 
-def test_duration_cuts_a_file_short(fake_daemon, capsys, tmp_path):
+def test_duration_cuts_a_file_short(fake_daemon, ctl, tmp_path):
     file = tmp_path / "task.csv"
     file.write_text("t_s,force_N\n0,1\n100,2\n")
-    result = send(fake_daemon, capsys, str(file), "--rate", "100", "--duration", "0.05")
+    result = send(fake_daemon, ctl, str(file), "--rate", "100", "--duration", "0.05")
     assert result["sent"] + result["skipped"] == 6
 
 
@@ -118,11 +118,10 @@ def test_duration_cuts_a_file_short(fake_daemon, capsys, tmp_path):
         (b"\x00\x01\x02", "task.csv"),
     ],
 )
-def test_a_faulty_file_is_refused_by_row_column_and_value(tmp_path, capsys, content, named):
+def test_a_faulty_file_is_refused_by_row_column_and_value(tmp_path, ctl, content, named):
     file = tmp_path / "task.csv"
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
-    assert main(["--json", "send", str(file)]) == 2
-    assert named in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert named in ctl("--json", "send", str(file)).ended(2).error["message"]
 
 
 @given(st.binary(max_size=300))

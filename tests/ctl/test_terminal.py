@@ -67,7 +67,7 @@ def test_our_own_colours_and_lines_stay_on_a_terminal_that_wants_them(monkeypatc
 
 
 @pytest.mark.parametrize("command", ["status", "firmware"])
-def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, capsys, status_with, source_with, command):
+def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, ctl, status_with, source_with, command):
     told = spoil(
         status_with(
             limits=["RATE"],
@@ -84,44 +84,39 @@ def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, capsys, status_with,
     told["late_ticks_by"] = {EVIL: 3}  # names, too
     told["setpoints"]["by_source"] = {EVIL: told["setpoints"]["by_source"]["me"]}
     fake_daemon.answers["status"] = lambda: {"ok": True, "result": told}
-    assert main(["--endpoint", fake_daemon.control, command]) == 0
-    captured = capsys.readouterr()
+    captured = ctl(*fake_daemon.at, command).ended(0)
     assert is_harmless(captured.out + captured.err)
     # one line each: nobody makes up a line of ours
     assert not any(line.startswith("evil") for line in captured.out.splitlines())
     assert HARMLESS in captured.out
-    assert main(["--endpoint", fake_daemon.control, "--json", command]) == 0
-    printed = capsys.readouterr().out
+    printed = ctl(*fake_daemon.at, "--json", command).ended(0).out
     assert is_harmless(printed)
     known = json.loads(printed)["result"]
     assert (known["link"] if command == "status" else known)["port"].endswith(EVIL)
 
 
-def test_a_refusal_is_one_printable_line_and_a_hint(fake_daemon, capsys):
+def test_a_refusal_is_one_printable_line_and_a_hint(fake_daemon, ctl):
     error = {"code": EVIL, "message": "no" + EVIL, "hint": "next" + EVIL}
     fake_daemon.answers["pause"] = lambda: {"ok": False, "error": error}
-    assert main(["--endpoint", fake_daemon.control, "pause"]) == 1
-    said = capsys.readouterr().err
+    said = ctl(*fake_daemon.at, "pause").ended(1).err
     assert is_harmless(said)
     assert len(said.splitlines()) == 2
 
 
 @pytest.mark.parametrize("what", ["key", "value", "name"])
-def test_a_file_cannot_either(tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str) -> None:
+def test_a_file_cannot_either(tmp_path: Path, ctl: Any, what: str) -> None:
     path = tmp_path / ("\x1b[2J.toml" if what == "name" else "a.toml")
     path.write_text({"key": '"\\u001b[2J" = 1', "value": 'scene = "\\u001b[2J\\n"', "name": "x = 1"}[what])
-    assert main(["--config", str(path), "scene", "show"]) == 2
-    captured = capsys.readouterr()
+    captured = ctl("--config", str(path), "scene", "show").ended(2)
     assert is_harmless(captured.out + captured.err)
     assert r"\u001b[2J" in captured.err or r"\x1b[2J" in captured.err
 
 
-def test_a_scene_is_shown_without_obeying_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scene_is_shown_without_obeying_it(tmp_path: Path, capsys: pytest.CaptureFixture[str], ctl: Any) -> None:
     assert main(["scene", "show", "pulse"]) == 0
     path = tmp_path / "a.toml"
     path.write_text(capsys.readouterr().out.replace('description = "', 'description = "\\u009b2J\\u001b[2J'))
-    assert main(["scene", "show", str(path)]) == 0
-    printed = capsys.readouterr().out
+    printed = ctl("scene", "show", str(path)).ended(0).out
     assert is_harmless(printed)
     assert r'description = "\u009b2J\u001b[2J' in printed
 

@@ -1,6 +1,5 @@
 """`tormagctl send` is done when its setpoints were rendered, and says why when they were not."""
 
-import json
 from itertools import chain, repeat
 from typing import Any
 
@@ -67,19 +66,23 @@ def test_when_sending_is_over_the_newest_may_be_stale(seen):
     assert held_back(seen({"state": "refused"}), "me", is_over=True).code == "other_source"
 
 
-def send(daemon: Any, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any], str]:
-    command = ["--endpoint", daemon.control, "--json", "send", "step", "--duration", "0.4", "--rate", "50"]
-    code = main([*command, *arguments])
-    captured = capsys.readouterr()
-    return code, json.loads(captured.out), captured.err
+@pytest.fixture
+def sent(fake_daemon: Any, ctl: Any) -> Any:
+    """Sends a step of 0.4 s."""
+    step = ("send", "step", "--duration", "0.4", "--rate", "50")
+    return lambda: ctl(*fake_daemon.at, "--json", *step)
 
 
-def test_what_was_rendered_is_told(fake_daemon, capsys):
+def test_what_was_rendered_is_told(fake_daemon, sent):
     fake_daemon.says(limits=["RATE"])
-    code, printed, said = send(fake_daemon, capsys)
-    assert (code, said) == (0, "")
-    result = printed["result"]
-    assert (result["accepted"], result["rendered_share"], result["limits"]) == (result["sent"], 1.0, ["RATE"])
+    done = sent().ended(0)
+    result = done.result
+    assert (done.err, result["accepted"], result["rendered_share"], result["limits"]) == (
+        "",
+        result["sent"],
+        1.0,
+        ["RATE"],
+    )
 
 
 @pytest.mark.parametrize(
@@ -90,17 +93,17 @@ def test_what_was_rendered_is_told(fake_daemon, capsys):
         ({"operating_state": "FAULT", "faults": ["SKEW"]}, 4, "fault", "in FAULT: SKEW"),
     ],
 )
-def test_what_is_not_rendered_is_no_success(fake_daemon, capsys, changes, expected, code, says):
+def test_what_is_not_rendered_is_no_success(fake_daemon, sent, changes, expected, code, says):
     fake_daemon.says(**changes)
-    exit_code, printed, said = send(fake_daemon, capsys)
-    assert (exit_code, printed["result"], printed["error"]["code"]) == (expected, None, code)
-    assert says in printed["error"]["message"]
-    assert says[-10:] in said
+    done = sent().ended(expected)
+    assert (done.result, done.error["code"]) == (None, code)
+    assert says in done.error["message"]
+    assert says[-10:] in done.err
     # in FAULT nothing is sent at all
     assert bool(fake_daemon.setpoints) == (expected == 1)
 
 
-def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, capsys, status_with):
+def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, sent, status_with):
     """`enable` wants a neutral setpoint, so that a publisher is there before."""
 
     def states(*names: str) -> Any:
@@ -111,20 +114,17 @@ def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon,
         }
 
     fake_daemon.answers["status"] = states("DISABLED", "DISABLED", "ENABLED")
-    code, printed, said = send(fake_daemon, capsys)
-    assert code == 0
-    assert 0.0 < printed["result"]["rendered_share"] < 1.0
-    assert said.count("not rendered: the device is DISABLED") == 1
+    done = sent().ended(0)
+    assert 0.0 < done.result["rendered_share"] < 1.0
+    assert done.err.count("not rendered: the device is DISABLED") == 1
     fake_daemon.setpoints.clear()
     fake_daemon.answers["status"] = states("ENABLED", "ENABLED", "PAUSED", "ENABLED")
-    code, printed, _ = send(fake_daemon, capsys)
-    assert (code, printed["error"]["code"]) == (1, "paused")
+    assert sent().ended(1).error["code"] == "paused"
 
 
-def test_setpoints_that_nobody_took_are_no_success(fake_daemon, capsys):
+def test_setpoints_that_nobody_took_are_no_success(fake_daemon, sent):
     fake_daemon.taken_by_source = False
-    code, printed, _ = send(fake_daemon, capsys)
-    assert (code, printed["error"]["code"]) == (1, "not_heard")
+    assert sent().ended(1).error["code"] == "not_heard"
     # taken in part: another publisher of the same name, or a loss
     fake_daemon.taken_by_source = True
     taken = fake_daemon.taken
@@ -137,19 +137,17 @@ def test_setpoints_that_nobody_took_are_no_success(fake_daemon, capsys):
         }
     )
     fake_daemon.setpoints.clear()
-    code, printed, _ = send(fake_daemon, capsys)
-    assert (code, printed["error"]["code"]) == (1, "not_taken")
+    assert sent().ended(1).error["code"] == "not_taken"
 
 
 @pytest.mark.parametrize(
     "arguments", [("step", "--to-N", "5.5"), ("step", "--from-N", "0.4", "--to-N", "6"), ("FILE",)]
 )
-def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, capsys, tmp_path, arguments):
+def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, ctl, tmp_path, arguments):
     file = tmp_path / "task.csv"
     file.write_text("t_s,force_N\n0,1\n1,7\n")
     told = [str(file) if each == "FILE" else each for each in arguments]
-    assert main(["--endpoint", fake_daemon.control, "--json", "send", *told]) == 1
-    error = json.loads(capsys.readouterr().out)["error"]
+    error = ctl(*fake_daemon.at, "--json", "send", *told).ended(1).error
     assert error["code"] == "out_of_range"
     assert "allowed is 0..5 N in scene pulse; nothing was sent" in error["message"]
     assert fake_daemon.setpoints == []
@@ -169,7 +167,7 @@ def test_a_key_that_may_only_publish_is_told_how(run_dir, tmp_path, capsys):
     assert "with a key that may only publish: --blind" in capsys.readouterr().err
 
 
-def test_a_daemon_that_takes_setpoints_and_does_not_answer_is_not_reached(fake_daemon, run_dir, tmp_path, capsys):
+def test_a_daemon_that_takes_setpoints_and_does_not_answer_is_not_reached(fake_daemon, run_dir, tmp_path):
     config = tmp_path / "tormagd.toml"
     config.write_text(f'[endpoints]\ncontrol = "ipc://{run_dir}/nobody"\nsetpoint = "ipc://{run_dir}/setpoint"\n')
     assert (main(["--config", str(config), "--wait", "0.1", "send", "step"]), fake_daemon.setpoints) == (3, [])
