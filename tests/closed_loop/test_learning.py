@@ -1,14 +1,16 @@
-"""What a device shows of itself is learned while a step arrives, and noise alone moves nothing (synthetic)."""
+"""What a device shows of itself is learned while a step arrives; what is believed is told (synthetic)."""
 
 import msgspec
 import numpy as np
 import pytest
 
+from tormagd.assembly.belief import beliefs
 from tormagd.assembly.build import build_core
 from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.records import TimedSetpoint
-from tormagd.scenes.scene import Terms, load_scene
+from tormagd.scenes.scene import EVERY_TERM, Terms, load_scene
 from tormagd.simulation.hand import ReversingHand
 
 VALID_S = 0.2
@@ -69,3 +71,35 @@ def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces
     loop = arm("sample_3", ReversingHand(1.0), core=frozen, config=config)
     list(loop.run(2.5, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)))
     assert (loop.planner.believe.learned(), loop.stepper.move.acceleration_scale) == (NOTHING_LEARNED, 1.0)
+
+
+# -- what is believed is told, with its unit and whether it acts -------------------------------------------------------
+
+
+def test_a_weak_device_that_was_slid_at_speed_is_known_as_such(arm, render) -> None:
+    loop = arm("sample_2")
+    render(loop, 0.7, 1.0)
+    render(loop, 2.0, 2.0)
+    told = beliefs(loop.planner, loop.stepper, loop.now_s, EVERY_TERM)
+    assert told["scale"].value == loop.planner.believe.strength.fit.scale < 0.95
+    assert told["scale"].sd is not None
+    assert 0.0 < told["scale"].sd < 0.1
+    assert told["relaxed"].value > 0.0
+    assert {name for name, it in told.items() if it.acts} >= {"scale", "offset", "sensor_zero", "relaxed", "field_lag"}
+    # nothing came that was known ahead, or repeated itself
+    assert not told["carriage_lag"].acts
+    assert not told["forecast_trust"].acts
+    later = beliefs(loop.planner, loop.stepper, loop.now_s + 3600.0, EVERY_TERM)["sensor_zero"]
+    assert later.sd is not None
+    assert (later.sd > UNKNOWN_SD_N, later.acts) == (True, False)
+
+
+def test_a_term_that_is_left_out_does_not_act(arm, render) -> None:
+    config, left_out = Config(scene="pulse"), Terms(creep=False, scale=False, hysteresis=False)
+    loop = arm(core=build_core(config, msgspec.structs.replace(load_scene("pulse"), terms=left_out)), config=config)
+    render(loop, 1.5, 1.0)
+    told = beliefs(loop.planner, loop.stepper, loop.now_s, left_out)
+    assert {name for name, it in told.items() if it.acts} == {
+        "offset", "sensor_zero", "acceleration_scale", "relaxed"
+    }  # fmt: skip
+    assert (told["scale"].value, told["field_lag"].value) == (1.0, 0.0)

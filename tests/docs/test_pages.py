@@ -1,19 +1,25 @@
-"""The documentation says what is there: pages written from types are up to date, and what is shown can be typed."""
+"""The documentation says what is there: pages written from types are up to date, what is shown can be typed."""
 
 import argparse
+import ast
 import importlib
 import importlib.util
+import json
 import re
 import shlex
 from pathlib import Path
 
 import pytest
 import reference_pages
+from PIL import Image
 
 from firmware_protocol.conformance import __main__ as conformance
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
+from tormagd.ctl.commands import COMMANDS
 from tormagd.daemon import main as daemon
+from tormagd.lab.pages import KEY, figures_of, stamp
+from tormagd.scenes.measured import measured
 from tormagd.simulation import __main__ as simulation
 from tormagd.toml_file import toml_tables
 
@@ -159,3 +165,81 @@ def test_every_key_of_the_configuration_says_what_it_is_for():
 @pytest.mark.parametrize("page", sorted((ROOT / "docs/decisions").glob("0*.md")), ids=name_of)
 def test_every_decision_has_the_same_four_parts(page):
     assert re.findall(r"^## (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE) == DECISION
+
+
+# -- what a message tells a user to type is there: in a wheel, where there is no checkout and no make ------------------
+
+
+SOURCES = sorted(file for room in ("tormagd", "firmware_protocol", "client") for file in (ROOT / room).rglob("*.py"))
+NAMED = re.compile(r"\b(tormagctl(?: --?[\w-]+)*|tormag-lab|python -m|python|make) ([a-z][\w./-]*)|\b(tools/\w+\.py)")
+TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+PROSE = ("of", "are")
+"What may follow `tormagctl` where a sentence speaks of the program."
+
+
+def messages(source):
+    """The strings of a module that are not documentation."""
+    tree = ast.parse(source.read_text(encoding="utf-8"))
+    told = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.Expr)}
+    for each in ast.walk(tree):
+        if isinstance(each, ast.Constant) and isinstance(each.value, str) and id(each) not in told:
+            yield each.value
+
+
+def is_there(program, word, tool):
+    """Whether an installed wheel has it; words after `make` and `python` that are no targets and no files are prose."""
+    if tool or program == "python":
+        return LAB is None or not (tool or word.endswith(".py"))
+    if program == "make":
+        return word not in TARGETS
+    if program == "python -m":
+        return importlib.util.find_spec(word.rstrip(".")) is not None
+    if program == "tormag-lab":
+        return LAB is None or word in LAB.COMMANDS
+    return word in COMMANDS or word in PROSE
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: str(source.relative_to(ROOT)))
+def test_every_command_that_a_message_names_is_in_a_wheel(source):
+    missing = [found[0] for text in messages(source) for found in NAMED.finditer(text) if not is_there(*found.groups())]
+    assert missing == []
+
+
+# -- committed pictures are of the figures that are committed beside them ----------------------------------------------
+
+
+DOCS = ROOT / "docs"
+GENERATED = ("inverse_trade.md", "learned_inverse.md", "reproduction.md")
+SHOWN = re.compile(r"\]\(([\w/]+\.png)\)")
+DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
+
+
+def drawn():
+    """Every picture that is drawn from committed figures, and these."""
+    yield "images/scenes.png", measured().scenes
+    for path in sorted(DOCS.glob("evidence/*.json")):
+        evidence = json.loads(path.read_text(encoding="utf-8"))
+        for picture in DRAWN.findall(evidence["command"]):
+            evidence["figures"].pop("machine_us", None)  # of the machine, not of what was measured
+            yield picture, evidence["figures"]
+    summary = (ROOT / "README.md").read_text(encoding="utf-8").partition("\nforce asked")[2].partition("```")[0]
+    yield "images/pulse.png", [line for line in summary.splitlines() if line.startswith("  ")]
+    for name in GENERATED:
+        page = (DOCS / name).read_text(encoding="utf-8")
+        for picture in SHOWN.findall(page):
+            yield picture, figures_of(page)
+
+
+@pytest.mark.parametrize(("picture", "figures"), [pytest.param(*each, id=each[0]) for each in drawn()])
+def test_a_picture_is_no_older_than_its_figures(picture, figures):
+    with Image.open(DOCS / picture) as opened:
+        assert opened.info[KEY] == stamp(figures)[KEY], "what writes the figures draws it anew"
+
+
+def test_other_figures_have_another_stamp_and_other_words_the_same():
+    page = "# A\n\n| mN |\n| --- |\n| 3 |\n"
+    assert (
+        stamp(figures_of(page))
+        == stamp(figures_of(page + "\nMore words.\n"))
+        != stamp(figures_of(page.replace("3", "4")))
+    )

@@ -1,0 +1,333 @@
+"""A material: laws, fits, tests of a sample, relaxation. Synthetic data, but for measured rubber."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings, strategies as st
+
+from tormagd.lab.characterisation.compression import (
+    CompressionRecord,
+    Sample,
+    deviations,
+    evaluated_cycle,
+    loading_halves,
+    read_compression,
+)
+from tormagd.lab.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
+from tormagd.lab.characterisation.hyperelastic import Ogden, ThesisOgden
+from tormagd.lab.characterisation.relaxation import RelaxationRecord, fit_relaxation
+from tormagd.lab.errors import LabError
+from tormagd.lab.main import main
+from tormagd.lab.tables import read_columns
+from tormagd.physics.errors import DomainError
+from tormagd.physics.relaxation import PronySeries
+
+# -- uniaxial laws: initial slopes, digits near no strain, refusals ----------------------------------------------------
+
+
+NEO_HOOKEAN = Ogden((15e3,), (2.0,))
+LAWS = (NEO_HOOKEAN, Ogden((12e3, 30.0, 5e3), (1.3, 9.0, -2.0)), ThesisOgden(15e3, 2.7), ThesisOgden(40e3, 0.7))
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_law_starts_with_three_times_its_shear_modulus(law: Ogden | ThesisOgden) -> None:
+    assert law.stress_Pa(1.0) == 0.0
+    rise_Pa = law.stress_Pa(1.0 + 1e-6) - law.stress_Pa(1.0 - 1e-6)
+    assert rise_Pa / 2e-6 == pytest.approx(3.0 * law.shear_modulus_Pa, rel=1e-6)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_stress_rises_and_keeps_type_and_shape(law: Ogden | ThesisOgden, dtype: type) -> None:
+    stretch: Any = np.linspace(0.1, 10.0, 60, dtype=dtype).reshape(6, 10)
+    stress = law.stress_Pa(stretch)
+    assert (stress.dtype, stress.shape) == (dtype, stretch.shape)
+    assert (np.diff(stress.ravel()) > 0.0).all()
+
+
+@given(st.floats(-15.0, -0.1), st.booleans(), st.floats(0.1, 20.0))
+def test_stress_keeps_its_digits_at_small_strain(strain: float, compressed: bool, exponent: float) -> None:
+    stretch = 1.0 - 10.0**strain if compressed else 1.0 + 10.0**strain
+    with mp.workdps(50):
+        power, log = mp.mpf(exponent), mp.log(mp.mpf(stretch))
+        printed = mp.exp(power * log) - mp.exp(-power / 2 * log)
+        engineering = 2 / power * printed / stretch
+    assert ThesisOgden(1e3, exponent).stress_Pa(stretch) == pytest.approx(1e3 * float(printed), rel=1e-13)
+    assert Ogden((1e3,), (exponent,)).stress_Pa(stretch) == pytest.approx(1e3 * float(engineering), rel=1e-13)
+
+
+@pytest.mark.parametrize("bad", [0.0, -0.5, math.nan, math.inf, 25.0])
+def test_stretches_are_checked(bad: float) -> None:
+    for law in LAWS:
+        with pytest.raises(DomainError, match="stretch"):
+            law.stress_Pa(bad)
+
+
+@pytest.mark.parametrize(
+    ("moduli", "exponents", "name"),
+    [
+        ((), (), "exponents"),
+        ((1e3,), (2.0, 3.0), "exponents"),
+        ((-1e3,), (2.0,), "moduli_Pa"),
+        ((math.nan,), (2.0,), "moduli_Pa"),
+        ((1e3,), (0.0,), "exponents"),
+        ((1e3,), (math.inf,), "exponents"),
+    ],
+)
+def test_constants_are_checked(moduli: tuple[float, ...], exponents: tuple[float, ...], name: str) -> None:
+    with pytest.raises(DomainError, match=name):
+        Ogden(moduli, exponents)
+
+
+def test_constants_of_the_other_laws_are_checked() -> None:
+    with pytest.raises(DomainError, match="constant_Pa"):
+        ThesisOgden(math.nan, 2.0)
+    with pytest.raises(DomainError, match="exponent"):
+        ThesisOgden(1e3, -2.0)
+
+
+# -- fits: synthetic curves with a known answer, and measured rubber where the data are at hand ------------------------
+
+
+COMPRESSION = np.linspace(1.0, 0.75, 60)
+TENSION = np.linspace(1.0, 4.0, 80)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(3.0, 7.0), st.floats(0.4, 12.0), st.booleans())
+def test_one_ogden_term_is_found_again(decades: float, exponent: float, pulled: bool) -> None:
+    law = Ogden((10.0**decades,), (exponent,))
+    stretch = TENSION if pulled else COMPRESSION
+    stress_Pa = law.stress_Pa(stretch)
+    assume(np.abs(stress_Pa).max() <= 1e12)  # beyond, a record is refused
+    fit = fit_ogden(stretch, stress_Pa)
+    assert (fit.law.shear_modulus_Pa, fit.law.exponents[0]) == (
+        pytest.approx(law.shear_modulus_Pa, rel=1e-4),
+        pytest.approx(exponent, rel=1e-3),
+    )
+    assert fit.r2 > 1.0 - 1e-9
+
+
+@pytest.mark.parametrize("exponent", [0.7, 2.0, 9.0])
+def test_the_printed_law_is_found_again(exponent: float) -> None:
+    law = ThesisOgden(140e3, exponent)
+    fit = fit_thesis_ogden(COMPRESSION, law.stress_Pa(COMPRESSION))
+    assert (fit.law.constant_Pa, fit.law.shear_modulus_Pa) == (
+        pytest.approx(140e3, rel=1e-5),
+        pytest.approx(law.shear_modulus_Pa, rel=1e-6),
+    )
+
+
+@pytest.mark.parametrize(
+    ("file", "published_kPa"), [("Ecoflex_00-10", 7.4), ("Ecoflex_00-30", 15.1), ("Ecoflex_00-50", 20.8)]
+)
+def test_measured_silicones(recordings: Path, file: str, published_kPa: float) -> None:
+    """Neo-Hookean over 5..50 % strain, where the grips' slack is out; Ogden to four times the length."""
+    columns = ("Engineering Strain", "Engineering Stress (MPa)")
+    strain, stress_MPa = read_columns(recordings / "srmd_silicone" / f"{file}.csv", columns, delimiter=";").values()
+    chosen = (strain >= 0.05) & (strain <= 0.5)
+    fit = fit_neo_hookean(1.0 + strain[chosen], 1e6 * stress_MPa[chosen])
+    assert 1e-3 * fit.law.shear_modulus_Pa == pytest.approx(published_kPa, rel=0.01)
+    chosen = (strain >= 0.05) & (strain <= 3.0)
+    for terms, share in ((1, 0.997), (2, 0.9997)):
+        assert fit_ogden(1.0 + strain[chosen], 1e6 * stress_MPa[chosen], terms).r2 > share
+
+
+def test_treloars_rubber(recordings: Path) -> None:
+    stretch, stress_MPa = read_columns(recordings / "hyperelastics_jl" / "uniaxial.csv", ("Stretch", "Stress")).values()
+    assert fit_neo_hookean(stretch, 1e6 * stress_MPa).r2 < 0.9
+    fit = fit_ogden(stretch, 1e6 * stress_MPa, terms=3)
+    assert fit.r2 > 0.998
+    assert 0.25e6 < fit.law.shear_modulus_Pa < 0.45e6
+
+
+@pytest.mark.parametrize("fit", [fit_neo_hookean, fit_ogden, fit_thesis_ogden])
+@pytest.mark.parametrize(
+    ("stretch", "stress_Pa", "error", "said"),
+    [
+        (COMPRESSION, -Ogden((1e4,), (2.0,)).stress_Pa(COMPRESSION), LabError, "no positive modulus"),
+        (COMPRESSION, np.zeros_like(COMPRESSION), LabError, "vary"),
+        (COMPRESSION[:1], COMPRESSION[:1], LabError, "pairs"),
+        (np.array([1.0, 0.9, 0.0]), np.array([0.0, -1e3, -1e4]), DomainError, "stretch"),
+        (np.array([1.0, 0.9, 0.8]), np.array([0.0, -1e3, np.nan]), DomainError, "stress_Pa"),
+    ],
+)
+def test_curves_that_cannot_be_fitted(fit, stretch, stress_Pa, error, said) -> None:
+    with pytest.raises(error, match=said):
+        fit(stretch, stress_Pa)
+
+
+# -- cyclic compression: the right cycle is evaluated, the standard's rules are checked --------------------------------
+
+
+LAW = Ogden((120e3,), (3.0,))
+SAMPLE = Sample()
+SOFTENING = (1.5, 1.2, 1.05, 1.0, 0.99)
+
+
+def cyclic_test(
+    cycles: int = 4, strain: float = 0.25, rate_mm_min: float = 10.0, noise: float = 0.0, set_mm: float = 0.0
+) -> CompressionRecord:
+    """Triangles from zero to the strain; stiffer in the first cycles and while loading; a set shifts later starts."""
+    rng = np.random.default_rng(0)
+    top_mm, dt_s = strain * SAMPLE.height_mm, 0.05
+    half = round(top_mm / (rate_mm_min / 60.0) / dt_s)
+    displacement, force = [0.0], [0.0]
+    for cycle in range(cycles):
+        low_mm = set_mm * cycle
+        loading = np.linspace(low_mm, top_mm, half + 1)[1:]
+        for path, share in ((loading, 1.0), (np.linspace(top_mm, low_mm + set_mm, half + 1)[1:], 0.85)):
+            stretch = 1.0 - path / SAMPLE.height_mm
+            displacement.extend(path)
+            force.extend(-LAW.stress_Pa(stretch) * SAMPLE.area_m2 * share * SOFTENING[cycle])
+    jitter = rng.normal(0.0, noise, (2, len(force)))
+    return CompressionRecord(
+        np.arange(len(force)) * dt_s, np.array(displacement) + 1e-2 * jitter[0], np.array(force) + jitter[1]
+    )
+
+
+def test_the_fourth_cycle_gives_the_conditioned_modulus() -> None:
+    curve = evaluated_cycle(cyclic_test(), SAMPLE)
+    assert (curve.stretch[0], curve.stretch[-1]) == pytest.approx((1.0, 0.75))
+    assert fit_ogden(curve.stretch, curve.stress_Pa).law.shear_modulus_Pa == pytest.approx(120e3, rel=1e-3)
+    assert fit_thesis_ogden(curve.stretch, curve.stress_Pa).r2 > 0.99
+
+
+def test_noise_and_set_make_no_cycles() -> None:
+    record = cyclic_test(noise=0.5, set_mm=0.1)
+    assert len(loading_halves(record)) == 4
+    curve = evaluated_cycle(record, SAMPLE)
+    assert fit_ogden(curve.stretch, curve.stress_Pa).law.shear_modulus_Pa == pytest.approx(120e3, rel=0.05)
+
+
+def test_deviations_from_the_cycle_rules_are_told() -> None:
+    found = deviations(cyclic_test(cycles=2, strain=0.4, rate_mm_min=50.0), Sample(29.2, 12.5))
+    assert found[0] == "2 cycles: the method has 4 and evaluates the last"
+    assert "cycle 1 goes to 40.0% strain: the method goes to 25%" in found
+    assert any("cycle 2 loads at 5" in one for one in found)
+
+
+@pytest.mark.parametrize(
+    ("evaluated", "error", "said"),
+    [
+        (lambda: evaluated_cycle(cyclic_test(cycles=3), SAMPLE), LabError, "cycle 4 of 3"),
+        (lambda: evaluated_cycle(cyclic_test(), Sample(height_mm=2.0)), LabError, "height"),
+        (lambda: loading_halves(CompressionRecord(np.arange(5.0), np.zeros(5), np.zeros(5))), LabError, "no cycle"),
+        (lambda: Sample(diameter_mm=0.0), DomainError, "diameter_mm"),
+    ],
+)
+def test_records_that_cannot_be_evaluated(evaluated: Callable[[], object], error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        evaluated()
+
+
+def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
+    path = tmp_path / "test.csv"
+    path.write_text("Machine;X\ntime_s, displacement_mm ,force_N,note\n0,0,0,a\n1,0.5,20,b\n\n2,1,45\n")
+    assert read_compression(path).force_N.tolist() == [0.0, 20.0, 45.0]
+    for text, said in (
+        ("a,b\n1,2\n", "header is .*needed is 'time_s,displacement_mm,force_N'"),
+        ("time_s,displacement_mm,force_N\n", "0 rows"),
+        (
+            "time_s,displacement_mm,force_N\n0,0,0\n1,nan,0\n",
+            "row 3, displacement_mm: 'nan' .*only finite",
+        ),
+        ("time_s,displacement_mm,force_N\n0,0\n", "row 2, force_N: ''"),
+        ("time_s,displacement_mm,force_N\n1,0,0\n1,1,1\n", "time_s does not rise"),
+    ):
+        path.write_text(text)
+        with pytest.raises(LabError, match=said):
+            read_compression(path)
+    with pytest.raises(LabError, match="absent"):
+        read_columns(tmp_path / "absent.csv", ("a",))
+
+
+# -- relaxation --------------------------------------------------------------------------------------------------------
+
+
+SERIES = PronySeries((0.05, 0.04, 0.04), (8.0, 90.0, 900.0))
+HOLD_S = np.concatenate(([0.0, 1e-3], 1e-3 + np.geomspace(0.05, 4000.0, 400)))
+
+
+def record(time_s: np.ndarray, driving: np.ndarray, scale_N: float = 2.5, noise_N: float = 0.0) -> RelaxationRecord:
+    state, forces = SERIES.relaxed(float(driving[0])), [SERIES.discretise(0.0).equilibrium_fraction * driving[0]]
+    for dt_s, level in zip(np.diff(time_s), driving[1:], strict=True):
+        force, state = SERIES.discretise(float(dt_s)).advance(state, float(level))
+        forces.append(force)
+    noise = np.random.default_rng(2).normal(0.0, noise_N, len(forces)) if noise_N else 0.0
+    return RelaxationRecord(time_s, driving, scale_N * np.array(forces) + noise)
+
+
+def step() -> np.ndarray:
+    return np.where(HOLD_S > 0.0, 1.0, 0.0)
+
+
+def test_a_step_gives_the_spectrum_and_the_scale() -> None:
+    fit = fit_relaxation(record(HOLD_S, step()))
+    assert (fit.scale_N, fit.series.fractions, fit.series.times_s) == (
+        pytest.approx(2.5, rel=1e-6),
+        pytest.approx(SERIES.fractions, rel=1e-4),
+        pytest.approx(SERIES.times_s, rel=1e-4),
+    )
+
+
+def test_ramps_down_and_up_give_the_same_spectrum() -> None:
+    time_s = np.arange(0.0, 4000.0, 5.0)
+    driving = 2.0 + np.interp(time_s, [0, 20, 800, 900, 2000, 2010, 4000], [3, 0, 0, 2, 2, -1, -1])
+    fit = fit_relaxation(record(time_s, driving))
+    found, expected = ((*series.fractions, *series.times_s) for series in (fit.series, SERIES))
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_noise_is_left_over_and_not_fitted() -> None:
+    fit = fit_relaxation(record(HOLD_S, step(), noise_N=0.005))
+    assert (fit.rms_N, sum(fit.series.fractions)) == (pytest.approx(0.005, rel=0.15), pytest.approx(0.13, abs=0.01))
+    assert fit.r2 > 0.99
+
+
+GOOD = record(HOLD_S, step())
+
+
+@pytest.mark.parametrize(
+    ("record_", "branches", "error", "said"),
+    [
+        (RelaxationRecord(*(column[:10] for column in GOOD)), 3, LabError, "14 rows"),
+        (GOOD._replace(time_s=GOOD.time_s[::-1].copy()), 3, LabError, "rise strictly"),
+        (GOOD._replace(driving=np.ones_like(GOOD.driving)), 3, LabError, "both change"),
+        (GOOD._replace(force_N=-GOOD.force_N), 3, LabError, "equilibrium"),
+        (GOOD, 7, LabError, "branches = 7"),
+        (GOOD._replace(force_N=np.where(GOOD.time_s > 1.0, np.nan, GOOD.force_N)), 3, DomainError, "force_N"),
+    ],
+)
+def test_records_that_cannot_be_fitted(record_, branches, error, said) -> None:
+    with pytest.raises(error, match=said):
+        fit_relaxation(record_, branches)
+
+
+# -- the command, from a file to a figure ------------------------------------------------------------------------------
+
+
+def test_tension_and_relaxation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    strain = np.linspace(0.0, 1.0, 50)
+    rows = zip(strain, 1e-6 * Ogden((15e3,), (2.0,)).stress_Pa(1.0 + strain), strict=True)
+    tension = tmp_path / "tension.csv"
+    tension.write_text("strain,stress\n" + "\n".join(f"{e!r},{s!r}" for e, s in rows).replace("np.float64", ""))
+    tension.write_text(tension.read_text().replace("(", "").replace(")", ""))
+    assert (
+        main(["characterise", "--json", "tension", str(tension), "--strain", "strain", "--stress-mpa", "stress"]) == 0
+    )
+    assert json.loads(capsys.readouterr().out)["neo_hookean"]["shear_modulus_kPa"] == pytest.approx(15.0)
+
+    time_s = np.geomspace(0.1, 100.0, 40)
+    hold = [f"{t},1,{2.0 - 0.4 * -np.expm1(-t / 5.0)}" for t in time_s]
+    relaxation = tmp_path / "relaxation.csv"
+    relaxation.write_text("time_s,driving,force_N\n0,0,0\n1e-6,1,2\n" + "\n".join(hold))
+    assert main(["characterise", "--json", "relaxation", str(relaxation), "--branches", "1"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["fractions"], found["times_s"]) == (pytest.approx([0.2], rel=1e-3), pytest.approx([5.0], rel=1e-3))

@@ -1,0 +1,267 @@
+"""The subcommands of `benchmark`: the keys of the contract, their arithmetic, figures of no machine in particular."""
+
+import argparse
+import contextlib
+import io
+import json
+from pathlib import Path
+
+import benchmark
+import msgspec
+import numpy as np
+import pytest
+from benchmarks import inverse_report, inverse_workload, latency, loop, step, virtual_time
+from benchmarks.inverse_report import ROOT
+
+from tormagd.assembly.build import build_core
+from tormagd.config import Config, RealTime, load_config
+from tormagd.lab.told import lines
+from tormagd.lab.tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, corner_margins
+from tormagd.scenes.scene import shipped_scenes
+from tormagd.simulation.element import Element
+from tormagd.simulation.parameters import load_plant
+
+# -- inverse, its quick run --------------------------------------------------------------------------------------------
+
+
+KEYS = {
+    "name", "dtype", "hidden", "p50_us", "p99_us", "p999_us", "solver_mae_mT", "plant_mae_mT", "plant_max_mT",
+    "force_mae_N", "memory_kB", "pareto",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result():
+    """The object, by way of the command line."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert benchmark.main(["inverse", "--quick", "--json"]) == 0
+    return json.loads(printed.getvalue())
+
+
+def rows(result, name, hidden=50):
+    return [row for row in result["variants"] if (row["solver"], row["hidden"]) == (name, hidden)]
+
+
+def test_every_variant_has_the_keys_of_the_contract(result):
+    for row in result["variants"]:
+        assert row.keys() >= KEYS
+        assert 0 < row["p50_us"] <= row["p99_us"] <= row["p999_us"]
+        assert row["memory_kB"] > 0 or row["solver"] == "newton"
+    assert {row["name"] for row in result["variants"]} >= {"thesis-linear", "linear-argmin", "vectorised-argmin"}
+    assert any(row["pareto"] for row in result["variants"])
+    assert result["speedup_vs_thesis_linear"] > 0
+    assert rows(result, "newton") or "newton, 50 units" in result["refused"]
+
+
+def test_the_solver_error_is_that_of_the_method(result):
+    assert all(row["solver_max_mT"] < 1e-3 for row in rows(result, "newton"))
+    assert all(row["solver_max_mT"] < 1e-2 for row in rows(result, "torch") if row["step_mT"] == 1.0)
+    assert all(row["solver_max_mT"] <= 0.5 + 1e-6 for row in rows(result, "linear-argmin"))
+    # with the network's mean error for a radius, the thesis's search stops before the nearest row
+    (thesis,), (argmin,) = rows(result, "thesis-linear"), rows(result, "linear-argmin")
+    assert thesis["solver_mae_mT"] > argmin["solver_mae_mT"]
+
+
+def test_no_search_is_better_than_its_network(result):
+    errors = [
+        row["plant_mae_mT"]
+        for row in [*rows(result, "newton"), *rows(result, "torch"), *rows(result, "nearest")]
+        if row["step_mT"] <= 2.0
+    ]
+    assert np.ptp(errors) < 1e-3
+    assert min(errors) > 0.01
+
+
+def test_a_scene_gets_a_search_that_is_measured_and_exact_enough(result):
+    assert set(result["chosen"]) >= {"coronary", "pulse"}
+    for chosen in result["chosen"].values():
+        assert chosen["solver_force_max_N"] <= 0.1 * chosen["tolerance_rms_N"]
+        assert any(row["name"] == chosen["name"] for row in result["variants"])
+
+
+def test_the_roots_that_judge_are_roots():
+    plant = load_plant("sample_1")
+    model = inverse_workload.trained(inverse_workload.training_data(plant, 600, seed=1), hidden=8, epochs=5)
+    along = inverse_workload.course(plant, 50)
+    for (displacement, rate, force), roots in zip(
+        along.rows(), inverse_workload.network_roots_mT(model, along), strict=True
+    ):
+        for root in roots.tolist():
+            assert model.predict_one(displacement, rate, root, inverse_workload.CIP_PERCENT) == pytest.approx(
+                force, abs=1e-9
+            )
+
+
+def test_the_plant_of_the_workload_is_the_plant():
+    """Against the simulator's own element, turned steadily after a reversal, its memory switched off."""
+    plant = load_plant("sample_1")
+    still = msgspec.structs.replace(
+        plant,
+        relaxation=msgspec.structs.replace(plant.relaxation, fractions=(0.0, 0.0, 0.0)),
+        field=msgspec.structs.replace(plant.field, hysteresis_percent=0.0),
+        thermal=msgspec.structs.replace(plant.thermal, force_percent_K=0.0),
+    )
+    gap, speed, travel, dt = 60.0, 20.0, 1.8, 1e-4
+    element = Element(still, gap, dt)
+    for tick in range(20_000):
+        element.advance(tick * dt, gap, -speed)
+    for tick in range(round(travel / speed / dt)):
+        element.advance(tick * dt, gap, speed)
+    field = inverse_workload.NOMINAL.field_mT(gap)
+    (expected,) = inverse_workload.plant_force_N(plant, np.array([travel]), np.array([speed]), np.array([field]))
+    assert element.force_N == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_committed_page_is_of_the_committed_figures() -> None:
+    figures = json.loads((ROOT / "docs/evidence/inverse.json").read_text(encoding="utf-8"))["figures"]
+    assert inverse_report.PAGE.read_text(encoding="utf-8") == inverse_report.page(figures), (
+        "python tools/evidence.py inverse writes both anew"
+    )
+
+
+# -- scenes: what the chosen terms save --------------------------------------------------------------------------------
+
+
+SCENE_KEYS = {
+    "name", "terms_in", "terms_out", "control_hz", "inference_hz", "solver", "rms_N", "rms_full_N", "tolerance_N",
+    "cost_us_per_s", "cost_full_us_per_s",
+}  # fmt: skip
+
+
+def test_every_scene_has_the_keys_of_the_contract_and_saves_what_it_leaves_out(capsys):
+    assert benchmark.main(["scenes", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert {row["name"] for row in result["scenes"]} <= set(shipped_scenes())
+    for row in result["scenes"]:
+        assert row.keys() >= SCENE_KEYS
+        if row["terms_out"]:
+            # the forecast works by the time: a scene that requires it saves less by slow rates than one that does not
+            least = 1.8 if "forecast" in row["terms_in"] else 2.0
+            assert row["cost_us_per_s"] < row["cost_full_us_per_s"] / least
+
+
+# -- step, on the plant: figures of the position loop that are promised to users ---------------------------------------
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """One run on the sample the loop was tuned on."""
+    return step.run("sample_1")
+
+
+@pytest.mark.parametrize(
+    ("figure", "least", "most"),
+    [
+        ("rise_s", 0.0, 0.06),
+        ("rise_over_time_optimal", 1.0, 1.5),
+        ("overshoot", 0.0, 0.02),
+        ("settling_5pct_s", 0.0, 0.12),
+        ("overshoot_over_stroke", 0.0, 0.02),
+        ("steady_error_um", 0.0, 5.0),
+        ("skew_um", 0.0, 30.0),
+        # the stroke is limited by the motors, and the transfer function is the plant's
+        ("stroke_ratio", 1.0, 1.15),
+        ("model_nrmse", 0.0, 0.05),
+    ],
+)
+def test_a_millimetre_is_nearly_time_optimal_and_the_figures_are_those_promised(measured, figure, least, most):
+    assert least <= measured[figure] <= most
+
+
+def test_a_wrong_motor_is_noticed_in_the_comparison():
+    """With twice the inertia the same comparison fails: it can."""
+    heavy = msgspec.structs.replace(Config().motor, inertia_kg_m2=1.6e-6)
+    assert step.nrmse(*step.model_step(heavy, load_plant("sample_1"), step.MODEL_DUTY)) > 0.1
+
+
+def test_the_shipped_gains_are_robust():
+    corners = corner_margins(Config())
+    assert corners["gain_margin_dB"] >= LEAST_GAIN_MARGIN_DB
+    assert corners["phase_margin_deg"] >= LEAST_PHASE_MARGIN_DEG
+
+
+# -- timing, on made-up measurements -----------------------------------------------------------------------------------
+
+
+def block(lateness_us: float, merged: int) -> loop.Block:
+    """Ten seconds in which every tick was equally late."""
+    ticks = 10_000 - merged
+    return loop.Block(np.full(ticks, lateness_us), np.full(ticks, 50.0), ticks, merged, 10.0)
+
+
+def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
+    lateness = [(30.0, 20.0), (900.0, 300.0), (44.0, 40.0)]
+    pairs = [loop.Pair(block(daemon, 10), block(bare, 0)) for daemon, bare in lateness]
+    result = loop.summary(pairs, RealTime(fifo_priority=50))
+    assert (result["ratio"], result["rate_hz"], result["ticks"], result["merged_ticks"]) == (
+        {"p50": 1.5, "p99": 1.5, "p999": 1.5},
+        pytest.approx(999.0),
+        29_970,
+        30,
+    )
+    assert (result["lateness_us"], result["control_exec_us"]["mean"], result["bare"]["merged_share"]) == (
+        {"p50": 44.0, "p99": 900.0, "p999": 900.0, "max": 900.0},
+        50.0,
+        0.0,
+    )
+    assert result["merged_share"] == pytest.approx(30 / 29_970)
+
+
+def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
+    times = zip((0, 1, 2, 4, 5), (0.1, 0.2, 0.2, 0.3, 0.4), strict=True)
+    made = loop.as_block([[stamp_ms * 1_000_000, 0.0, 50.0, received_s] for stamp_ms, received_s in times])
+    assert (made.ticks, made.merged, made.fresh) == (5, 1, 3)
+    assert loop.summary([loop.Pair(made, made._replace(lateness_us=np.ones(5)))], RealTime())["fresh_share"] == 0.75
+
+
+def test_what_is_measured_is_a_configuration_that_tormagd_takes(tmp_path: Path) -> None:
+    config = load_config(loop.write_config(tmp_path, "/dev/null", loop.Stand(RealTime())))
+    assert (config.rates.control_hz, config.rates.inference_hz) == (loop.CONTROL_HZ, loop.CONTROL_HZ)
+    build_core(config)
+
+
+def test_the_bound_is_the_hops_and_a_period_and_a_quarter_of_a_millisecond() -> None:
+    for whole_us, kept in ((1_350.0, True), (1_351.0, False)):
+        found_us = {latency.WHOLE: np.array([whole_us]), latency.HOP: np.array([100.0])}
+        result = latency.summary(found_us, 1, RealTime())
+        assert (result["bound_us"], result["kept"]) == (1_350.0, kept)
+
+
+def test_the_first_tick_that_used_a_setpoint_counts() -> None:
+    rows = [{"setpoint_cf": force, "t_ns": number} for number, force in enumerate((None, 1.0, 1.0, 1.5, 9.0))]
+    made = [row | dict.fromkeys(latency.COLUMNS[1:], 0.0) for row in rows]
+    assert [tick[:2] for tick in latency.first_ticks({1.0: 100, 1.5: 200}, made)] == [(100, 1), (200, 3)]
+
+
+def test_stages_add_up_to_the_whole() -> None:
+    # sent, written by the wall clock; the tick's time; planned, begun by the monotonic clock
+    ticks = [(1_000_000, 1_960_000, 60.0, 5.0, 5.0007), (3_000_000, 3_570_000, 70.0, 7.0, 7.0001)]
+    found_us = latency.stages(ticks) | {latency.HOP: np.array([100.0, 120.0])}
+    assert list(found_us)[1:4] == ["sent, until planning begins", "then until the tick begins", "tick, until written"]
+    expected_us = [[960.0, 570.0], [200.0, 400.0], [700.0, 100.0], [60.0, 70.0]]
+    assert np.array(list(found_us.values())[:4]) == pytest.approx(np.array(expected_us))
+    result = latency.summary(found_us, 3, RealTime())
+    assert (result["setpoint_to_wire_us"]["p50"], result["setpoint_to_wire_us"]["max"]) == pytest.approx((765.0, 960.0))
+    assert (result["ratio"], result["setpoints"], result["seen"], len(result["stages_us"])) == (
+        pytest.approx(765.0 / 110.0, abs=0.01),
+        3,
+        2,
+        3,
+    )
+
+
+def test_virtual_time_is_measured() -> None:
+    found = virtual_time.measure(argparse.Namespace(seconds=0.2, plant="sample_1"))["interpreted"]
+    expected = {name: pytest.approx(1e3 / found["tick_us"][name], rel=0.01) for name in virtual_time.LOOPS}
+    assert {name: found[name] for name in virtual_time.LOOPS} == expected
+
+
+def test_a_result_is_told_by_lines_and_tables() -> None:
+    result = {"rate_hz": 999.26, "lateness_us": {"p50": 44.0, "p99": 900.0}, "against": {"ratio": {"p50": 1.5}}}
+    rows = [{"name": "a", "p50_us": 1.25, "more": {}}, {"name": "long", "p50_us": 10.0, "more": {"RATE": 0.5}}]
+    told = [" ".join(line.split()) for line in lines(result | {"variants": rows, "cpus": [0, 1]})]
+    assert told == [
+        "rate_hz 999.3", "lateness_us p50 44, p99 900", "against ratio p50 1.5",
+        "variants", "name p50_us more RATE", "a 1.25", "long 10 0.5", "cpus 0, 1",
+    ]  # fmt: skip
