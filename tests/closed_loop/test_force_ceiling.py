@@ -1,5 +1,6 @@
 """The brake is not closed by mistake: three layers that each hold alone, and a sensor that is judged (synthetic)."""
 
+import random
 from collections.abc import Callable
 
 import msgspec
@@ -11,11 +12,13 @@ from tormagd.closed_loop import Sample
 from tormagd.config import Config
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import Governor
+from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import ReversingHand
+from tormagd.simulation.hand import RecordedHand, ReversingHand
 
 
 class LyingSensor:
@@ -251,3 +254,28 @@ def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     samples = render(arm(sample, ReversingHand(2.0)), MOST_N, 4.5)
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert worst_N(samples) < CEILING_N
+
+
+# -- a profile is a prior for tracking, never for the ceiling: it presses no harder than any device may ----------------
+
+
+RESTS_S, GOES_MM_S = 4.0, (0.0, 1.0, 42.0)
+SCALES, OFFSETS_N = (0.1, 2.0), (-1.0, 1.0)
+
+
+@pytest.mark.parametrize("goes_mm_s", GOES_MM_S)
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("offset_N", OFFSETS_N)
+def test_a_profile_that_lies_never_presses_over_the_ceiling(
+    make, render, goes_mm_s: float, scale: float, offset_N: float
+) -> None:
+    """Tampered, of another insert or outdated; the handle rests, then creeps or slides, or goes on resting."""
+    draw = random.Random(f"{goes_mm_s} {scale} {offset_N}")
+    hand = RecordedHand((0.0, RESTS_S, RESTS_S + 30.0), (0.0, 0.0, 30.0 * goes_mm_s))
+    loop = make(f"sample_{draw.randint(1, 3)}", hand)
+    fit = DeviceFit(scale, offset_N, draw.choice((1e-6, 1e-2)), 0.0, 1e-4)
+    loop.planner.teach(Learned(fit, draw.uniform(0.7, 1.2), 1.0, draw.uniform(-0.3, 0.3)))
+    loop.arm()
+    samples = render(loop, MOST_N, 6.0)
+    assert max(abs(sample.truth.force_N) for sample in samples) < 1.25 * MOST_N + 0.1
+    assert set(samples[-1].safety.faults) <= {Fault.SENSOR}

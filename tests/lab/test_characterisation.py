@@ -9,6 +9,7 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 import pytest
+import torch
 from hypothesis import assume, given, settings, strategies as st
 
 from tormagd.lab.characterisation.compression import (
@@ -19,13 +20,26 @@ from tormagd.lab.characterisation.compression import (
     loading_halves,
     read_compression,
 )
+from tormagd.lab.characterisation.constitutive import (
+    MooneyRivlin,
+    cauchy_stress_Pa,
+    field,
+    invariants,
+    nominal_stress_Pa,
+    pressure_for_free_ends_Pa,
+    strain_energy_J_m3,
+    stretches,
+    total_energy_J_m3,
+)
 from tormagd.lab.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
 from tormagd.lab.characterisation.hyperelastic import Ogden, ThesisOgden
 from tormagd.lab.characterisation.relaxation import RelaxationRecord, fit_relaxation
+from tormagd.lab.design.force_law import stretch_minus_one
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
 from tormagd.lab.tables import read_columns
 from tormagd.physics.errors import DomainError
+from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N
 from tormagd.physics.relaxation import PronySeries
 
 # -- uniaxial laws: initial slopes, digits near no strain, refusals ----------------------------------------------------
@@ -60,36 +74,6 @@ def test_stress_keeps_its_digits_at_small_strain(strain: float, compressed: bool
         engineering = 2 / power * printed / stretch
     assert ThesisOgden(1e3, exponent).stress_Pa(stretch) == pytest.approx(1e3 * float(printed), rel=1e-13)
     assert Ogden((1e3,), (exponent,)).stress_Pa(stretch) == pytest.approx(1e3 * float(engineering), rel=1e-13)
-
-
-@pytest.mark.parametrize("bad", [0.0, -0.5, math.nan, math.inf, 25.0])
-def test_stretches_are_checked(bad: float) -> None:
-    for law in LAWS:
-        with pytest.raises(DomainError, match="stretch"):
-            law.stress_Pa(bad)
-
-
-@pytest.mark.parametrize(
-    ("moduli", "exponents", "name"),
-    [
-        ((), (), "exponents"),
-        ((1e3,), (2.0, 3.0), "exponents"),
-        ((-1e3,), (2.0,), "moduli_Pa"),
-        ((math.nan,), (2.0,), "moduli_Pa"),
-        ((1e3,), (0.0,), "exponents"),
-        ((1e3,), (math.inf,), "exponents"),
-    ],
-)
-def test_constants_are_checked(moduli: tuple[float, ...], exponents: tuple[float, ...], name: str) -> None:
-    with pytest.raises(DomainError, match=name):
-        Ogden(moduli, exponents)
-
-
-def test_constants_of_the_other_laws_are_checked() -> None:
-    with pytest.raises(DomainError, match="constant_Pa"):
-        ThesisOgden(math.nan, 2.0)
-    with pytest.raises(DomainError, match="exponent"):
-        ThesisOgden(1e3, -2.0)
 
 
 # -- fits: synthetic curves with a known answer, and measured rubber where the data are at hand ------------------------
@@ -331,3 +315,120 @@ def test_tension_and_relaxation(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["characterise", "--json", "relaxation", str(relaxation), "--branches", "1"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["fractions"], found["times_s"]) == (pytest.approx([0.2], rel=1e-3), pytest.approx([5.0], rel=1e-3))
+
+
+# -- constitutive model: stress against the energy's derivative, limits, its link to the brake's force law -------------
+
+
+MATERIAL = MooneyRivlin(c10_Pa=90e3, c01_Pa=48.65e3, relative_permeability=4.0)
+stretch_values = st.floats(0.3, 3.0)
+field_values = st.floats(-3.0, 3.0)
+materials = st.builds(MooneyRivlin, st.floats(1e3, 1e6), st.floats(0.0, 1e6), st.floats(1.0, 10.0))
+
+
+def energy_by_definition(gradient: torch.Tensor, b: torch.Tensor, material: MooneyRivlin) -> torch.Tensor:
+    """Omega* straight from tensors: traces of C = F^T F, and C b . b."""
+    c = gradient.T @ gradient
+    i1, of_square = torch.trace(c), torch.trace(c @ c)
+    elastic = material.c10_Pa * (i1 - 3) + material.c01_Pa * ((i1**2 - of_square) / 2 - 3)
+    return elastic + b @ c @ b / (2 * MU0_H_M * material.relative_permeability)
+
+
+@given(stretch_values, stretch_values, field_values, field_values, st.floats(-1e6, 1e6), materials)
+def test_stress_is_the_derivative_of_the_energy(
+    radial: float, around: float, radial_T: float, axial_T: float, pressure: float, material: MooneyRivlin
+) -> None:
+    stretch, b = stretches(radial, around), field(radial_T, axial_T)
+    gradient = torch.tensor(stretch.deformation_gradient, requires_grad=True)
+    energy = energy_by_definition(gradient, torch.tensor([radial_T, 0.0, axial_T], dtype=torch.float64), material)
+    (slope,) = torch.autograd.grad(energy, gradient)
+    # the constraint det F = 1 adds -p F^-T
+    nominal = slope.numpy() - pressure * np.linalg.inv(stretch.deformation_gradient).T
+    size = np.abs(slope.numpy()).max() + abs(pressure) * 10.0
+    np.testing.assert_allclose(nominal_stress_Pa(stretch, b, material, pressure), nominal, atol=1e-12 * size)
+    cauchy = nominal @ stretch.deformation_gradient.T
+    np.testing.assert_allclose(cauchy_stress_Pa(stretch, b, material, pressure), cauchy, atol=1e-11 * size)
+    assert total_energy_J_m3(stretch, b, material) == pytest.approx(energy.item(), abs=1e-9 * energy.item() + 1e-7)
+
+
+@given(stretch_values, stretch_values, field_values, field_values)
+def test_invariants_are_those_of_the_tensors(radial: float, around: float, radial_T: float, axial_T: float) -> None:
+    stretch = stretches(radial, around)
+    c, b = stretch.right_cauchy_green, np.array([radial_T, 0.0, axial_T])
+    found = invariants(stretch, field(radial_T, axial_T))
+    expected = (
+        np.trace(c),
+        (np.trace(c) ** 2 - np.trace(c @ c)) / 2.0,
+        np.linalg.det(c),
+        b @ b,
+        b @ c @ b,
+        b @ c @ c @ b,
+    )
+    # I2 by traces cancels where one stretch dominates
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.trace(c) ** 2)
+
+
+@given(st.floats(-14.0, -0.3), st.floats(-14.0, -0.3), st.booleans(), st.booleans())
+def test_strain_energy_keeps_its_digits_at_small_strain(
+    radial: float, around: float, compressed: bool, pressed: bool
+) -> None:
+    lambda_1 = 1.0 - 10.0**radial if compressed else 1.0 + 10.0**radial
+    lambda_2 = 1.0 - 10.0**around if pressed else 1.0 + 10.0**around
+    with mp.workdps(60):
+        first, second = mp.mpf(lambda_1) ** 2, mp.mpf(lambda_2) ** 2
+        third = 1 / (first * second)
+        exact = MATERIAL.c10_Pa * (first + second + third - 3)
+        exact += MATERIAL.c01_Pa * (1 / first + 1 / second + 1 / third - 3)
+    assert float(strain_energy_J_m3(stretches(lambda_1, lambda_2), MATERIAL)) == pytest.approx(float(exact), rel=1e-13)
+
+
+def test_the_force_law_is_the_radial_stress_per_undeformed_shaft_with_the_sign_of_the_field_turned() -> None:
+    """What Eq. 33 makes of Eq. 27: T_rr / lambda_1^2 at lambda_2 = 1 with free ends. Its field is the one in the
+    deformed elastomer, and its Maxwell term presses the elastomer on the shaft.
+    """
+    elastomer = Elastomer(277.3e3, 4.0, 0.2)
+    material = MooneyRivlin(100e3, 38.65e3, 4.0)
+    for moment_Tm in (1e-4, 1e-3, 2.5e-3):
+        lambda_1 = 1.0 + stretch_minus_one(moment_Tm, elastomer, TORMAG)
+        stretch, none = stretches(lambda_1, 1.0), field(0.0)
+        pressure = pressure_for_free_ends_Pa(stretch, none, material)
+        elastic = float(cauchy_stress_Pa(stretch, none, material, pressure)[0, 0])
+        in_deformed_T = moment_Tm * 4.0 / 4.0 / TORMAG.inner_radius_m
+        with_field = cauchy_stress_Pa(stretch, field(in_deformed_T / lambda_1), material, pressure)
+        maxwell = float(with_field[0, 0]) - elastic
+        area_m2 = 2.0 * math.pi * TORMAG.thickness_m * TORMAG.inner_radius_m**2
+        traction = 0.2 * area_m2 / (TORMAG.roller_radius_m * lambda_1)
+        force = traction * (maxwell - elastic) / lambda_1**2
+        assert force == pytest.approx(brake_force_N(moment_Tm, elastomer, TORMAG), rel=1e-9)
+
+
+# -- what is refused, by name ------------------------------------------------------------------------------------------
+
+NO_STRETCHES = (0.0, -1.0, 0.01, 21.0, math.nan, math.inf, np.array([1.0, math.nan]), "one")
+NO_FIELDS_T = (math.nan, math.inf, 11.0, -11.0)
+REFUSED: list[tuple[Callable[..., object], tuple[Any, ...], str]] = [
+    *((law.stress_Pa, (bad,), "stretch") for law in LAWS for bad in (0.0, -0.5, math.nan, math.inf, 25.0)),
+    (Ogden, ((), ()), "exponents"),
+    (Ogden, ((1e3,), (2.0, 3.0)), "exponents"),
+    *((Ogden, ((bad,), (2.0,)), "moduli_Pa") for bad in (-1e3, math.nan)),
+    *((Ogden, ((1e3,), (bad,)), "exponents") for bad in (0.0, math.inf)),
+    (ThesisOgden, (math.nan, 2.0), "constant_Pa"),
+    (ThesisOgden, (1e3, -2.0), "exponent"),
+    *((stretches, (bad, 1.0), "radial") for bad in NO_STRETCHES),
+    *((stretches, (1.0, bad), "circumferential") for bad in NO_STRETCHES),
+    (stretches, (0.1, 0.1), "axial"),
+    *((field, (bad,), "radial_T") for bad in NO_FIELDS_T),
+    *((field, (0.0, bad), "axial_T") for bad in NO_FIELDS_T),
+    (MooneyRivlin, (-1.0, 1e3, 2.0), "c10_Pa"),
+    (MooneyRivlin, (1e3, math.nan, 2.0), "c01_Pa"),
+    (MooneyRivlin, (1e3, 1e3, 0.5), "relative_permeability"),
+    (MooneyRivlin, (0.0, 0.0, 2.0), r"c10_Pa \+ c01_Pa"),
+]
+
+
+@pytest.mark.parametrize(("made", "arguments", "name"), REFUSED)
+def test_what_no_law_is_for_is_refused_by_name(
+    made: Callable[..., object], arguments: tuple[Any, ...], name: str
+) -> None:
+    with pytest.raises(DomainError, match=name):
+        made(*arguments)
