@@ -74,18 +74,19 @@ def test_the_lists_say_who_may_do_what(folder: Path) -> None:
     assert roles == [("observer", ["observe"]), ("operater", ["operate"]), ("other", ["observe", "publish"])]
 
 
-@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644])
-def test_a_secret_that_others_can_read_is_refused(folder: Path, mode: int) -> None:
-    secret = folder / "server.key_secret"
-    secret.chmod(mode)
-    with pytest.raises(ConfigError, match=rf"^{secret} can be read by others \(mode {mode:04o}\).*chmod 600 {secret}"):
-        ring(folder)
-
-
-@pytest.mark.parametrize("path", ["publish", "operate/operater.key"])
-def test_a_list_that_others_can_write_is_refused(folder: Path, path: str) -> None:
-    (folder / path).chmod(0o770)
-    with pytest.raises(ConfigError, match=rf"^{folder / path} can be written by others \(mode 0770\).*chmod go-w"):
+@pytest.mark.parametrize(
+    ("name", "mode", "said"),
+    [
+        *(("server.key_secret", mode, "can be read by others .*chmod 600") for mode in (0o640, 0o604, 0o660, 0o644)),
+        *((name, 0o770, "can be written by others .*chmod go-w") for name in ("publish", "operate/operater.key")),
+    ],
+)
+def test_a_secret_that_others_can_read_and_a_list_that_they_can_write_are_refused(
+    folder: Path, name: str, mode: int, said: str
+) -> None:
+    path, said = folder / name, said.replace(" .*", rf" \(mode {mode:04o}\).*")
+    path.chmod(mode)
+    with pytest.raises(ConfigError, match=f"^{path} {said} {path}"):
         ring(folder)
 
 

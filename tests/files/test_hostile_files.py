@@ -5,6 +5,7 @@ second of processor time, and without 100 MB of memory.
 """
 
 import os
+import re
 import resource
 import socket
 import tempfile
@@ -216,6 +217,5 @@ def test_what_is_as_deep_as_allowed_or_only_looks_deeper_is_read(text: str) -> N
     ],
 )
 def test_what_is_deeper_or_no_number_is_refused_with_its_place(text: str, said: str) -> None:
-    with pytest.raises(TomlError) as refused:
+    with pytest.raises(TomlError, match=re.escape(said)):
         toml_tables(text)
-    assert said in str(refused.value)

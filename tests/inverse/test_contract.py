@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -28,8 +27,7 @@ from tormagd.model.force_curve import ForceCurve, Known, Network
 from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.physics.errors import DomainError
 from tormagd.scenes.measured import measured
-from tormagd.scenes.scene import Solver, load_scene, scene_path, shipped_scenes, terms_of
-from tormagd_client.endpoints import ConfigError
+from tormagd.scenes.scene import Solver, load_scene, shipped_scenes, terms_of
 
 torch.set_num_threads(1)  # a second thread costs more than it saves at this size, and waits for a busy processor
 
@@ -540,22 +538,6 @@ def test_a_scene_may_name_its_search() -> None:
     scene = load_scene(shipped_scenes()[0])
     choice = choose_solver(msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2)))
     assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ('name = "bisection"', ("solver.name", "bisection", "newton")),
-        ("step_mT = 5.0", ("solver.step_mT", "5.0", "auto")),
-        ('name = "nearest"\nneighbours = 60\nstep_mT = 50.0', ("neighbours", "60", "number of grid points")),
-    ],
-)
-def test_a_scene_whose_search_cannot_be_is_refused(tmp_path: Path, table: str, words: tuple[str, ...]) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(Path(scene_path("coronary")).read_text() + f"\n[solver]\n{table}\n")
-    with pytest.raises(ConfigError) as caught:
-        build_core(Config(scene=str(path)))
-    assert all(word in str(caught.value) for word in words)
 
 
 def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:

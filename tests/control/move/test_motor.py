@@ -1,6 +1,7 @@
 """H(z) of motor and screw, and the stability margins, against scipy and against a bisection of their own."""
 
 import math
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -203,26 +204,25 @@ def test_the_round_trip_that_is_refused_is_within_what_the_loop_bears(core) -> N
     assert bears_s == pytest.approx(core.margins.phase_margin_deg / 360.0 / core.margins.crossover_Hz)
 
 
+OSCILLATES = r"phase margin of .* gain margin of .* allowed is at least"
+TOO_WEAK = r"coulomb_V = .* pull_V = .* to open the gap from .* allowed is"
+
+
 @pytest.mark.parametrize(
-    "changes",
+    ("section", "said"),
     [
-        {"proportional_per_mm": 60.0},
-        {"proportional_per_mm": 1_000.0},
-        {"derivative_time_s": 0.5},
-        {"derivative_time_s": 0.0, "integral_time_s": 0.005},
+        (Position(proportional_per_mm=60.0), OSCILLATES),
+        (Position(proportional_per_mm=1_000.0), OSCILLATES),
+        (Position(derivative_time_s=0.5), OSCILLATES),
+        (Position(derivative_time_s=0.0, integral_time_s=0.005), OSCILLATES),
+        (Motor(pull_V=6.0), TOO_WEAK),
+        (Motor(coulomb_V=5.8), TOO_WEAK),
+        (Motor(supply_V=3.0, coulomb_V=1.4), TOO_WEAK),
     ],
 )
-def test_gains_that_would_oscillate_give_no_core(changes: dict[str, float]) -> None:
-    position = msgspec.structs.replace(Config().position, **changes)
-    with pytest.raises(ConfigError, match=r"phase margin of .* gain margin of .* allowed is at least"):
-        build_core(Config(position=position))
-
-
-@pytest.mark.parametrize("changes", [{"pull_V": 6.0}, {"coulomb_V": 5.8}, {"supply_V": 3.0, "coulomb_V": 1.4}])
-def test_motors_too_weak_for_the_pull_give_no_core(changes: dict[str, float]) -> None:
-    motor = msgspec.structs.replace(Config().motor, **changes)
-    with pytest.raises(ConfigError, match=r"coulomb_V = .* pull_V = .* to open the gap from .* allowed is"):
-        build_core(Config(motor=motor))
+def test_gains_that_would_oscillate_and_motors_too_weak_for_the_pull_give_no_core(section: Any, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        build_core(Config(**{type(section).__name__.lower(): section}))
 
 
 @pytest.mark.parametrize("gap_mm", np.linspace(45.0, 95.0, 11))
