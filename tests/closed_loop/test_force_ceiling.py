@@ -93,11 +93,22 @@ def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(arm, render, li
     assert worst_N(samples) < ASKED_N + 0.25
 
 
+@pytest.fixture
+def lying(make):
+    """An armed loop whose sensor has lied so from the beginning."""
+
+    def build(lie: str, **options: object):
+        loop = make(**options)
+        LyingSensor(loop.device, LIES[lie]())
+        loop.arm()
+        return loop
+
+    return build
+
+
 @pytest.mark.parametrize("lie", ["-0.5 N", "+1 N", "inverted"])
-def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(make, lie: str) -> None:
-    loop = make()
-    LyingSensor(loop.device, LIES[lie]())
-    loop.arm()
+def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(lying, lie: str) -> None:
+    loop = lying(lie)
     loop.command("disable")
     list(loop.run(1.5))
     with pytest.raises(RefusedError, match="force sensor") as refused:
@@ -105,37 +116,24 @@ def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(make, l
     assert refused.value.code == "sensor_doubted"
 
 
-def test_a_sensor_that_is_frozen_from_the_beginning_is_named_as_the_gap_moves(make, render) -> None:
-    loop = make()
-    LyingSensor(loop.device, frozen())
-    loop.arm()
-    samples = render(loop, ASKED_N, 3.0)
+def test_a_sensor_that_is_frozen_from_the_beginning_is_named_as_the_gap_moves(lying, render) -> None:
+    samples = render(lying("frozen"), ASKED_N, 3.0)
     assert named_s(samples) < 1.0
     assert worst_N(samples) < ASKED_N + 0.3
 
 
-def test_a_sensor_that_reads_too_little_from_the_beginning_presses_more_by_no_more(make, render) -> None:
-    """Until the handle turns back it cannot be told from a weaker device."""
-    loop = make()
-    LyingSensor(loop.device, LIES["-0.3 N"]())
-    loop.arm()
-    assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N + 0.35
-
-
-def test_a_sensor_that_reads_too_much_from_the_beginning_presses_less(make, render) -> None:
-    """As long as the handle goes one way it cannot be told from a stronger device with another field law; what it does
-    is on the safe side."""
-    loop = make()
-    LyingSensor(loop.device, LIES["+0.3 N"]())
-    loop.arm()
-    assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N
+@pytest.mark.parametrize(("lie", "most_N"), [("-0.3 N", ASKED_N + 0.35), ("+0.3 N", ASKED_N)])
+def test_a_sensor_that_reads_too_little_presses_more_by_no_more_and_too_much_less(
+    lying, render, lie: str, most_N: float
+) -> None:
+    """As long as the handle goes one way the device may be a weaker one, or a stronger one with another field law, and
+    then what it does is on the safe side."""
+    assert worst_N(render(lying(lie), ASKED_N, 3.0)) < most_N
 
 
 @pytest.mark.parametrize("lie", ["+0.3 N", "-0.3 N"])
-def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(make, render, lie: str) -> None:
-    loop = make(hand=ReversingHand(4.0))
-    LyingSensor(loop.device, LIES[lie]())
-    loop.arm()
+def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(lying, render, lie: str) -> None:
+    loop = lying(lie, hand=ReversingHand(4.0))
     render(loop, ASKED_N, 3.0)
     samples = render(loop, ASKED_N, 3.0)
     assert samples[-1].plan.limits == (Limit.SENSOR_ZERO,)

@@ -1,5 +1,6 @@
 """After `disable`, `stop` or a fault the gap opens, on both buses; where it does not, that is named in time."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -60,15 +61,15 @@ def held(loop: ClosedLoop, gap_mm: float, seconds: float) -> list[Sample]:
     return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(1e3 * seconds))]
 
 
-def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0) -> float | None:
-    """How long after now NOT_OPENING is latched; `spoils` is done to the device before each tick."""
+def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0) -> float:
+    """How long after now NOT_OPENING is latched, infinity where it is not; `spoils` is done before each tick."""
     begins_s = loop.now_s
     while loop.now_s < begins_s + seconds:
         if spoils is not None:
             spoils(loop.simulated, loop.now_s)
         if Fault.NOT_OPENING in held(loop, CLOSED_MM, 1e-3)[0].safety.faults:
             return loop.now_s - begins_s
-    return None
+    return math.inf
 
 
 def never_begins(device: MessageDevice, time_s: float) -> None:
@@ -83,13 +84,19 @@ def stops_half_way(device: MessageDevice, time_s: float) -> None:
         never_begins(device, time_s)
 
 
-@pytest.mark.parametrize(("bus", "command"), [("serial", "disable"), ("can", "stop")])
-def test_a_retract_that_does_not_begin_is_named(closed: Opens, bus: str, command: str) -> None:
+@pytest.mark.parametrize(
+    ("bus", "ends"),
+    [
+        ("serial", lambda loop: loop.command("disable")),
+        ("can", lambda loop: loop.command("stop")),
+        ("serial", lambda loop: loop.stepper.latch(Fault.PLAN_FAILED)),
+    ],
+    ids=["disable", "stop", "a fault"],
+)
+def test_a_retract_that_does_not_begin_is_named(closed: Opens, bus: str, ends: Callable[[ClosedLoop], None]) -> None:
     loop = closed(bus)
-    loop.command(command)
-    found_s = named_s(loop, never_begins)
-    assert found_s is not None
-    assert found_s <= NAMED_S
+    ends(loop)
+    assert named_s(loop, never_begins) <= NAMED_S
     assert loop.simulated.truth.gap_mm < HALF_MM + 2.0
 
 
@@ -103,9 +110,7 @@ def test_a_retract_that_stops_half_way_is_named(closed: Opens) -> None:
             stopped_s.append(time_s - begins_s)
         stops_half_way(device, time_s)
 
-    found_s = named_s(loop, stops)
-    assert found_s is not None
-    assert found_s - stopped_s[0] <= NAMED_S
+    assert named_s(loop, stops) - stopped_s[0] <= NAMED_S
 
 
 @pytest.mark.parametrize(("bus", "percent"), [("serial", -100), ("can", -200)])
@@ -123,17 +128,7 @@ def test_motors_that_do_not_open_or_press_shut_are_named(closed: Opens, bus: str
 def test_a_retract_that_is_too_slow_is_named(closed: Opens, bus: str, percent: int) -> None:
     loop = closed(bus, faults=[f"opening={percent}%"])
     loop.command("disable")
-    found_s = named_s(loop)
-    assert found_s is not None
-    assert found_s <= SHOULD_S + NAMED_S
-
-
-def test_after_a_fault_too(closed: Opens) -> None:
-    loop = closed("serial")
-    loop.stepper.latch(Fault.PLAN_FAILED)
-    found_s = named_s(loop, never_begins)
-    assert found_s is not None
-    assert found_s <= NAMED_S
+    assert named_s(loop) <= SHOULD_S + NAMED_S
 
 
 def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_and_opened(core: Core) -> None:
@@ -142,9 +137,7 @@ def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_an
     assert isinstance(firmware, Firmware)
     firmware.homed, firmware._left_zero_mm, firmware._right_zero_mm = True, 7.5, 8.5
     loop = ClosedLoop(Config(), core.stepper(), None, device)
-    found_s = named_s(loop)
-    assert found_s is not None
-    assert found_s <= NAMED_S + 0.1  # until the first State
+    assert named_s(loop) <= NAMED_S + 0.1  # until the first State
     held(loop, CLOSED_MM, 2.0)
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
 
@@ -176,13 +169,13 @@ def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
     held(loop, 70.0, 1.5)
     held(loop, CLOSED_MM, 0.3)
     loop.command("disable")
-    assert (named_s(loop, seconds=3.0), loop.stepper.safety.faults) == (None, ())
+    assert (named_s(loop, seconds=3.0), loop.stepper.safety.faults) == (math.inf, ())
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
     for gap_mm, closes_s, opens_s in ((94.0, 0.3, 1.0), (60.0, 1.0, 2.0)):
         loop.command("enable")
         held(loop, gap_mm, closes_s)
         loop.command("disable")
-        assert named_s(loop, seconds=opens_s) is None
+        assert named_s(loop, seconds=opens_s) == math.inf
 
 
 @pytest.mark.parametrize("gap_mm", [50.0, 85.0])
@@ -191,5 +184,5 @@ def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: f
     loop.device = line = BadSerialLine(loop.device)
     line.spoil(partial(losing, 0.1))
     loop.command("disable")
-    assert named_s(loop, seconds=4.0) is None
+    assert named_s(loop, seconds=4.0) == math.inf
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0

@@ -141,8 +141,7 @@ def test_a_handle_that_stands_still_is_refused(table):
     table[table[:, column("sweep")] == 2.0, column("rate_mm_s")] = 0.3
     code, text = refusal(table)
     assert code == "handle_still"
-    assert "0% of sweep 3" in text
-    assert "30%" in text
+    assert [said for said in ("0% of sweep 3", "30%") if said not in text] == []
 
 
 @pytest.mark.parametrize("dead", [0.0, 1.3, "noise"])

@@ -91,8 +91,6 @@ def test_requests_come_back_as_they_went(request_: Request) -> None:
 def test_replies_and_telemetry_come_back_as_they_went() -> None:
     refused = Reply(v=1, id=None, ok=False, error=ErrorReply("busy", "homing", "wait"))
     done = Reply(v=1, id="x", ok=True, result={"operating_state": "ENABLED", "faults": []})
-    assert decode(encode(refused), Reply) == refused
-    assert decode(encode(done), Reply) == done
     telemetry = Telemetry(
         v=1,
         t_ns=1,
@@ -116,7 +114,8 @@ def test_replies_and_telemetry_come_back_as_they_went() -> None:
         confidence=1.0,
         tick=Tick(12.0, 100.0),
     )
-    assert decode(encode(telemetry), Telemetry) == telemetry
+    for message in (refused, done, telemetry):
+        assert decode(encode(message), type(message)) == message
 
 
 def test_a_message_is_a_plain_msgpack_map() -> None:
@@ -153,8 +152,7 @@ def test_a_number_is_a_number(name: str, value: object) -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> None:
     text = refusal(changed(SETPOINT, **{name: value}))
-    assert f"{name} = {value}" in text
-    assert "allowed is" in text
+    assert [said for said in (f"{name} = {value}", "allowed is") if said not in text] == []
 
 
 @pytest.mark.parametrize(

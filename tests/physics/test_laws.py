@@ -303,22 +303,8 @@ def test_what_makes_no_sense_is_refused_by_its_key(odd: dict[str, object]) -> No
 # -- what every law keeps: type and shape of arrays, and its domain, by name -------------------------------------------
 
 
-# -- the field over the gap --------------------------------------------------------------------------------------------
-
-
-# -- the force of the brake --------------------------------------------------------------------------------------------
-
-
-# -- the attraction of the magnets, against the published 64-term sum in 50 digits, and against magpylib ---------------
-
-
-# -- relaxation --------------------------------------------------------------------------------------------------------
-
-
 SERIES = PronySeries(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0))
 
-
-# -- arrays ------------------------------------------------------------------------------------------------------------
 
 ONE_BY_ONE: list[tuple[Callable[[Any], Any], float, float, float]] = [
     *((method, 46.0, 94.0, 16) for law in LAWS for method in (law.radial_moment_Tm, law.d_radial_moment_d_gap)),

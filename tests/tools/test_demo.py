@@ -81,15 +81,13 @@ def test_what_was_missed_is_the_softwares_unless_kernel_or_bare_timer_say_otherw
     assert named in sentence
     verdict, sentence = demo.judge(SCENE, shown(host=STALLED, **missed))
     assert verdict is demo.Verdict.HOST
-    assert named in sentence
-    assert "92 ms" in sentence
+    assert [said for said in (named, "92 ms") if said not in sentence] == []
 
 
 def test_the_control_rate_is_held_against_the_worst_bare_timer():
-    poor = QUIET._replace(bare_kept=0.93)
-    assert demo.judge(SCENE, shown(kept=0.90, host=poor))[0] is demo.Verdict.MET
-    assert demo.judge(SCENE, shown(kept=0.90 - demo.MARGIN, host=poor))[0] is demo.Verdict.HOST
-    assert demo.judge(SCENE, shown(kept=0.90 - demo.MARGIN))[0] is demo.Verdict.MISSED
+    poor, missed = QUIET._replace(bare_kept=0.93), 0.90 - demo.MARGIN
+    shows = (shown(kept=0.90, host=poor), shown(kept=missed, host=poor), shown(kept=missed))
+    assert [demo.judge(SCENE, each)[0] for each in shows] == [demo.Verdict.MET, demo.Verdict.HOST, demo.Verdict.MISSED]
 
 
 @pytest.mark.parametrize("host", [QUIET, STALLED, STALLED._replace(bare_kept=0.4, waited={"daemon": 0.6})])
@@ -106,8 +104,7 @@ def test_a_fault_is_one_sentence_with_cause_and_remedy(fault):
         verdict, sentence = demo.judge(SCENE, aborted(fault, host))
         is_hosts = host is STALLED and fault in show.OF_TIME
         assert verdict is (demo.Verdict.HOST if is_hosts else demo.Verdict.MISSED)
-        assert fault in sentence
-        assert FAULTS[fault].cause in sentence
+        assert [said for said in (fault, FAULTS[fault].cause) if said not in sentence] == []
         assert is_hosts or FAULTS[fault].remedy in sentence
         assert not re.search(r"[\n{}]", sentence)
 

@@ -129,8 +129,7 @@ def test_the_ends_are_those_of_the_configuration_the_insert_and_the_device() -> 
 def test_an_end_is_refused_by_name_or_runs(end: End, kind: str, why: str) -> None:
     found = became((end,), 0.05)
     assert found.kind == kind, found.why
-    assert str(end) in found.why
-    assert why in found.why
+    assert [said for said in (str(end), why) if said not in found.why] == []
     assert (found.gain_margin_dB is None) == (kind == "refused")
 
 

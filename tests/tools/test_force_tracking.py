@@ -148,8 +148,11 @@ def test_recorded_signals_are_in_the_devices_range(recordings, monkeypatch) -> N
 
 def test_what_is_allowed_grows_with_what_the_ideal_carriages_miss() -> None:
     row = {"sd_N": 0.3, "no_delay_rms_N": 0.2, "foresight_rms_N": 0.1}
-    assert allowed_N(None, "sample_1", True, row) is None
-    assert allowed_N(Kind.PULSE, "sample_1", False, row) == pytest.approx(math.hypot(0.26, 0.006))
-    assert allowed_N(Kind.PULSE, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.015))
-    assert allowed_N(Kind.HAND, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.01))
-    assert allowed_N(Kind.HAND, "sample_1", False, row) is None
+    allowed = {
+        (None, "sample_1", True): None,
+        (Kind.PULSE, "sample_1", False): pytest.approx(math.hypot(0.26, 0.006)),
+        (Kind.PULSE, "sample_2", True): pytest.approx(math.hypot(0.13, 0.015)),
+        (Kind.HAND, "sample_2", True): pytest.approx(math.hypot(0.13, 0.01)),
+        (Kind.HAND, "sample_1", False): None,
+    }
+    assert {case: allowed_N(*case, row) for case in allowed} == allowed

@@ -10,10 +10,9 @@ from machines.host import Stall
 
 
 def test_a_stall_costs_the_beats_that_were_due_in_it():
-    assert host.kept([], 10.0, 20.0) == 1.0
-    assert host.kept([Stall(11.0, 11.0505)], 10.0, 20.0) == pytest.approx(1.0 - 50 / 10_000)
-    assert host.kept([Stall(9.0, 10.5), Stall(19.9, 30.0), Stall(40.0, 50.0)], 10.0, 20.0) == pytest.approx(0.94)
-    assert host.kept([Stall(0.0, 99.0)], 10.0, 20.0) == 0.0
+    at_the_ends = [Stall(9.0, 10.5), Stall(19.9, 30.0), Stall(40.0, 50.0)]
+    found = [host.kept(stalls, 10.0, 20.0) for stalls in ([], [Stall(11.0, 11.0505)], at_the_ends, [Stall(0.0, 99.0)])]
+    assert found == pytest.approx([1.0, 1.0 - 50 / 10_000, 0.94, 0.0])
 
 
 @pytest.mark.parametrize(
