@@ -57,6 +57,12 @@ def core(config: Config) -> Core:
         return build_core(config)
 
 
+@pytest.fixture
+def planner(core: Core) -> Planner:
+    """Of a device that nothing is known of."""
+    return core.planner()
+
+
 @pytest.fixture(scope="session")
 def measure() -> MeasurementMaker:
     """A healthy homed device's measurement `number`, a millisecond apart, at a gap of 80 mm. All streams come."""

@@ -189,14 +189,6 @@ def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> Non
 # -- commands ------------------------------------------------------------------------------------------------------
 
 
-def test_disable_and_stop_open(running) -> None:
-    running.command("disable")
-    assert (running.step().request, running.is_off, running.faults) == (DeviceRequest.RETRACT, True, ())
-    running.command("stop")
-    running.step()
-    assert running.opened_for == (Fault.STOPPED,)
-
-
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:
     broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED, "left_mm": 0.0, "right_mm": 0.0}
     bench.step(**broken)

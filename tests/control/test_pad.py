@@ -31,8 +31,7 @@ def pad_core() -> Core:
 def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, **changes: object) -> Measured:
     """A homed device with a finger that deep in its pad."""
     handle, half_mm = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, 0.0)), gap_mm / 2.0
-    measured = Measured(1, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0)
-    return measured.replaced(**changes)
+    return Measured(1, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0).replaced(**changes)
 
 
 def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = DEPTH_MM) -> Planner:

@@ -193,8 +193,7 @@ def test_a_steady_handle_teaches_nothing_about_rate_and_displacement(table):
 
 def test_displacement_is_what_the_daemon_calls_it():
     """Of a whole sweep or position by position: one law."""
-    rng = np.random.default_rng(1)
-    path = np.cumsum(rng.normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
+    path = np.cumsum(np.random.default_rng(1).normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
     measure, handle = Measure(47.5, 0.01, True, 20.0, 1e-3), Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
     expected = []
     for position in path:

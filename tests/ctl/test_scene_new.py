@@ -23,8 +23,7 @@ def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_i
     forces = recording(tmp_path / "forces.csv", 0.31, 0.62, 0.3)
     out = tmp_path / "scenes" / "mine.toml"
     out.parent.mkdir()
-    made = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(0).result
-    assert made["insert"] == "MRE-10-10"
+    assert ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(0).result["insert"] == "MRE-10-10"
     scene = load_scene(str(out))
     assert (scene.name, scene.force.least_N, scene.force.most_N, scene.force.tolerance_rms_N) == (
         "mine",

@@ -52,8 +52,7 @@ def test_every_setpoint_arrives_from_the_first_on(fake_daemon, ctl):
 def test_a_second_run_of_the_same_source_is_newer(fake_daemon, ctl):
     options = ("step", "--duration", "0.02", "--source", "me", "--valid-for-ms", "70")
     first = send(fake_daemon, ctl, *options)
-    second = send(fake_daemon, ctl, *options)
-    wait_for(fake_daemon, first["sent"] + second["sent"])
+    wait_for(fake_daemon, first["sent"] + send(fake_daemon, ctl, *options)["sent"])
     numbers = [(setpoint.session, setpoint.seq) for setpoint in fake_daemon.setpoints]
     assert numbers[0][1] == numbers[first["sent"]][1] == 0
     assert numbers == sorted(set(numbers))

@@ -792,8 +792,7 @@ def test_a_device_that_cannot_be_met_is_not_moved() -> None:
     line = by_error("another hash")
     results = {result.check.name: result for result in run(Host(line), checks_on(line))}
     assert results["device_clock"].passed
-    said = {results[one.name].seen for one in CHECKS if one.moves}
-    assert said == {"not tried, because schema_hash failed"}
+    assert {results[one.name].seen for one in CHECKS if one.moves} == {"not tried, because schema_hash failed"}
 
 
 class Asleep(Wire):
@@ -934,8 +933,7 @@ def test_a_reader_that_goes_does_not_end_the_run(monkeypatch: pytest.MonkeyPatch
 
 def test_every_check_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["--list"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(":")[0] for line in lines] == [one.name for one in CHECKS]
+    assert [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()] == [one.name for one in CHECKS]
 
 
 def test_every_check_cites_the_page() -> None:

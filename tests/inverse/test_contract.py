@@ -334,8 +334,7 @@ def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel,
     creep = creeping.curve(0.5, 10, CIP)
     assert 0 < creep.force_N(800.0) - creep.force_N(500.0) < 1e-14
     for curve in (plateau.curve(0.5, 10, CIP), creep):
-        top = curve.force_N(800.0)
-        above = solver.solve(curve, top + 1, 600.0)
+        above = solver.solve(curve, curve.force_N(800.0) + 1, 600.0)
         assert (above.reach, above.field_mT) == (Reach.ABOVE, pytest.approx(600, abs=0.5))
     assert solver.solve(plateau.curve(0.5, 10, CIP), plateau.predict_one(0.5, 10, 800.0, CIP), 700.0).field_mT == (
         pytest.approx(700, abs=0.5)

@@ -108,8 +108,7 @@ def test_without_delay_a_step_takes_the_least_time_that_acceleration_allows() ->
     """Half the way speeding up, half of it braking, sqrt(D/a) each: 23/30 D^2 sqrt(D/a) of squared error."""
     way_mm, acceleration_mm_s2, lasts_s = 2.0, 1600.0, 0.5
     drive = Drive(stall_mm_s2=1e6, per_s=1.0, most_mm_s2=acceleration_mm_s2)
-    along_s = time_s(lasts_s)
-    no_delay_N, _ = errors_N(np.where(along_s < 0.1, 50.0, 50.0 + way_mm), drive)
+    no_delay_N, _ = errors_N(np.where(time_s(lasts_s) < 0.1, 50.0, 50.0 + way_mm), drive)
     squared = 23.0 / 30.0 * way_mm**2 * math.sqrt(way_mm / acceleration_mm_s2)
     assert no_delay_N == pytest.approx(N_MM * math.sqrt(squared / lasts_s), rel=0.02)
 

@@ -308,8 +308,7 @@ def test_tension_and_relaxation(tmp_path: Path, capsys: pytest.CaptureFixture[st
     )
     assert json.loads(capsys.readouterr().out)["neo_hookean"]["shear_modulus_kPa"] == pytest.approx(15.0)
 
-    time_s = np.geomspace(0.1, 100.0, 40)
-    hold = [f"{t},1,{2.0 - 0.4 * -np.expm1(-t / 5.0)}" for t in time_s]
+    hold = [f"{t},1,{2.0 - 0.4 * -np.expm1(-t / 5.0)}" for t in np.geomspace(0.1, 100.0, 40)]
     relaxation = tmp_path / "relaxation.csv"
     relaxation.write_text("time_s,driving,force_N\n0,0,0\n1e-6,1,2\n" + "\n".join(hold))
     assert main(["characterise", "--json", "relaxation", str(relaxation), "--branches", "1"]) == 0

@@ -1,6 +1,5 @@
 """What `tormag-lab` promises: its commands, how they refuse, what they need, and who may import the laboratory."""
 
-import ast
 import json
 import re
 import subprocess
@@ -107,22 +106,6 @@ def test_where_tormagd_stands_in_a_folder_of_its_own_packages_are_brought_there(
     assert errors.not_installed("torch").endswith(
         f"sudo python3 -m pip install --target {tmp_path}/tormagd 'torch==2.13.0'"
     )
-
-
-def imported(path: Path) -> set[str]:
-    """The modules that a file imports, also inside functions."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
-
-
-def test_nothing_else_imports_the_laboratory():
-    outside = [path for path in SOURCES if ROOT / "tormagd" / "lab" not in path.parents]
-    assert not [path for path in outside if any(name.startswith("tormagd.lab") for name in imported(path))]
 
 
 def test_every_command_that_is_named_exists():

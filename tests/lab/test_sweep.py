@@ -56,23 +56,20 @@ def test_other_processes_give_the_same_answer(runs: list[Run], thread: Executor)
     assert len({outcome.design for outcome in here.values()}) > 1
 
 
-def test_a_stopped_sweep_goes_on_where_it_was(runs: list[Run], thread: Executor, tmp_path: Path) -> None:
+def test_what_was_finished_is_kept_and_a_stopped_sweep_goes_on_there(
+    runs: list[Run], thread: Executor, tmp_path: Path
+) -> None:
     state = tmp_path / "sweep.json"
     with pytest.raises(ConnectionError):
         sweep([runs[0]], Refusing(thread, 0), state)
     assert read_state(state) == {}
     first = sweep(runs[:2], thread, state)
+    with pytest.raises(ConnectionError, match="worker lost"):
+        sweep(runs, Refusing(thread, 0), state)
+    assert read_state(state) == first
     rest = sweep(runs, Refusing(thread, 1), state)
     assert (list(rest), {run: rest[run] for run in first}) == (runs, first)
     assert read_state(state) == rest
-
-
-def test_a_failure_keeps_what_was_finished(runs: list[Run], thread: Executor, tmp_path: Path) -> None:
-    state = tmp_path / "sweep.json"
-    sweep(runs[:1], thread, state)
-    with pytest.raises(ConnectionError, match="worker lost"):
-        sweep(runs, Refusing(thread, 0), state)
-    assert list(read_state(state)) == runs[:1]
 
 
 def test_another_problem_does_not_take_an_old_answer(runs: list[Run], thread: Executor, tmp_path: Path) -> None:

@@ -363,8 +363,7 @@ def test_not_rising_counts_in_the_boxes_alone(of_two: ForceModel) -> None:
     # rises where either insert's fields are, falls with more iron: the whole's ranges have corners that neither has
     whole = replace(of_two, hidden_weight=weight, output_weight=np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]))
     assert not_rising_share(whole) == 0.0
-    falls = replace(of_two, hidden_weight=-np.abs(weight), output_weight=np.ones(6))
-    assert not_rising_share(falls) == 1.0
+    assert not_rising_share(replace(of_two, hidden_weight=-np.abs(weight), output_weight=np.ones(6))) == 1.0
 
 
 def test_a_box_that_is_none_is_refused(of_two: ForceModel) -> None:

@@ -4,16 +4,10 @@ from collections.abc import Callable
 
 import pytest
 
-from tormagd.assembly.build import Core
 from tormagd.control.core import Planner
 from tormagd.control.records import Measured, Plan
 
 PERIOD_S = 0.004
-
-
-@pytest.fixture
-def planner(core: Core) -> Planner:
-    return core.planner()
 
 
 @pytest.fixture

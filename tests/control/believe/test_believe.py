@@ -147,8 +147,7 @@ def test_what_its_zero_is_off_by_is_no_part_of_what_a_sensor_teaches_and_is_said
 def test_what_its_zero_is_off_by_is_no_friction_at_a_creep(core, planner, hear, moving) -> None:
     right = hear(core.planner(), 0.5, moving(force_N=1.3, **CREEPING)).believe.slow.factor
     planner.teach(Learned(sensor_zero_N=0.1))
-    off = hear(planner, 0.5, moving(force_N=1.4, **CREEPING)).believe.slow.factor
-    assert off == pytest.approx(right)
+    assert hear(planner, 0.5, moving(force_N=1.4, **CREEPING)).believe.slow.factor == pytest.approx(right)
     assert right != 1.0
 
 

@@ -41,8 +41,7 @@ def swinging(now_s: float) -> float:
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_force_that_swings_with_the_gap_under_a_handle_that_stands_is_a_lost_encoder(sign: float) -> None:
-    watch = watched(SETTLES_S + 1.5, still, lambda now_s: sign * swinging(now_s), swinging)
-    assert watch.is_lost
+    assert watched(SETTLES_S + 1.5, still, lambda now_s: sign * swinging(now_s), swinging).is_lost
 
 
 def test_it_is_lost_until_it_moves() -> None:

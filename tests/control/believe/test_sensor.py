@@ -40,8 +40,7 @@ def test_readings_that_fall_move_nothing_however_long(known, hear, moving, share
 
 
 def test_readings_that_rise_are_followed_at_a_bounded_rate(known, hear, moving) -> None:
-    believe = hear(known, 0.08, moving(force_N=1.4 * MODEL_N)).believe
-    assert force_N(believe) - MODEL_N < MOVED_N + 0.08 * RISES_N_S
+    assert force_N(hear(known, 0.08, moving(force_N=1.4 * MODEL_N)).believe) - MODEL_N < MOVED_N + 0.08 * RISES_N_S
     assert (force_N(hear(known, 0.5, moving(force_N=1.4 * MODEL_N)).believe), known.planned.limits) == (
         pytest.approx(1.4 * MODEL_N, abs=0.01),
         (Limit.DEVICE_OR_SENSOR,),

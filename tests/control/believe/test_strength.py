@@ -95,8 +95,7 @@ def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
 
 def test_where_stronger_devices_are_allowed_the_ceiling_holds_for_them() -> None:
     strong = DeviceFit(3.0, scale_variance=0.0, offset_variance_N2=0.0)
-    model_N = strong.surely_within_N(2.5, DeviceBounds(0.6, 4.0, -0.2, 0.3))
-    assert strong.force_N(model_N) == pytest.approx(2.5)
+    assert strong.force_N(strong.surely_within_N(2.5, DeviceBounds(0.6, 4.0, -0.2, 0.3))) == pytest.approx(2.5)
 
 
 readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))
@@ -149,8 +148,7 @@ def test_what_is_known_is_forgotten_in_its_time() -> None:
     )
     assert relaxed.offset_variance_N2 == pytest.approx(OFFSET_SD_N**2 + left * (0.002 - OFFSET_SD_N**2))
     half = forgotten(known, 0.5 * offset_lasts_s, adapts_in_s)
-    twice = forgotten(half, 0.5 * offset_lasts_s, adapts_in_s)
-    assert twice.covariance_N == pytest.approx(relaxed.covariance_N)
+    assert forgotten(half, 0.5 * offset_lasts_s, adapts_in_s).covariance_N == pytest.approx(relaxed.covariance_N)
     assert 0.0 < relaxed.covariance_N < left**0.5 * known.covariance_N
 
 

@@ -63,13 +63,6 @@ def test_a_least_gap_ends_a_motion_towards_it(running) -> None:
     assert 76.0 - 1e-3 < lowest_mm < 76.01
 
 
-@pytest.mark.parametrize("min_gap_mm", [0.0, 79.8])
-def test_the_gap_is_closed_no_further_than_this_device_allows(running, min_gap_mm: float) -> None:
-    for _ in range(40):
-        running.step(running.plan(50.0, min_gap_mm=min_gap_mm))
-    assert (running.move.reference.gap_mm >= 79.7) == (min_gap_mm > 0.0)
-
-
 @pytest.mark.parametrize("gap_mm", [40.5, 42.0, 44.9])
 def test_carriages_beyond_the_closed_end_are_driven_back(bench, gap_mm: float) -> None:
     bench.enabled(**bench.gap(gap_mm))
