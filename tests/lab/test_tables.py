@@ -1,3 +1,7 @@
+"""Tables 2.4 and 2.5 of the thesis: the fits of the ranges, and what serves which task."""
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,9 +11,14 @@ from tormagd.lab.design.range_fit import (
     frictionless_range_N,
     mean_relative_error,
 )
+from tormagd.lab.thesis import page, table_2_5
+from tormagd.lab.thesis.values import TABLE_2_5
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import TORMAG, brake_force_N
 from tormagd.physics.inserts import INSERTS
+
+# -- table 2.4: friction and exponent fitted to the measured ranges ----------------------------------------------------
+
 
 ALL = list(INSERTS.values())
 LAWS = (ThesisFieldLaw(), PowerFieldLaw())
@@ -43,3 +52,34 @@ def test_exponent_one_is_the_force_law_itself() -> None:
     forces = brake_force_N(law.radial_moment_Tm(np.array([45.0, 95.0])), item.elastomer, TORMAG)
     friction = item.elastomer.friction_coefficient
     assert friction * frictionless_range_N(item, law) == pytest.approx(forces[0] - forces[1], rel=1e-12)
+
+
+# -- table 2.5 in both readings: what the thesis names matches by width, no brake gives the least forces ---------------
+
+
+FOUND = table_2_5.table_2_5()
+
+
+def test_every_insert_stands_before_every_task_in_both_readings() -> None:
+    for (task, _), found in zip(TABLE_2_5, FOUND["tasks"], strict=True):
+        assert {row["insert"] for row in found["ranked"]} == set(INSERTS)
+        for row in found["ranked"]:
+            wide = INSERTS[row["insert"]].force_range.measured_N >= task.most_N - task.least_N
+            assert (row["matched_share"] == 1.0) == wide
+            assert not row["serves"]  # every task begins at 0 N
+
+
+def test_of_what_the_thesis_names_one_is_not_wide_enough() -> None:
+    rows = [dict(zip(table_2_5.COLUMNS, row, strict=True)) for row in table_2_5.readings(FOUND)]
+    assert len(rows) == sum(len(named) for _, named in TABLE_2_5)
+    short = [row for row in rows if row["range matched"] != "100%"]
+    assert [row["insert the thesis names"] for row in short] == ["MRE-30-30"]
+    assert "0.67 N of the width" in short[0]["missed"]
+    named = {row["task"].split(",")[0]: row["narrowest that matches"] for row in rows}
+    assert all(named[task.name] in inserts for task, inserts in TABLE_2_5)
+
+
+def test_the_page_has_it() -> None:
+    """`tormag-lab reproduce-thesis --out docs` writes it."""
+    written = Path(__file__).parents[2] / "docs" / "reproduction.md"
+    assert page.table_2_5(FOUND) in written.read_text(encoding="utf-8")
