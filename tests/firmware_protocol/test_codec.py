@@ -1,9 +1,13 @@
-"""The codec against cantools, against its own inverse, and against what must not pass."""
+"""The codec, in Python and in C: against the DBC, the golden vectors, and what the README shows."""
 
 import contextlib
+import ctypes
+import json
 import math
 import random
+import re
 import struct
+from pathlib import Path
 from typing import Any
 
 import cantools
@@ -11,10 +15,13 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
 
+import firmware_protocol
 from firmware_protocol import codec
 from firmware_protocol.codec import (
     FUNCTION,
+    PROTOCOL_VERSION,
     SCHEMA_HASH,
+    Clear,
     DecodeError,
     DeviceFault,
     DeviceMode,
@@ -22,6 +29,7 @@ from firmware_protocol.codec import (
     DriveMode,
     EncodeError,
     Hello,
+    Home,
     Identity,
     Message,
     Retract,
@@ -29,15 +37,22 @@ from firmware_protocol.codec import (
     State,
     Status,
     Switches,
+    can_identifier,
     crc8,
     decode,
     encode,
     period,
 )
 from firmware_protocol.dbc import DBC
-from firmware_protocol.golden import bitwise_crc8
+from firmware_protocol.framing import MAX_PAYLOAD, Frame, FrameDecoder, FramingStatistics, encode_frame
+from firmware_protocol.golden import bitwise_crc8, bitwise_crc16
 from firmware_protocol.layouts import LAYOUTS
 from firmware_protocol.schema import Layout, Signal
+from tormagd.simulation.firmware import Answer, Firmware, Sensors
+from tormagd.simulation.parameters import load_plant
+
+# -- against the DBC ---------------------------------------------------------------------------------------------------
+
 
 DATABASE: Any = cantools.database.load_file(DBC, strict=True)
 DRIVE = Drive(left_duty=0.5, right_duty=-0.25, mode=DriveMode.RUN, counter=7)
@@ -244,3 +259,287 @@ def test_numbers_of_numpy_s_are_numbers() -> None:
     assert encode(drive) == encode(DRIVE)
     with pytest.raises(TypeError, match="int object expected") if IS_COMPILED else contextlib.nullcontext():
         assert encode(DRIVE.replaced(counter=np.uint8(7))) == encode(DRIVE)
+
+
+# -- the golden vectors in Python and in C, also under sanitizers, and what the README shows ---------------------------
+
+
+ROOM = Path(firmware_protocol.__file__).parent
+MESSAGES: dict[str, Any] = json.loads((ROOM / "vectors" / "messages.json").read_text(encoding="utf-8"))
+PAGE = (ROOM / "README.md").read_text(encoding="utf-8")
+FRAMES: dict[str, Any] = json.loads((ROOM / "vectors" / "frames.json").read_text(encoding="utf-8"))
+
+
+def test_valid_payloads_in_both_directions() -> None:
+    types = {layout.message.__name__: layout.message for layout in LAYOUTS}
+    for vector in MESSAGES["valid"]:
+        payload = bytes.fromhex(vector["payload"])
+        message = types[vector["message"]](**vector["values"])
+        assert encode(message) == payload, vector
+        assert decode(vector["function"], payload) == message, vector
+        assert can_identifier(FUNCTION[type(message)]) == vector["can_identifier"]
+
+
+@pytest.mark.parametrize("vector", MESSAGES["invalid"], ids=lambda vector: f"{vector['reason']} {vector['payload']}")
+def test_invalid_payloads_are_refused(vector: dict[str, Any]) -> None:
+    with pytest.raises(DecodeError):
+        decode(vector["function"], bytes.fromhex(vector["payload"]))
+
+
+def test_valid_frames_in_both_directions() -> None:
+    for vector in FRAMES["valid"]:
+        frame = Frame(vector["function"], vector["sequence"], bytes.fromhex(vector["payload"]))
+        encoded = bytes.fromhex(vector["frame"])
+        assert encode_frame(frame.function, frame.sequence, frame.payload) == encoded
+        assert FrameDecoder().feed(encoded) == [frame]
+
+
+@pytest.mark.parametrize("vector", FRAMES["streams"], ids=lambda vector: vector["name"])
+def test_streams_give_the_frames_and_counts_written_down(vector: dict[str, Any]) -> None:
+    decoder = FrameDecoder()
+    assert decoder.feed(bytes.fromhex(vector["bytes"])) == [
+        Frame(f["function"], f["sequence"], bytes.fromhex(f["payload"])) for f in vector["frames"]
+    ]
+    assert decoder.statistics == FramingStatistics(**vector["statistics"])
+
+
+def test_the_examples_of_the_readme_are_true() -> None:
+    examples = re.findall(
+        r"```frame\n([0-9a-f ]+)\n```\n\n\| bytes \| meaning \|\n\| --- \| --- \|\n((?:\|.*\n)+)", PAGE
+    )
+    open_ends = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+    whole = re.findall(r"^\| (?:host|device): (\w+), sequence (\d+),.* \| `([0-9a-f ]+)` \|$", PAGE, re.MULTILINE)
+    shown: tuple[tuple[int, Message], ...] = (
+        (42, Drive(left_duty=0.125, right_duty=0.1234, mode=DriveMode.RUN, counter=200)),
+        (42, State(left_position_mm=-12.0, right_position_mm=-12.1, device_time_s=0.25, counter=0)),
+        (0, Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce=255)),
+        (17, Identity(SCHEMA_HASH, firmware_major=1, firmware_minor=0, serial_number=1)),
+        (60, Home(nonce=1)),
+        (93, Status(DeviceMode.HOMING, open_ends, DeviceFault(0), 25.0, 12.0, drive_counter=44, command_nonce=1)),
+    )
+    for (name, number, line), (sequence, message) in zip(whole, shown[3:], strict=True):
+        assert (name, int(number)) == (type(message).__name__, sequence)
+        assert bytes.fromhex(line) == encode_frame(FUNCTION[type(message)], sequence, encode(message))
+    for (line, rows), (sequence, message) in zip(examples, shown[:3], strict=True):
+        assert bytes.fromhex(line) == encode_frame(FUNCTION[type(message)], sequence, encode(message))
+        assert f"function {FUNCTION[type(message)]}, {type(message).__name__} |" in rows
+        assert " ".join(re.findall(r"^\| `([0-9a-f ]+)` \|", rows, re.MULTILINE)) == line
+
+
+def test_the_crcs_of_the_readmes_examples_are_over_what_it_says() -> None:
+    checked = re.findall(r"^\| `([0-9a-f ]+)` \| CRC-(8|16) over `([0-9a-f ]+)` \|$", PAGE, re.MULTILINE)
+    assert len(checked) == 3
+    for crc, width, data in checked:
+        expected = bitwise_crc8 if width == "8" else bitwise_crc16
+        assert int.from_bytes(bytes.fromhex(crc), "big") == expected(bytes.fromhex(data))
+
+
+def test_the_readme_says_which_way_round_the_schema_hash_is() -> None:
+    assert f"`{SCHEMA_HASH.to_bytes(4, 'big').hex(' ')} ..` is 0x{SCHEMA_HASH:08X}" in PAGE
+    assert f"`{SCHEMA_HASH.to_bytes(4, 'little').hex(' ')}`)" in PAGE
+
+
+def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
+    """At 1 Mbaud a byte takes 10 us, at 1 Mbit/s a bit takes 1."""
+    for message in (Drive(0.0, 0.0, DriveMode.OFF, 1), State(0, 0, 0, 1)):
+        payload = encode(message)
+        serial_ms = 0.01 * len(encode_frame(FUNCTION[type(message)], 0, payload))
+        # ISO 11898-1 with the most stuffing: a bit for every four after the first of the 34 + 8 n that are stuffed
+        can_ms = 0.001 * (47 + 8 * len(payload) + (34 + 8 * len(payload) - 1) // 4)
+        said = f"{type(message).__name__} on its way"
+        assert f"| {said} | {serial_ms:.2f} ms serial, at most {math.ceil(100 * can_ms) / 100:.2f} ms CAN |" in PAGE
+
+
+# -- what each mode takes, as the page says --------------------------------------------------------------------------
+
+AT_REST = Sensors(0, 0, 0.0, 0.0, 0.0, 0, Switches(0), 12.0, 25.0)
+ASKED = 0.25
+"""A duty."""
+
+
+def in_mode(mode: DeviceMode) -> Firmware:
+    """A homed device that has met its host, brought there by what a host says."""
+    firmware = Firmware(load_plant("sample_1"))
+    firmware.receive(0.0, Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255), AT_REST)
+    firmware.homed = True
+    before: dict[DeviceMode, tuple[Message, ...]] = {
+        DeviceMode.IDLE: (),
+        DeviceMode.RUN: (Drive(0.0, 0.0, DriveMode.RUN, 1),),
+        DeviceMode.HOMING: (Home(1),),
+        DeviceMode.RETRACTING: (Retract(1),),
+        DeviceMode.LATCHED: (Hello(SCHEMA_HASH ^ 1, PROTOCOL_VERSION, 255), Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255)),
+    }
+    for message in before[mode]:
+        firmware.receive(0.0, message, AT_REST)
+    assert firmware.mode is mode
+    return firmware
+
+
+SAID: dict[str, Message] = {
+    "Drive OFF": Drive(0.0, 0.0, DriveMode.OFF, 2),
+    "Drive RUN": Drive(ASKED, 0.0, DriveMode.RUN, 2),
+    "Hello that fits": Hello(SCHEMA_HASH, PROTOCOL_VERSION, 9),
+    "Hello that does not": Hello(SCHEMA_HASH ^ 1, PROTOCOL_VERSION, 9),
+    "Retract": Retract(9),
+    "Home": Home(9),
+    "Clear": Clear(9),
+}
+
+
+def taken() -> list[tuple[str, DeviceMode, str]]:
+    """The cells of the page's table: what is said, in which mode, and what comes of it."""
+    head, _, *rows = re.findall(r"^\|(.*)\|$", PAGE.partition("### What each mode takes")[2].partition("###")[0], re.M)
+    modes = [DeviceMode[name.strip()] for name in head.split("|")[1:]]
+    cells = [[cell.strip() for cell in row.split("|")] for row in rows]
+    return [(said, mode, what) for said, *row in cells for mode, what in zip(modes, row, strict=True)]
+
+
+def test_the_table_of_the_page_is_whole() -> None:
+    assert [(said, mode) for said, mode, _ in taken()] == [(said, mode) for said in SAID for mode in DeviceMode]
+
+
+@pytest.mark.parametrize(("said", "mode", "what"), taken())
+def test_the_firmware_does_what_the_pages_table_says(said: str, mode: DeviceMode, what: str) -> None:
+    firmware = in_mode(mode)
+    answer = firmware.receive(0.001, SAID[said], AT_REST)
+    assert firmware.mode is DeviceMode.__members__.get(re.split(r"\W", what)[0], mode)
+    nonce = firmware.status(AT_REST).command_nonce
+    if said.startswith("Drive"):
+        assert answer is Answer.MEASUREMENT
+        assert (firmware.output.left_duty == ASKED) == (firmware.mode is DeviceMode.RUN)
+    elif said.startswith("Hello"):
+        assert (answer, nonce) == (Answer.IDENTITY, 9)
+        assert (DeviceFault.SCHEMA_MISMATCH in firmware.faults) == ("not" in said or mode is DeviceMode.LATCHED)
+    else:
+        assert (answer, nonce == 9) == (Answer.NONE, what != "refused")
+    if "not homed" in what:
+        assert not firmware.homed
+
+
+# -- the C codec and framing -------------------------------------------------------------------------------------------
+
+
+STEP_TYPES = {
+    "b": ctypes.c_int8,
+    "B": ctypes.c_uint8,
+    "h": ctypes.c_int16,
+    "H": ctypes.c_uint16,
+    "I": ctypes.c_uint32,
+}
+OK, UNKNOWN_FUNCTION, OUT_OF_RANGE = 0, 1, 4
+REFUSALS = 4
+
+
+def structure(layout: Layout) -> type[ctypes.Structure]:
+    """struct tormag_..._t of a message."""
+    names = [signal.name for signal in layout.signals] + ["crc"] * layout.protected
+    fields = [(name, STEP_TYPES[code]) for name, code in zip(names, layout.format[1:], strict=True)]
+    return type(layout.message.__name__, (ctypes.Structure,), {"_fields_": fields})
+
+
+class Signals(ctypes.Union):
+    _fields_ = [(layout.message.__name__, structure(layout)) for layout in LAYOUTS]
+
+
+class CMessage(ctypes.Structure):
+    """struct tormag_message."""
+
+    _fields_ = [("function", ctypes.c_uint8), ("signals", Signals)]
+
+
+def c_decode(library: ctypes.CDLL, function: int, payload: bytes) -> tuple[int, dict[str, int]]:
+    """The result and, if it is OK, the steps of the message's signals."""
+    message = CMessage()
+    result = library.tormag_decode(
+        ctypes.byref(message), ctypes.c_uint8(function), payload, ctypes.c_size_t(len(payload))
+    )
+    if result != OK:
+        return result, {}
+    assert message.function == function
+    layout = next(layout for layout in LAYOUTS if layout.function == function)
+    steps = getattr(message.signals, layout.message.__name__)
+    return result, {signal.name: getattr(steps, signal.name) for signal in layout.signals}
+
+
+def c_encode(library: ctypes.CDLL, function: int, name: str, steps: dict[str, int]) -> tuple[int, bytes]:
+    """The result and, if it is OK, the payload; a checksum field is filled with what must not be sent."""
+    message = CMessage(function=function)
+    signals = getattr(message.signals, name)
+    for signal, step in (steps | {"crc": 0xA5}).items():
+        setattr(signals, signal, step)  # one of no field stays in Python
+    payload = ctypes.create_string_buffer(MAX_PAYLOAD)
+    length = ctypes.c_size_t()
+    result = library.tormag_encode(payload, ctypes.byref(length), ctypes.byref(message))
+    return result, payload.raw[: length.value]
+
+
+def hexed(data: bytes) -> str:
+    """As the exchange program writes bytes."""
+    return data.hex() or "-"
+
+
+# -- payloads ------------------------------------------------------------------------------------------------------
+
+
+def test_c_knows_the_same_payloads_in_both_directions(library: ctypes.CDLL) -> None:
+    for vector in MESSAGES["valid"]:
+        payload = bytes.fromhex(vector["payload"])
+        assert c_decode(library, vector["function"], payload) == (OK, vector["steps"]), vector
+        assert c_encode(library, vector["function"], vector["message"], vector["steps"]) == (OK, payload), vector
+
+
+def test_c_refuses_the_same_payloads(library: ctypes.CDLL) -> None:
+    results = set()
+    for vector in MESSAGES["invalid"]:
+        result, _ = c_decode(library, vector["function"], bytes.fromhex(vector["payload"]))
+        assert result != OK, vector
+        results.add(result)
+    assert results == set(range(1, REFUSALS + 1))
+
+
+DRIVE_STEPS = {"left_duty": 0, "right_duty": 0, "mode": 0, "counter": 0}
+
+
+@pytest.mark.parametrize(
+    ("function", "name", "steps", "result"),
+    [
+        (2, "Drive", DRIVE_STEPS, OK),
+        (2, "Drive", DRIVE_STEPS | {"left_duty": 10001}, OUT_OF_RANGE),
+        (2, "Drive", DRIVE_STEPS | {"right_duty": -10001}, OUT_OF_RANGE),
+        (2, "Drive", DRIVE_STEPS | {"mode": 2}, OUT_OF_RANGE),
+        (7, "Status", {"faults": 1024}, OUT_OF_RANGE),
+        (10, "Drive", DRIVE_STEPS, UNKNOWN_FUNCTION),
+        (0, "Drive", DRIVE_STEPS, UNKNOWN_FUNCTION),
+    ],
+)
+def test_c_sends_no_step_out_of_range(
+    library: ctypes.CDLL, function: int, name: str, steps: dict[str, int], result: int
+) -> None:
+    assert c_encode(library, function, name, steps)[0] == result
+
+
+# -- frames --------------------------------------------------------------------------------------------------------
+
+
+def test_under_sanitizers_any_payload_is_framed_as_by_python(exchange) -> None:
+    generator = random.Random(20240513)
+    frames = []
+    for _ in range(2000):
+        length = generator.randrange(MAX_PAYLOAD + 1)
+        # zeros are what COBS is about
+        payload = bytes(generator.choice((0, 0, 1, 255, generator.randrange(256))) for _ in range(length))
+        frames.append((generator.randrange(256), generator.randrange(256), payload))
+    answers = exchange([f"frame {function} {sequence} {hexed(payload)}" for function, sequence, payload in frames])
+    assert answers == [encode_frame(*frame).hex() for frame in frames]
+    assert exchange([f"frame 1 1 {'00' * (MAX_PAYLOAD + 1)}"]) == ["-"]
+
+
+def test_under_sanitizers_golden_streams_are_read_as_written_down(exchange) -> None:
+    """Random payloads and damaged streams: `tools/endure.py fuzz`, which tests/tools runs for a moment."""
+    requests, expected = [], []
+    for vector in FRAMES["streams"]:
+        requests += ["restart", f"stream {vector['bytes']}"]
+        frames = [f"{frame['function']}:{frame['sequence']}:{frame['payload'] or '-'}" for frame in vector["frames"]]
+        counts = [str(vector["statistics"][name]) for name in FramingStatistics.__match_args__]
+        expected += ["-", " ".join([*frames, *counts])]
+    assert exchange(requests) == expected

@@ -1,5 +1,6 @@
-"""Training: its data and splits; the network's derivatives, noise floor, determinism, scaling; the command."""
+"""Training: its data, splits and sweeps; the network's derivatives, noise floor, determinism, scaling; the command."""
 
+import json
 import math
 from pathlib import Path
 
@@ -10,13 +11,21 @@ from hypothesis import given, strategies as st
 from torch.func import functional_call, jacrev
 
 from tormagd.lab.errors import LabError
+from tormagd.lab.main import main
+from tormagd.lab.training import train_model
+from tormagd.lab.training.bench_sweep import LOADED_MM, LOADED_STEP_MM, loading, sliding, strokes
 from tormagd.lab.training.dataset import ALLOWED, COLUMNS, Dataset, read_csv, write_csv
 from tormagd.lab.training.fitting import scaling_of
 from tormagd.lab.training.levenberg_marquardt import jacobian, train
 from tormagd.lab.training.metrics import leave_cycles_out, leave_one_out, random_split
+from tormagd.lab.training.unremembered import identify
+from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.features import FIELD
+from tormagd.model.memory import NO_MEMORY, Memory
+from tormagd.model.model_file import load_model
 from tormagd.model.network import ForceNetwork
 from tormagd.physics.errors import DomainError
+from tormagd.physics.friction import Friction
 
 # -- data: what is read is what was written, what is wrong is refused by row, column and value -------------------------
 
@@ -117,7 +126,7 @@ def test_a_split_without_two_sides_is_refused(share: float) -> None:
 
 
 @pytest.fixture
-def data() -> Dataset:
+def grouped() -> Dataset:
     field, cip = np.repeat([0.0, 50.0, 99.0], 20), np.tile(np.repeat([25.0, 45.0], 10), 3)
     features = np.column_stack((np.linspace(0, 4, 60), np.ones(60), field, cip))
     return Dataset(features, np.linspace(0, 1, 60), np.arange(60) // 4)
@@ -131,20 +140,20 @@ def test_random_split_has_its_share_and_its_seed() -> None:
 
 
 @pytest.mark.parametrize(("feature", "column", "values"), [("field_mT", 2, [0, 50, 99]), ("cip_percent", 3, [25, 45])])
-def test_each_value_is_left_out_once(data: Dataset, feature: str, column: int, values: list[float]) -> None:
-    folds = list(leave_one_out(data, feature))
+def test_each_value_is_left_out_once(grouped: Dataset, feature: str, column: int, values: list[float]) -> None:
+    folds = list(leave_one_out(grouped, feature))
     assert [value for value, _ in folds] == values
     for value, held in folds:
-        assert set(data.features[held, column]) == {value}
-        assert value not in data.features[~held, column]
+        assert set(grouped.features[held, column]) == {value}
+        assert value not in grouped.features[~held, column]
     assert (np.sum([held for _, held in folds], axis=0) == 1).all()
 
 
-def test_cycles_stay_whole(data: Dataset) -> None:
-    folds = [held for _, held in leave_cycles_out(data, 4, seed=0)]
+def test_cycles_stay_whole(grouped: Dataset) -> None:
+    folds = [held for _, held in leave_cycles_out(grouped, 4, seed=0)]
     assert (np.sum(folds, axis=0) == 1).all()
-    assert data.cycle is not None
-    assert not any(set(data.cycle[held]) & set(data.cycle[~held]) for held in folds)
+    assert grouped.cycle is not None
+    assert not any(set(grouped.cycle[held]) & set(grouped.cycle[~held]) for held in folds)
 
 
 # -- the network and its training --------------------------------------------------------------------------------------
@@ -253,3 +262,175 @@ class _Scaled(torch.nn.Module):
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         return self.network.forward_scaled(inputs)
+
+
+# -- rows that a bench sweep keeps, and the memory that is taken out of them; all records are synthetic ----------------
+
+
+KINETIC_N, STIFFNESS_N_MM = 2.0, 8.0
+
+
+@pytest.mark.parametrize("speed_mm_s", [0.6, 20.0, 300.0])
+def test_displacement_counts_from_where_the_elastomer_bears_nothing(speed_mm_s: float) -> None:
+    lasts_s = max(0.4, 4.0 / speed_mm_s)
+    speeds = np.repeat([100.0, 0.0, -speed_mm_s, 0.0], [300, 300, round(1e3 * lasts_s), 300])
+    friction, deflection_mm, forces = Friction(STIFFNESS_N_MM, 0.0, 1.0, 5.0), 0.0, []
+    for speed in speeds.tolist():
+        force_N, deflection_mm = friction.advance(deflection_mm, speed, KINETIC_N, 1e-3)
+        forces.append(force_N)
+    handle_mm, signed_N = np.cumsum(speeds) * 1e-3, np.array(forces)
+    rate_mm_s, displacement_mm = loading(handle_mm, np.full(len(speeds), 60.0), signed_N)
+    kept = np.flatnonzero(~np.isnan(displacement_mm) & (rate_mm_s < 0.0))
+    found_mm = displacement_mm[kept]
+    assert len(kept) >= min(LOADED_MM / LOADED_STEP_MM, 0.5 * LOADED_MM / (speed_mm_s * 1e-3))
+    assert 0.0 <= found_mm.min() <= found_mm.max() <= LOADED_MM
+    assert rate_mm_s[kept] == pytest.approx(-speed_mm_s, rel=1e-6)
+    expected_N = KINETIC_N * -np.expm1(-STIFFNESS_N_MM * found_mm / KINETIC_N)
+    # a tick of a fast handle is a part of the way
+    assert -signed_N[kept] == pytest.approx(expected_N, abs=STIFFNESS_N_MM * speed_mm_s * 1e-3 * 0.1 + 1e-3)
+    assert not sliding(handle_mm, np.full(len(speeds), 60.0))[1][kept].any()
+
+
+def test_while_the_gap_moves_no_row_is_kept() -> None:
+    handle_mm = np.cumsum(np.repeat([20.0, -20.0], 400)) * 1e-3
+    signed_N = np.where(np.arange(800) < 500, 1.0, -1.0)
+    assert not np.isnan(loading(handle_mm, np.full(800, 60.0), signed_N)[1]).all()
+    assert np.isnan(loading(handle_mm, 60.0 + 5e-3 * np.arange(800), signed_N)[1]).all()
+
+
+def test_a_stroke_mobilises_before_it_creeps() -> None:
+    hand, ends_s = strokes(3, seed=1)
+    assert len(ends_s) == 3
+    positions = np.array([hand.position_mm(time_s) for time_s in np.arange(0.0, ends_s[-1], 1e-3).tolist()])
+    assert positions.max() - positions[0] > 9.0
+    assert ends_s == sorted(ends_s)
+
+
+def test_what_inserts_of_one_matrix_remember_is_found_in_all_their_records() -> None:
+    """Both relax alike; at one gap the weaker has half the field, and some rows are not yet mobilised."""
+    fraction, random, time_s = 0.06, np.random.default_rng(0), np.arange(0.0, 160.0)
+    records = []
+    for iron, greatest_mT in ((20.0, 400.0), (40.0, 800.0), (20.0, 400.0), (40.0, 800.0)):
+        shares = np.concatenate(([1.0], random.uniform(0.4, 1.0, 7)))
+        field_mT = greatest_mT * np.repeat(shares, 20)
+        level_N = 4.0 * (field_mT / 800.0) ** 2
+        slow_N = last_N = level_N[0]
+        for tick, drive_N in enumerate(level_N.tolist()):
+            mean_N, last_N = (drive_N + last_N) / 2.0, drive_N
+            slow_N = mean_N + (slow_N - mean_N) * np.exp(-1.0 / 8.0)
+            level_N[tick] -= fraction * slow_N
+        displacement_mm = np.where(time_s % 5.0 == 4.0, 0.2, MOBILISED_MM)
+        borne_N = level_N * -np.expm1(-STIFFNESS_N_MM * displacement_mm / level_N)
+        force_N = np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
+        rate = 20.0 + 60.0 * (time_s % 7.0)
+        records.append((np.column_stack((displacement_mm, rate, field_mT, np.full(160, iron))), force_N))
+    features, forces_N = (np.concatenate(part) for part in zip(*records, strict=True))
+    memory, free = identify(Dataset(features, forces_N, np.repeat(np.arange(4), 160), np.tile(time_s, 4)))
+    assert (memory.fractions, memory.times_s[0]) == (
+        pytest.approx((fraction, 0.0, 0.0), abs=0.002),
+        pytest.approx(8.0, rel=0.05),
+    )
+    slid = features[:, 0] >= MOBILISED_MM
+    fresh_N = 4.0 * (features[:, 2] / 800.0) ** 2
+    assert free.force_N[slid] == pytest.approx(fresh_N[slid], rel=0.01)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic torque element: pre-sliding, rate and field as smooth formulas, 0.01 N of noise, one insert."""
+    rng = np.random.default_rng(0)
+    rows = 3000
+    displacement, rate, field = rng.uniform((0, 0, 100), (1, 60, 800), (rows, 3)).T
+    slip = 1 - np.exp(-displacement / 0.15)
+    force = slip * (0.3 + 4.6 * (field / 800) ** 2.2) * (1 + 0.2 * np.exp(-rate / 12)) + rng.normal(0, 0.01, rows)
+    features = np.column_stack((displacement, rate, field, np.full(rows, 40.0)))
+    path = tmp_path_factory.mktemp("data") / "synthetic.csv"
+    write_csv(path, Dataset(features, force, np.arange(rows) // 50))
+    return path
+
+
+def command(data: Path, out: Path, *more: str) -> list[str]:
+    required = ["train-model", str(data), "--element", "torque", "--insert", "MRE-50-40", "--out", str(out)]
+    return [*required, "--hidden", "15", "--epochs", "40", "--created", "2024-01-01", *more]
+
+
+def test_from_csv_to_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "model.safetensors"
+    assert main(command(data, out, "--json")) == 0
+    report = json.loads(capsys.readouterr().out)
+    model = load_model(out, element="torque", insert="MRE-50-40")
+    assert report["validation_r2"] > 0.999
+    assert report["validation_mae_N"] < 0.015
+    assert 0 < report["train_mae_percent"] < 1
+    assert 0 <= report["not_rising_share"] < 0.2
+    assert (report["train_rows"], report["data_sha256"]) == (2100, model.metadata.training_data_sha256)
+    assert model.metadata.metrics["validation_r2"] == report["validation_r2"]
+    assert model.predict_one(1.0, 60.0, 800.0, 40.0) == pytest.approx(4.9, abs=0.05)
+
+
+def test_several_inserts_are_told_apart_by_their_iron(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = read_csv(data)
+    weak = rows.features.copy()
+    weak[:, 2:] = weak[:, 2:] / 2.0  # half the field, half the iron
+    assert rows.cycle is not None
+    joined = Dataset(
+        np.concatenate((rows.features, weak)),
+        np.concatenate((rows.force_N, rows.force_N / 3.0)),
+        np.concatenate((rows.cycle, rows.cycle + 100)),
+    )
+    both, out = tmp_path / "both.csv", tmp_path / "model.safetensors"
+    write_csv(both, joined)
+    arguments = [*command(both, out, "--rising", "--epochs", "10"), "--insert", "MRE-50-20", "MRE-50-40"]
+    assert main(arguments) == 0
+    whole, strong = (load_model(out, element="torque", insert=name) for name in (None, "MRE-50-40"))
+    assert (whole.metadata.insert, whole.metadata.ranges["cip_percent"]) == ("MRE-50", (20.0, 40.0))
+    assert (strong.metadata.ranges["cip_percent"], strong.field_range_mT[1]) == (
+        (40.0, 40.0),
+        pytest.approx(800.0, rel=0.01),
+    )
+    assert load_model(out, element="torque", insert="MRE-50-20").field_range_mT[1] == pytest.approx(400.0, rel=0.01)
+    assert whole.metadata.metrics["not_rising_share"] == 0.0
+    assert main([*arguments[:-1], "MRE-50-30"]) == 2
+    assert "insert = MRE-50-30 is not allowed: one that there are rows of" in capsys.readouterr().err
+
+
+def test_the_same_command_gives_the_same_bytes(data: Path, tmp_path: Path) -> None:
+    written = []
+    for seed in ("1", "1", "2"):
+        assert main(command(data, tmp_path / "m.safetensors", "--epochs", "5", "--seed", seed)) == 0
+        written.append((tmp_path / "m.safetensors").read_bytes())
+    assert written[0] == written[1] != written[2]
+
+
+def test_what_was_taken_out_of_the_data_is_in_the_file(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = Memory(fractions=(0.05,), times_s=(8.0,), lag_mT=7.0, turn_mT=70.0)
+    monkeypatch.setattr(train_model, "identify", lambda rows: (memory, rows))
+    for name, more, expected in (("with", ["--without-memory"], memory), ("plain", [], NO_MEMORY)):
+        out = tmp_path / f"{name}.safetensors"
+        assert main(command(data, out, "--epochs", "2", *more)) == 0
+        assert load_model(out, element="torque").metadata.memory == expected
+
+
+def test_what_cannot_work_is_told_with_exit_2(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "m.safetensors"
+    broken = tmp_path / "broken.csv"
+    broken.write_text("displacement_mm,rate_mm_s,field_mT,cip_percent,force_N\n0,0,nan,40,1\n")
+    for arguments, message in (
+        (command(broken, out), "row 2, field_mT: 'nan'"),
+        (command(tmp_path / "absent.csv", out), "cannot be read"),
+        (command(data, tmp_path / "absent" / "m.safetensors", "--epochs", "1"), "cannot write"),
+        (command(data, out, "--hidden", "0"), "hidden = 0"),
+        (command(data, out, "--epochs", "0"), "epochs = 0"),
+        (command(data, out, "--insert", "two words"), "insert"),
+        (command(data, out, "--validation-share", "1"), "validation_share"),
+    ):
+        assert main(arguments) == 2
+        assert message in capsys.readouterr().err
+    assert not out.exists()
