@@ -21,9 +21,10 @@ from tormagd.config import Config, load_config
 from tormagd.control.believe.strength import device_bounds
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
-from tormagd.force_file import ForceFileError
+from tormagd.force_file import ForceFileError, read_forces
 from tormagd.model.model_file import ModelFileError, load_model
 from tormagd.scenes.scene import load_scene
+from tormagd.scenes.signal import recorded
 from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd.toml_file import LONGEST_LINE, TomlError, toml_tables
 from tormagd_client.endpoints import ConfigError
@@ -219,3 +220,46 @@ def test_what_is_as_deep_as_allowed_or_only_looks_deeper_is_read(text: str) -> N
 def test_what_is_deeper_or_no_number_is_refused_with_its_place(text: str, said: str) -> None:
     with pytest.raises(TomlError, match=re.escape(said)):
         toml_tables(text)
+
+
+# -- a force over time has one reader, whoever it is for ---------------------------------------------------------------
+
+
+FORCE_READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_forces)
+
+
+@pytest.mark.parametrize("text", ["t_s,force_N\n0,1\n1,2\n3,1\n", "rate_mm_s,force_N,t_s\n5,1,7\n5,2,8\n-5,0,9.5\n"])
+def test_all_read_the_same_files(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "task.csv"
+    path.write_text(text)
+    sent, (time_s, force_N), table = read_csv(path), recorded(path), read_forces(path)
+    assert [sent.at(at_s).force_N for at_s in time_s] == force_N.tolist() == list(table["force_N"])
+    assert [at_s - table["t_s"][0] for at_s in table["t_s"]] == time_s.tolist()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "t_s,force_N\n0,1\n",
+        "t_s,force_N\n0,1\n1,-0.5\n2,1\n",
+        "t_s,force_N\n0,1\n1,1001\n2,1\n",
+        "t_s,force_N\n0,1\n1,nan\n2,1\n",
+        "t_s,force_N\n0,1\n1,1_5\n2,1\n",
+        "t_s,force_N\n0,1\n0,2\n2,1\n",
+        "t_s,force_N\n0,1\n1\n2,1\n",
+        "t_s,force_N,mood\n0,1,2\n1,1,2\n2,1,2\n",
+        't_s,force_N\n0,"1\n',
+        None,
+    ],
+)
+def test_the_same_mistake_is_told_in_the_same_words(tmp_path: Path, text: str | None) -> None:
+    path = tmp_path / "task.csv"
+    if text is not None:
+        path.write_text(text)
+    said = set()
+    for read in FORCE_READERS:
+        with pytest.raises(ValueError, match=str(path)) as refused:
+            read(path)
+        said.add(str(refused.value).removeprefix("signal.file = "))
+    assert len(said) == 1
