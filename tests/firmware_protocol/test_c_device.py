@@ -326,18 +326,14 @@ def told() -> Twins:
     bench.drive(-1.0, -1.0, count=100)
     carriages.held, carriages.current_A = True, -3.5
     bench.drive(-1.0, -1.0, count=600)  # OVERCURRENT, then RETRACT_FAILED: a stall
-    # RETRACT_FAILED: a motor without current, at once; at a travelling one only after 8 s
-    for current_A, ticks in ((0.01, 700), (0.025, 8300)):
+    # RETRACT_FAILED: a motor without current, at once; at a travelling one only after 8 s; not creeping at a stalling
+    # current: 0.05 mm in 0.3 s is progress enough
+    for current_A, drift_mm_s, ticks in ((0.01, 0.0, 700), (0.025, 0.0, 8300), (3.5, 0.18, 700)):
         bench.restart()
         bench.drive(-1.0, -1.0, count=50)
-        carriages.held, carriages.current_A = True, current_A
+        carriages.held, carriages.current_A, carriages.drift_mm_s = True, current_A, drift_mm_s
         bench.command(Retract)
         bench.tick(ticks)
-    bench.restart()
-    bench.drive(-1.0, -1.0, count=50)
-    carriages.held, carriages.current_A, carriages.drift_mm_s = True, 3.5, 0.18
-    bench.command(Retract)
-    bench.tick(700)  # creeping at a stalling current: 0.05 mm in 0.3 s is progress enough
     for drift_mm_s in (-5.0, 3.0):  # UNCOMMANDED_MOTION: inward, and outward from rest
         bench.restart()
         bench.tick(150)
