@@ -379,10 +379,6 @@ def test_under_sanitizers_the_same_life_gives_the_same_answers(told: Twins, exch
     assert [duties_as_python_writes_them(answer) for answer in answers[2:]] == told.expected[2:]
 
 
-def sent(firmware: Firmware | CompiledFirmware, sensors: Sensors) -> list[bytes]:
-    return [encode(message) for message in (firmware.status(sensors), *firmware.measurement(0.1, sensors))]
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -399,7 +395,7 @@ def test_what_does_not_fit_its_signal_is_not_sent(name: str, value: float) -> No
     sensors = Bench().sensors.replaced(**{name: value})
     for firmware in (Firmware(PLANT), CompiledFirmware(PLANT)):
         with pytest.raises(EncodeError):
-            sent(firmware, sensors)
+            list(map(encode, (firmware.status(sensors), *firmware.measurement(0.1, sensors))))
 
 
 def duty(tick: int, position_mm: float) -> float:

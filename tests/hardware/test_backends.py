@@ -59,7 +59,7 @@ PASSIVE = CanFrame(ERROR_FLAG | 0x04, bytes((0, 0x30, 0, 0, 0, 0, 0, 0)))
 
 
 def bus_frame(message: Message) -> CanFrame:
-    return CanFrame(*frame_of(message))
+    return CanFrame(*CanStream(1).pack(message))
 
 
 def opened(device: Device) -> CanBackend:
