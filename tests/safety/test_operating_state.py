@@ -124,6 +124,10 @@ def test_each_command_in_each_state(name: str, present: OperatingState) -> None:
     assert ((after.operating_state, after.request) if has_asked else after.operating_state) == wanted
 
 
+def test_stop_is_taken_without_a_device() -> None:
+    assert command(SafetyState(), "stop", 0.0, READY.replaced(connected=False, fresh=False)).faults == (Fault.STOPPED,)
+
+
 def test_an_unknown_command_lists_the_known_ones() -> None:
     refused = refusal(SafetyState(), "detonate")
     assert (refused.code, "detonate" in refused.message) == ("unknown_command", True)
