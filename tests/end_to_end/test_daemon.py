@@ -140,7 +140,8 @@ def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
     result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0).stdout)
     assert (result["reason"], result["differences"]) == ("STOPPED", [])
     assert result["rerun"]["difference"] is None
-    assert result["rerun"]["frames"] > 2 * result["rerun"]["ticks"] > 2_000
+    # one piece read and one frame written in nearly every period
+    assert result["rerun"]["frames"] > 1.9 * result["rerun"]["ticks"] > 2_000
     assert result["rerun"]["gaps"] <= box["dropped"]
 
 

@@ -47,7 +47,7 @@ NS = 1_000_000_000
 MOST_TICKS = 100
 "Ticks in one recording message at most."
 TELL_S = 0.1
-"How often systemd, log, profile and black box are seen to."
+"How often systemd, log and black box are seen to."
 PORTRAIT_STEP = 5
 "Every fifth point of the portrait is told: it is smooth."
 
@@ -128,20 +128,21 @@ class TelemetryLoop:
         if endpoint.has_listener("recording"):
             endpoint.publish_ticks(list(self._ticks))
         self._ticks.clear()
-        self.timing.record(beat.due_ns, start_ns, time.monotonic_ns())
-        return True
-
-    def tell(self, _beat: Beat) -> bool:
-        """Every TELL_S: log, service, profile and black box. False where it has been done."""
-        now_s = time.monotonic()
-        if now_s - self._told_s < TELL_S:
-            return False
-        self._told_s = now_s
+        # before anything is learned of a new device
         link = self._connection.link
         identity = None if link is None else link.identity
         self._profiles.look(
             None if identity is None else identity.serial_number, self._control.stepper.safety.is_driven
         )
+        self.timing.record(beat.due_ns, start_ns, time.monotonic_ns())
+        return True
+
+    def tell(self, _beat: Beat) -> bool:
+        """Every TELL_S: log, service and black box. False where it has been done."""
+        now_s = time.monotonic()
+        if now_s - self._told_s < TELL_S:
+            return False
+        self._told_s = now_s
         self._refresh(now_s)
         self._box.look()
         self._tell_service(now_s, self._is_homed())
