@@ -92,7 +92,7 @@ class Rig:
             self.endpoint.look()
             self.endpoint.take_setpoints()
             self.endpoint.take_requests(self.answer)
-            self.endpoint.serve(self.answer)
+            self.endpoint.serve(self.answer, 4)
             self.endpoint.admission.update()
             self.endpoint.tell(time.monotonic())
             self.endpoint.publish_ticks([(1,)], ("a",))

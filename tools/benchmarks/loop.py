@@ -447,7 +447,7 @@ async def _bare(config: Config) -> None:
         endpoint.take_requests(reply)
         endpoint.admission.update()
         if left:
-            left -= endpoint.serve(reply)
+            left -= endpoint.serve(reply, left)
         rows.append((time.time_ns(), (now_ns - heartbeat.due_ns) * 1e-3, 0.0))
         if len(rows) >= TELEMETRY_EVERY:
             endpoint.publish_ticks(rows, ("t_ns", "lateness_us", "exec_us"))

@@ -50,8 +50,8 @@ SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. Who says more is cut off, and comes back as anybody."
 TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket in one beat at most, and for how long."
-ANSWERS, ANSWERS_NS = 16, 300_000
-"Requests answered in one beat at most, and for how long."
+ANSWERS_NS = 300_000
+"For how long requests are answered in one beat."
 FIRST_AT_ONCE = 4
 "Requests that may be a `stop`, looked at in one go at most."
 RECONNECT_S = 0.5
@@ -177,14 +177,14 @@ class Endpoint:
             if looked_at == FIRST_AT_ONCE or time.monotonic_ns() >= until_ns:
                 return
 
-    def serve(self, answer: Answer) -> int:
-        """Answers at most ANSWERS of the waiting requests, for ANSWERS_NS; how many there were."""
+    def serve(self, answer: Answer, most: int) -> int:
+        """Answers the waiting requests, for ANSWERS_NS and not more than `most`; how many there were."""
         until_ns = time.monotonic_ns() + ANSWERS_NS
-        for number in range(ANSWERS):
+        for number in range(most):
             if time.monotonic_ns() > until_ns or (waiting := self._requests.next()) is None:
                 return number
             self._reply(waiting, self._answered(waiting, answer))
-        return ANSWERS
+        return most
 
     def tell(self, now_s: float) -> None:
         """Counts and tells what was not read: once a telemetry period."""

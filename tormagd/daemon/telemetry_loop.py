@@ -46,6 +46,8 @@ from tormagd_client.messages import (
 NS = 1_000_000_000
 MOST_TICKS = 100
 "Ticks in one recording message at most."
+REQUESTS = 16
+"Answered in a telemetry period at most: whoever asks on and on must not keep a `stop` waiting."
 TELL_S = 0.1
 "How often systemd, log and black box are seen to."
 PORTRAIT_STEP = 5
@@ -121,7 +123,7 @@ class TelemetryLoop:
         start_ns = time.monotonic_ns()
         endpoint = self._endpoint
         # with this very snapshot those are answered who wait now; who asks later waits for the next
-        self._status, self._answers = None, endpoint.waiting
+        self._status, self._answers = None, min(endpoint.waiting, REQUESTS)
         if endpoint.has_listener("telemetry") or self._answers:
             self._newest = self._snapshot(start_ns * 1e-9)
             endpoint.publish(self._newest)
@@ -155,7 +157,7 @@ class TelemetryLoop:
         """Answers a few of the requests that waited at the last snapshot; False where there are none."""
         if not self._answers:
             return False
-        answered = self._endpoint.serve(self._answer)
+        answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
 
