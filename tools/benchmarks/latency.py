@@ -5,7 +5,7 @@ of that tick has just been written when its row is stamped. A bare ZeroMQ hop of
 same run. Where the daemon has a real-time priority, the publisher and the far end of the hop have a lower one: what is
 measured is the way, not how long a sender waits for a processor.
 
-At worst a setpoint just misses the slack: it waits for a plan's time, then for the next control tick and the one after.
+At worst a setpoint just misses a beat: it waits for the next, which plans for it and writes.
 """
 
 import argparse
@@ -32,13 +32,13 @@ from tormagd_client.messages import VERSION, Setpoint, encode
 LEAST_N, GRAIN_N = 1.0, 1e-4
 SPACING_S = (0.0015, 0.0025)
 "500 a second, as in `make run`; random, so that they meet every phase of the control period."
-COLUMNS = ("t_ns", "exec_us", "plan_time_s", "monotonic_s")
+COLUMNS = ("t_ns", "exec_us")
 SETTLE_NS = 500_000_000
 LOST_S = 10.0
 "For a message of the bare hop."
-ALLOWED_US = 250.0
+ALLOWED_US = 400.0
 """From a setpoint to its frame p99 is to take no longer than the bare hop's of the same run, a control period, which it
-may just have missed, and this: the plan, the tick and the write."""
+may just have missed, and this: the beat, until it has written."""
 PERIOD_US = 1e6 / CONTROL_HZ
 BELOW = 10
 "The measurement's own processes are this far below the daemon's real-time priority."
@@ -60,15 +60,12 @@ def run(count: int, realtime: RealTime) -> Stages:
 
 def stages(ticks: list[tuple[Any, ...]]) -> Stages:
     """The whole way and its parts, of what `first_ticks` found."""
-    stamp_ns, written_ns, tick_us, planned_s, began_s = (np.array(column) for column in zip(*ticks, strict=True))
+    stamp_ns, written_ns, beat_us = (np.array(column) for column in zip(*ticks, strict=True))
     whole_us = (written_ns - stamp_ns) * 1e-3
-    # plan and tick are stamped on the monotonic clock, the frame on that of the setpoint's stamp
-    plan_us = (began_s - planned_s) * 1e6
     return {
         WHOLE: whole_us,
-        "sent, until planning begins": whole_us - tick_us - plan_us,
-        "then until the tick begins": plan_us,
-        "tick, until written": tick_us,
+        "sent, until its beat begins": whole_us - beat_us,
+        "the beat, until it has written": beat_us,
     }
 
 

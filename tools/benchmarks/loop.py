@@ -62,6 +62,7 @@ STARTS_MS = 20_000
 WARM_UP_S = 1.0
 TELEMETRY_EVERY = 20
 PLAN_QUANTILES = ("p50", "p99")
+SHARES = ("core_share", "alone_share")
 HOST_SOURCES = "codec", "crc", "framing", "messages", "tormag"
 HOST_FLAGS = "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2"
 COLUMNS = ("t_ns", "lateness_us", "exec_us", "received_s")
@@ -70,7 +71,7 @@ QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
 class Block(NamedTuple):
-    """The ticks of one block; what only a daemon has is empty for the stub."""
+    """The ticks of one block, and `told`, what is told beside them: shares of a processor, wake-ups, plans, phases."""
 
     lateness_us: Array
     exec_us: Array
@@ -79,18 +80,7 @@ class Block(NamedTuple):
     seconds: float
     fresh: int = 0
     "Ticks whose measurement came since the tick before."
-    plan_us: dict[str, float] | None = None
-    "p50 and p99 of its plans over the last 5 to 10 s as the daemon's status has them, in bins of 3%."
-    core_share: float = 0.0
-    "Processor time of all its processes over wall time, while the clients ask,"
-    alone_share: float = 0.0
-    "and before."
-    wakeups_hz: tuple[float, float] = (0.0, 0.0)
-    "Of its first thread and of all its threads, while the clients ask,"
-    alone_hz: tuple[float, float] = (0.0, 0.0)
-    "and before."
-    phases_us: dict[str, dict[str, float]] | None = None
-    "p50 and p99 of each phase of a beat."
+    told: dict[str, Any] = {}  # noqa: RUF012 nobody changes it
 
 
 class Pair(NamedTuple):
@@ -127,7 +117,7 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
             "method": f"uvloop + timerfd, fifo {realtime.fifo_priority}, {CLIENTS} clients",
             "lateness_us": quantiles(bare.lateness_us),
             "merged_share": bare.merged / max(bare.ticks, 1),
-            "core_share": round(bare.core_share, 4),
+            **{name: bare.told[name] for name in SHARES if name in bare.told},
         },
         "ratio": {
             name: statistics.median(ours_us[name] / bare_us[name] for ours_us, bare_us in both_us)
@@ -147,12 +137,12 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
     against = [(pair.daemon, pair.against) for pair in pairs if pair.against is not None]
     if against:
         result["against"] = _told([theirs for _, theirs in against]) | {
-            "core_share_ratio": round(
-                statistics.median(one.core_share / other.core_share for one, other in against), 3
-            ),
-            "alone_share_ratio": round(
-                statistics.median(one.alone_share / other.alone_share for one, other in against), 3
-            ),
+            **{
+                f"{name}_ratio": round(
+                    statistics.median(ours.told[name] / theirs.told[name] for ours, theirs in against), 3
+                )
+                for name in SHARES
+            },
             "tick_mean_ratio": round(
                 statistics.median(float(one.exec_us.mean() / other.exec_us.mean()) for one, other in against), 3
             ),
@@ -170,17 +160,7 @@ def _told(blocks: list[Block]) -> dict[str, Any]:
         "fresh_share": round(whole.fresh / max(whole.ticks - len(blocks), 1), 5),
         "lateness_us": quantiles(whole.lateness_us),
         "control_exec_us": {"mean": float(whole.exec_us.mean())} | quantiles(whole.exec_us),
-        "plan_us": whole.plan_us,
-        "core_share": round(whole.core_share, 4),
-        "alone_share": round(whole.alone_share, 4),
-        "wakeups_hz": _wakeups(whole.wakeups_hz),
-        "alone_wakeups_hz": _wakeups(whole.alone_hz),
-        "phases_us": whole.phases_us,
-    }
-
-
-def _wakeups(hz: tuple[float, float]) -> dict[str, float]:
-    return {"control": round(hz[0]), "all": round(hz[1])}
+    } | whole.told
 
 
 def _middle(found: list[dict[str, Any]]) -> dict[str, Any]:
@@ -197,7 +177,7 @@ def block(started: Started, seconds: float) -> Block:
     """One block of one kind, under the load of the clients."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, started(Path(folder)) as (config, pid):
         time.sleep(WARM_UP_S)
-        _, alone_share, alone_hz = spent(pid, lambda: time.sleep(seconds))
+        _, *alone = spent(pid, lambda: time.sleep(seconds))
         with recording(config.endpoints) as recorder:
             stop = multiprocessing.Event()
             load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
@@ -205,29 +185,24 @@ def block(started: Started, seconds: float) -> Block:
             try:
                 recorder.poll(STARTS_MS)
                 collect(recorder, WARM_UP_S)
-                ticks, share, hz = spent(pid, partial(collect, recorder, seconds))
-                plan_us, phases_us = reported(config.endpoints.control)
+                ticks, *busy = spent(pid, partial(collect, recorder, seconds))
+                told = reported(config.endpoints.control)
             finally:
                 stop.set()
                 load.join(5.0)
-    return ticks._replace(
-        plan_us=plan_us,
-        phases_us=phases_us,
-        core_share=share,
-        alone_share=alone_share,
-        wakeups_hz=hz,
-        alone_hz=alone_hz,
-    )
+    keys = "alone_share", "alone_wakeups_hz", "core_share", "wakeups_hz"
+    return ticks._replace(told=dict(zip(keys, [*alone, *busy], strict=True)) | told)
 
 
-def spent(pid: int, wait: Callable[[], T]) -> tuple[T, float, tuple[float, float]]:
-    """What `wait` returns; meanwhile the process's share of a processor, and the wake-ups of its first thread and of
-    all, Hz."""
+def spent(pid: int, wait: Callable[[], T]) -> tuple[T, float, dict[str, float]]:
+    """What `wait` returns; meanwhile the process's share of a processor, and the wake-ups of its first thread (control)
+    and of all its threads, Hz."""
     started_s, before_s, before = time.monotonic(), processor_s(pid), wakeups(pid)
     result = wait()
     took_s, after = time.monotonic() - started_s, wakeups(pid)
     woken = {thread: count - before.get(thread, count) for thread, count in after.items()}
-    return result, (processor_s(pid) - before_s) / took_s, (woken[pid] / took_s, sum(woken.values()) / took_s)
+    hz = {"control": round(woken[pid] / took_s, 1), "all": round(sum(woken.values()) / took_s, 1)}
+    return result, round((processor_s(pid) - before_s) / took_s, 4), hz
 
 
 def wakeups(pid: int) -> dict[int, int]:
@@ -286,22 +261,19 @@ def as_block(rows: list[list[Any]]) -> Block:
     return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
 
 
-def reported(address: str) -> tuple[dict[str, float] | None, dict[str, dict[str, float]] | None]:
-    """p50 and p99 of plans and of phases, as status has them; None where it says nothing, as the stub's."""
+def reported(address: str) -> dict[str, Any]:
+    """p50 and p99 of plans and of phases, as status has them; nothing where it says nothing, as the stub's."""
     with contextlib.closing(Client(Endpoints(control=address), 5.0)) as client:
         status = client.request("status")
-    plans = status.get("rates", {}).get("inference", {}).get("exec_us")
-    phases = status.get("phases_us", {})
-    return (
-        None if plans is None else {name: float(plans[name]) for name in PLAN_QUANTILES},
-        {phase: {name: float(each[name]) for name in PLAN_QUANTILES} for phase, each in phases.items()} or None,
-    )
+    found = status.get("phases_us", {}) | {"plan_us": status.get("rates", {}).get("inference", {}).get("exec_us")}
+    told = {name: {key: float(each[key]) for key in PLAN_QUANTILES} for name, each in found.items() if each}
+    plan_us = told.pop("plan_us", None)
+    return {} if plan_us is None else {"plan_us": plan_us, "phases_us": told}
 
 
 def merge(blocks: list[Block]) -> Block:
-    """All blocks as one; shares and plans in the median."""
-    plans = [block.plan_us for block in blocks if block.plan_us is not None]
-    phases = [block.phases_us for block in blocks if block.phases_us is not None]
+    """All blocks as one; what is told beside them in the median."""
+    told = [block.told for block in blocks if block.told]
     return Block(
         np.concatenate([block.lateness_us for block in blocks]),
         np.concatenate([block.exec_us for block in blocks]),
@@ -309,18 +281,8 @@ def merge(blocks: list[Block]) -> Block:
         sum(block.merged for block in blocks),
         sum(block.seconds for block in blocks),
         sum(block.fresh for block in blocks),
-        _middle(plans) if plans else None,
-        statistics.median(block.core_share for block in blocks),
-        statistics.median(block.alone_share for block in blocks),
-        _medians([block.wakeups_hz for block in blocks]),
-        _medians([block.alone_hz for block in blocks]),
-        _middle(phases) if phases else None,
+        _middle(told) if told else {},
     )
-
-
-def _medians(pairs: list[tuple[float, float]]) -> tuple[float, float]:
-    first, second = zip(*pairs, strict=True)
-    return statistics.median(first), statistics.median(second)
 
 
 def draw(path: Path, phases_us: dict[str, dict[str, float]]) -> None:
@@ -502,6 +464,6 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         for _ in range(options.pairs)
     ]
     result = summary(pairs, ours.realtime)
-    if options.picture is not None and result["phases_us"]:
+    if options.picture is not None and "phases_us" in result:
         draw(options.picture, result["phases_us"])
     return result
