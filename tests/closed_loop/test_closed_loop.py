@@ -282,7 +282,10 @@ def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
 
 def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
     whole, coarse = (hold(Case("pad_1", False, False, 10.0, is_coarse)) for is_coarse in (False, True))
-    assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=1e-3)
+    # where the gap comes to rest differs by what friction lets it; how the force falls from there does not
+    fell, fell_coarse = (run["last_force_error"] - run["shares"][0] for run in (whole, coarse))
+    assert fell == pytest.approx(fell_coarse, abs=1e-4)
+    assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=2e-3)
 
 
 def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_core: Core) -> None:

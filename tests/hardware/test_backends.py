@@ -47,10 +47,6 @@ def descriptor(backend: Any) -> int:
     return int(backend._fd)
 
 
-def frame_of(message: Message, node: int = 1) -> tuple[int, bytes]:
-    return CanStream(node).pack(message)
-
-
 # -- ports and buses ---------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import Core, build_core
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import Config
+from tormagd.control.core import Stepper
+from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import rms
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.ideal_actuator import ideal_stepper
