@@ -3,9 +3,10 @@
     force_tracking.py [CASE ...] [--draws N] [--json]
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
-another, and of draws of the plant card. How well signals are followed: the `pulse` of `make run` on all of these, and
-in full on the `samples` and the second plant, 500 setpoints a second, with a preview of 70 ms and live; recorded
-`signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a file, and live.
+another, and of draws of the plant card; without draws, where an hour of `drift` of the force sensor leads. How well
+signals are followed: the `pulse` of `make run` on all of these, and in full on the `samples` and the second plant, 500
+setpoints a second, with a preview of 70 ms and live; recorded `signals` from the folder that TORMAG_DATA names, with
+400 ms, as a publisher can that plays a file, and live.
 Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does with carriages
 that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
 """
@@ -31,6 +32,7 @@ OF_DEVICES = {
     "steps": cases.steps,
     "creep": cases.creep,
     "speeds": cases.speeds,
+    "drift": cases.drift,
     "pulse": cases.pulse,
 }
 OF_SIGNALS: dict[str, Callable[[Executor], Any]] = {
@@ -44,7 +46,7 @@ def measure(case: str, options: argparse.Namespace, pool: Executor) -> Any:
     """One case."""
     if case in OF_SIGNALS:
         return OF_SIGNALS[case](pool)
-    names = judging(options.draws)
+    names = judging(0 if case == "drift" else options.draws)
     found = tqdm(pool.map(OF_DEVICES[case], names), desc=case, total=len(names), disable=not sys.stderr.isatty())
     return dict(zip(names, found, strict=True))
 

@@ -9,6 +9,7 @@ import itertools
 import math
 from concurrent.futures import Executor
 
+import msgspec
 import numpy as np
 
 from rendering.device_draws import SAMPLES, device, judging
@@ -43,6 +44,7 @@ from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Json
 from tormagd.lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
+from tormagd.safety.codes import Limit
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
@@ -59,6 +61,7 @@ CREEP_MM_S, CREPT_MM = 1.0, 10.0
 CREEP_N = (1.0, 2.0, 0.8)
 SPEEDS_MM_S, SPEED_S, SLID_S = (1.0, 42.0, 100.0, 300.0), 4.0, 1.0
 SPEEDS_N = (1.0, 2.0)
+DRIFT_MN_MIN, DRIFT_S, DRIFT_N, TURN_S = 5.0, 3600, 1.0, 10
 START_N, RAMP_S, HOLD_S = 0.6, 1.0, 1.0
 "Of the approach to a signal."
 PULSE_S, DRAWN_PULSE_S = 20.0, 15.0
@@ -168,6 +171,31 @@ def speeds(name: str) -> Json:
             for place, (before, after) in enumerate(itertools.pairwise(tour()), 1)
         }
         result[f"{force_N:g} N"] = with_rail(found, worst)
+    return result
+
+
+def drift(name: str) -> Json:
+    """A force sensor that drifts, with a handle that turns back every TURN_S, and one that never does: the worst error
+    of a second's mean, and how far the force went from when OFFSET_UNKNOWN was first shown, to a second."""
+    plant, result = device(name), {}
+    sensor = msgspec.structs.replace(plant.force_sensor, drift_mN_min=DRIFT_MN_MIN)
+    plant = msgspec.structs.replace(plant, force_sensor=sensor)
+    turns = [(float(TURN_S), speed) for speed in (TURNED_MM_S, -TURNED_MM_S)] * (DRIFT_S // TURN_S // 2)
+    at = np.arange(DRIFT_S)
+    # the second in which the handle turned says nothing, and the first ones arrive
+    settled = (at >= 3) & (at % TURN_S != 0) & (at % TURN_S != TURN_S - 1)
+    for key, legs in (("turning", turns), ("one_way", [(float(DRIFT_S), TURNED_MM_S)])):
+        loop, errors_N, known = armed_at_rest(plant, legs), np.zeros(DRIFT_S), DRIFT_S
+        for second in range(DRIFT_S):
+            found = follow(loop, lambda now_s: TimedSetpoint(DRIFT_N, now_s, VALID_S), 1.0, loop.now_s)
+            errors_N[second] = np.abs(found.rendered_N).mean() - DRIFT_N
+            if Limit.OFFSET_UNKNOWN in found.limits:
+                known = min(known, second)
+        result[key] = {
+            "worst_N": float(np.abs(errors_N[settled]).max()),
+            "unknown_after_s": known if known < DRIFT_S else None,
+            "drifted_on_N": float(np.abs(errors_N[known:] - errors_N[known - 1]).max(initial=0.0)),
+        }
     return result
 
 
