@@ -1,6 +1,7 @@
 """Snapshots: what is not known is null, and nothing holds back a device that is not driven."""
 
 import time
+from typing import Any
 
 import msgspec
 import pytest
@@ -61,55 +62,55 @@ def telemetry(
     return decode(encode(snapshot(tick, 3, is_homed, is_busy, 0.012, BELIEF)), Telemetry)
 
 
-def test_a_driven_device() -> None:
-    published = telemetry(MEASUREMENT, SafetyState(OperatingState.ENABLED), Reference(64.2))
-    assert published.measured_jp == (32.5, 32.0)
-    assert published.belief == BELIEF
-    assert (published.gap_mm, published.skew_mm, published.gap_setpoint_mm) == (64.5, 0.5, 64.2)
-    assert (published.setpoint_cf, published.governed_cf, published.predicted_cf, published.measured_cf) == (
-        1.5,
-        1.4,
-        1.38,
-        1.39,
-    )
-    assert (published.duty, published.setpoint_age_ms) == ((0.1, -0.2), pytest.approx(12.0))
-    assert (published.is_homed, published.is_busy, published.operating_state) == (True, False, "ENABLED")
+NOT_KNOWN = {"gap_mm": None, "measured_jp": None, "skew_mm": None, "gap_setpoint_mm": None}
+
+
+@pytest.mark.parametrize(
+    ("published", "known"),
+    [
+        (
+            telemetry(MEASUREMENT, SafetyState(OperatingState.ENABLED), Reference(64.2)),
+            {
+                "measured_jp": (32.5, 32.0),
+                "belief": BELIEF,
+                "gap_mm": 64.5,
+                "skew_mm": 0.5,
+                "gap_setpoint_mm": 64.2,
+                "setpoint_cf": 1.5,
+                "governed_cf": 1.4,
+                "predicted_cf": 1.38,
+                "measured_cf": 1.39,
+                "duty": (0.1, -0.2),
+                "setpoint_age_ms": pytest.approx(12.0),
+                "is_homed": True,
+                "is_busy": False,
+                "operating_state": "ENABLED",
+                # each limit once, those of the plan first
+                "limits": ("RANGE", "SKEW", "RATE"),
+            },
+        ),
+        (
+            telemetry(MEASUREMENT.replaced(switches=Switches(0), mode=DeviceMode.HOMING), SafetyState(), is_busy=True),
+            NOT_KNOWN | {"is_homed": False, "is_busy": True, "measured_cf": 1.39},
+        ),
+        (telemetry(None, SafetyState()), NOT_KNOWN | {"is_homed": False, "is_busy": False, "measured_cf": None}),
+    ],
+    ids=["driven", "before homing", "without a device"],
+)
+def test_what_is_known_is_published_and_the_rest_is_null(published: Telemetry, known: dict[str, Any]) -> None:
+    assert {name: getattr(published, name) for name in known} == known
     assert (published.tick.lateness_us, published.tick.exec_us) == (20.0, 150.0)
-    # each limit once, those of the plan first
-    assert published.limits == ("RANGE", "SKEW", "RATE")
-
-
-def test_positions_before_homing_are_not_known() -> None:
-    published = telemetry(
-        MEASUREMENT.replaced(switches=Switches(0), mode=DeviceMode.HOMING), SafetyState(), is_busy=True
-    )
-    assert (published.gap_mm, published.measured_jp, published.skew_mm, published.gap_setpoint_mm) == (None,) * 4
-    assert (published.is_homed, published.is_busy, published.measured_cf) == (False, True, 1.39)
-
-
-def test_without_a_device_nothing_measured_is_known() -> None:
-    published = telemetry(None, SafetyState())
-    assert (published.gap_mm, published.measured_cf, published.measured_jp) == (None, None, None)
-    assert (published.is_homed, published.is_busy) == (False, False)
 
 
 def test_a_tick_is_recorded_whole() -> None:
     """Every value differs from every other, so that none can stand in another's place."""
-    measurement = Measurement(
+    measurement = MEASUREMENT.replaced(
         number=11,
         received_s=1.25,
         device_time_s=2.25,
-        left_mm=-15.0,
-        right_mm=-15.5,
-        left_current_A=0.3,
-        right_current_A=0.4,
-        force_N=1.39,
-        handle_mm=3.0,
-        mode=DeviceMode.RUN,
         switches=Switches.HOMED | Switches.LEFT_OPEN,
         faults=DeviceFault.SUPPLY | DeviceFault.SKEW,
         temperature_C=25.5,
-        supply_V=12.1,
         sensed_s=1.2505,
         reported_s=1.2405,
         delay_s=0.031,
@@ -138,7 +139,6 @@ def test_a_tick_is_recorded_whole() -> None:
     safety = SafetyState(OperatingState.PAUSED, (Fault.SKEW, Fault.SENSOR), DeviceRequest.CLEAR, 99)
     stepper = stepped(safety, measurement, 1.5)
     stepper.move.reference = Reference(64.2)
-    measured = stepper.measured
     output = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
     tick = tick_record(stepper, output, plan, measurement, 20.0, 150.0, 9)
     sent = msgspec.msgpack.decode(encode_ticks([tick]))
@@ -187,11 +187,11 @@ def test_a_tick_is_recorded_whole() -> None:
         "right_current_A": 0.4,
         "supply_V": 12.1,
         "reference_gap_mm": 64.2,
-        "measured_cf": measured.force_N,
+        "measured_cf": stepper.measured.force_N,
         "left_mm": 32.5,
         "right_mm": 32.0,
-        "handle_mm": measured.handle_mm,
-        "handle_rate_mm_s": measured.handle.rate_mm_s,
+        "handle_mm": stepper.measured.handle_mm,
+        "handle_rate_mm_s": stepper.measured.handle.rate_mm_s,
         "operating_state": "PAUSED",
         "limits": ["RANGE", "RATE"],
         "step_limits": ["RATE"],
