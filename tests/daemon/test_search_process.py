@@ -61,20 +61,18 @@ def test_a_plan_uses_the_newest_answer_asks_anew_and_says_how_old_it_is(core: Co
 
 
 def test_the_force_law_guards_every_plan_whatever_was_answered(core: Core) -> None:
-    planner = core.planner(0.0)
+    planner, law = core.planner(0.0), core.element.law
+    assert law is not None
     for field_mT in (0.0, 5_000.0):
         planner.answered(Answer(0.0, FieldSolution(field_mT, 1.5, 1.0, 1, Reach.INSIDE)))
         plan = planner.plan(0.01, setpoint(1.5, 0.01), None)
-        law = core.element.law
-        assert law is not None
         assert abs(plan.field_mT / law.field_mT(1.5) - 1.0) <= LAW_SHARE + 1e-9
         assert [each.quantity for each in plan.outside] == ["field_mT"]
 
 
 def test_without_an_answer_for_long_planning_fails_and_begins_anew(core: Core) -> None:
-    planner = core.planner(0.0)
+    planner, late_s = core.planner(0.0), OLDEST_ANSWER_S + 0.01
     planner.plan(OLDEST_ANSWER_S, setpoint(1.5, 0.1), None)
-    late_s = OLDEST_ANSWER_S + 0.01
     with pytest.raises(DomainError, match=r"solver = no answer for 0\.51 s.*0\.5 s"):
         planner.plan(late_s, setpoint(1.5, 0.1), None)
     planner.afresh(late_s)
