@@ -4,7 +4,7 @@ import ctypes
 import os
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -12,10 +12,7 @@ from tormagd.config import RealTime
 from tormagd.daemon import realtime
 
 pytestmark = pytest.mark.usefixtures("usual_slices")
-
-
-def refuse(*_arguments: Any) -> None:
-    raise PermissionError(1, "Operation not permitted")
+REFUSED = PermissionError(1, "Operation not permitted")
 
 
 def test_nothing_asked_for_is_nothing_refused() -> None:
@@ -23,8 +20,8 @@ def test_nothing_asked_for_is_nothing_refused() -> None:
 
 
 def test_each_refusal_names_its_setting_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    for name in ("sched_setscheduler", "sched_setaffinity"):
+        monkeypatch.setattr(os, name, Mock(side_effect=REFUSED))
     monkeypatch.setattr(
         ctypes, "CDLL", lambda *_, **__: SimpleNamespace(mlockall=lambda flags: -1, syscall=lambda *_: -1)
     )
@@ -47,30 +44,24 @@ def test_processors_are_kept_awake_for_as_long_as_the_file_is_open(
     monkeypatch.setattr(realtime, "_LATENCY", latency)
     assert realtime.prepare(RealTime(keep_awake=True)) == []
     assert latency.read_bytes() == bytes(4)
-    opened = [link for link in Path("/proc/self/fd").iterdir() if os.path.realpath(link) == str(latency)]
-    assert len(opened) == 1
-    os.close(int(opened[0].name))
+    (opened,) = (link for link in Path("/proc/self/fd").iterdir() if os.path.realpath(link) == str(latency))
+    os.close(int(opened.name))
 
 
 def test_an_ordinary_thread_gives_its_threads_no_priority() -> None:
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
-    assert realtime.priority_of_threads() == 0
+    assert (os.sched_getscheduler(0), realtime.priority_of_threads()) == (os.SCHED_OTHER, 0)
 
 
-@pytest.mark.parametrize(("own", "theirs"), [(50, 49), (2, 1), (1, 1)])
-def test_threads_come_right_below_their_beginner(monkeypatch: pytest.MonkeyPatch, own: int, theirs: int) -> None:
-    asked: list[tuple[int, int]] = []
+@pytest.mark.parametrize(
+    ("own", "refusal", "theirs"),
+    [(50, None, 49), (2, None, 1), (1, None, 1), (50, REFUSED, 0)],
+)
+def test_threads_come_right_below_their_beginner_or_stay_ordinary_where_they_may_not(
+    monkeypatch: pytest.MonkeyPatch, own: int, refusal: Exception | None, theirs: int
+) -> None:
+    asked = Mock(side_effect=refusal)
     monkeypatch.setattr(os, "sched_getscheduler", lambda pid: os.SCHED_FIFO | os.SCHED_RESET_ON_FORK)
     monkeypatch.setattr(os, "sched_getparam", lambda pid: os.sched_param(own))
-    monkeypatch.setattr(
-        os, "sched_setscheduler", lambda pid, policy, param: asked.append((policy, param.sched_priority))
-    )
+    monkeypatch.setattr(os, "sched_setscheduler", asked)
     assert realtime.priority_of_threads() == theirs
-    assert asked == [(os.SCHED_FIFO, theirs)]
-
-
-def test_threads_that_may_not_have_it_stay_ordinary(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getscheduler", lambda pid: os.SCHED_FIFO)
-    monkeypatch.setattr(os, "sched_getparam", lambda pid: os.sched_param(50))
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert realtime.priority_of_threads() == 0
+    asked.assert_called_once_with(0, os.SCHED_FIFO, os.sched_param(max(own - 1, 1)))
