@@ -32,8 +32,18 @@ class Publishing:
     def realtime_ns(self) -> int:
         return START_NS + round((self.now_s + self.step_s) * 1e9)
 
-    def send(self, seq: int, force_N: float = 1.0, source: str = "a", age_s: float = 0.0, /, **fields: Any) -> bool:
-        """Publishes one setpoint, stamped `age_s` ago."""
+    def send(
+        self,
+        seq: int,
+        force_N: float = 1.0,
+        source: str = "a",
+        age_s: float = 0.0,
+        /,
+        at_s: float | None = None,
+        **fields: Any,
+    ) -> bool:
+        """Publishes one setpoint, at `at_s` where it is given, stamped `age_s` before."""
+        self.now_s = self.now_s if at_s is None else at_s
         message = {
             "v": 1,
             "source": source,
@@ -73,8 +83,7 @@ def publishing() -> Publishing:
 
 
 def test_a_setpoint_is_put_on_the_control_clock(publishing: Publishing) -> None:
-    publishing.now_s = 7.0
-    assert publishing.send(1, 1.5, "a", 0.02, rate_mm_s=30.0)
+    assert publishing.send(1, 1.5, "a", 0.02, at_s=7.0, rate_mm_s=30.0)
     newest = publishing.newest
     found = newest.stamp_s, newest.force_N, newest.valid_for_s, newest.rate_mm_s
     assert found == (pytest.approx(6.98), 1.5, 0.05, 30.0)
@@ -82,10 +91,8 @@ def test_a_setpoint_is_put_on_the_control_clock(publishing: Publishing) -> None:
 
 def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over(publishing: Publishing) -> None:
     publishing.send(1_000)
-    publishing.now_s = 0.049
-    assert not publishing.send(0, 2.0)
-    publishing.now_s = 0.051
-    assert (publishing.send(0, 2.0), publishing.force_N) == (True, 2.0)
+    assert not publishing.send(0, 2.0, at_s=0.049)
+    assert (publishing.send(0, 2.0, at_s=0.051), publishing.force_N) == (True, 2.0)
 
 
 # -- who holds the brake -------------------------------------------------------------------------------------------
@@ -93,8 +100,7 @@ def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over
 
 def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is_stale(publishing: Publishing) -> None:
     assert publishing.send(1, 1.0, "a")
-    publishing.now_s = 0.04
-    assert not publishing.send(1, 2.0, "b")
+    assert not publishing.send(1, 2.0, "b", at_s=0.04)
     assert (publishing.counters(), publishing.force_N) == ((1, 1, 0), 1.0)
     assert publishing.send(2, 1.0, "a")
     assert publishing.newest.is_contested
@@ -104,8 +110,7 @@ def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is
     told = publishing.inbox.told(publishing.now_s)[Limit.OTHER_SOURCE]
     assert told.cause == "'b' sends setpoints too, and 'a' holds the brake"
     assert told.remedy.endswith("tormagctl take b")
-    publishing.now_s = 0.0901
-    assert publishing.send(2, 2.0, "b")
+    assert publishing.send(2, 2.0, "b", at_s=0.0901)
     newest = publishing.newest
     assert (newest.force_N, newest.holder, newest.is_contested) == (2.0, 1, False)
     assert "'b' holds the brake instead of 'a': that is stale" in str(publishing.inbox.news(publishing.now_s))
@@ -124,8 +129,7 @@ def test_a_limit_that_is_over_is_over(publishing: Publishing) -> None:
 
 def test_a_source_that_is_late_itself_takes_nothing_over(publishing: Publishing) -> None:
     publishing.send(1, 1.0, "a")
-    publishing.now_s = 0.2
-    assert not publishing.send(1, 2.0, "b", 0.06)
+    assert not publishing.send(1, 2.0, "b", 0.06, at_s=0.2)
     assert publishing.inbox.hold.source == "a"
 
 
@@ -185,8 +189,7 @@ def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publ
 @pytest.mark.parametrize("by_s", [-0.5, 0.5])
 def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publishing, by_s: float) -> None:
     for tick in range(100):
-        publishing.now_s = tick * 0.002
-        publishing.send(tick, 1.0, "a", 0.0 if tick < 50 else -by_s)
+        publishing.send(tick, 1.0, "a", 0.0 if tick < 50 else -by_s, at_s=tick * 0.002)
         assert publishing.age_s == pytest.approx(0.0, abs=1e-3)
     assert publishing.counters() == (100, 0, 0)
     found = publishing.of("a")
@@ -199,8 +202,7 @@ def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock
     assert not publishing.send(1, 2.0, "a", -AHEAD_S - 0.001)
     assert publishing.counters() == (0, 1, 0)
     assert "51 ms ahead" in str(publishing.inbox.last_refusal)
-    publishing.now_s = SETTLED_S
-    assert publishing.send(2, 2.0, "a", -AHEAD_S - 0.001)
+    assert publishing.send(2, 2.0, "a", -AHEAD_S - 0.001, at_s=SETTLED_S)
     # of a source that is known, it is the clock; and no setpoint is younger than its arrival
     assert publishing.send(1, 1.0, "b", 0.0, valid_for_ms=1.0) is False
     assert publishing.newest.stamp_s == SETTLED_S
@@ -214,8 +216,7 @@ def test_a_stamp_of_long_ago_is_taken_and_is_as_old_as_it_says(publishing: Publi
 def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -> None:
     noise, drifts_ppm = random.Random(1), []
     for tick in range(800):
-        publishing.now_s = tick * 0.05
-        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.045), valid_for_ms=200.0)
+        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.045), at_s=tick * 0.05, valid_for_ms=200.0)
         found = publishing.of("a")
         assert found.cause == ""
         if found.clock is not None:
@@ -227,8 +228,8 @@ def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -
 def test_a_drifting_clock_is_told(publishing: Publishing, drift_ppm: float) -> None:
     noise = random.Random(1)
     for tick in range(1_500):
-        publishing.now_s = tick * 0.01
-        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.001) - drift_ppm * 1e-6 * publishing.now_s)
+        ahead_s = drift_ppm * 1e-6 * tick * 0.01
+        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.001) - ahead_s, at_s=tick * 0.01)
     found = publishing.of("a")
     assert (found.clock.windows > 8, found.clock.drift_ppm) == (True, pytest.approx(drift_ppm, abs=60.0))
     assert f"ppm {'fast' if drift_ppm > 0.0 else 'slow'}" in found.cause
@@ -242,9 +243,8 @@ def test_nothing_is_given_to_a_source_whose_stamps_were_refused(publishing: Publ
 
 def test_losses_and_delays_are_counted_for_each_source(publishing: Publishing) -> None:
     for tick in range(1_000):
-        publishing.now_s = tick * 0.002
         if tick % 10:
-            publishing.send(tick, 1.0, "a", 0.003 if tick % 2 else 0.001)
+            publishing.send(tick, 1.0, "a", 0.003 if tick % 2 else 0.001, at_s=tick * 0.002)
     found = publishing.of("a")
     assert (found.lost, found.cause, found.clock_behind_ms) == (99, "", pytest.approx(0.0, abs=0.1))
     assert (found.delay_us.p50, found.delay_us.p99) == pytest.approx((3_000.0, 3_000.0), rel=0.04)
@@ -253,13 +253,11 @@ def test_losses_and_delays_are_counted_for_each_source(publishing: Publishing) -
 
 def test_one_publisher_too_many_is_refused_until_one_is_silent(publishing: Publishing) -> None:
     for number in range(SOURCES):
-        publishing.now_s = number * 0.01
-        publishing.send(1, source=f"source {number}", valid_for_ms=60_000.0)
+        publishing.send(1, at_s=number * 0.01, source=f"source {number}", valid_for_ms=60_000.0)
     publishing.send(1, 2.0, source="one more")
     assert "one more" in str(publishing.inbox.last_refusal)
     # the first holds the brake and stays; the second has been silent for long enough, the third has not
-    publishing.now_s = SILENT_S + 0.015
-    publishing.send(1, 2.0, source="one more")
+    publishing.send(1, 2.0, at_s=SILENT_S + 0.015, source="one more")
     kept = {f"source {number}" for number in range(SOURCES) if number != 1}
     assert set(publishing.inbox.report(publishing.now_s).sources) == kept | {"one more"}
 
