@@ -21,8 +21,13 @@ def recorded(lateness_us: list[float], exec_us: list[float] | None = None) -> Ra
     return group
 
 
-def test_before_the_first_run_everything_is_zero() -> None:
-    report = RateGroup("test", PERIOD_NS).report
+@pytest.fixture
+def group() -> RateGroup:
+    return RateGroup("test", PERIOD_NS)
+
+
+def test_before_the_first_run_everything_is_zero(group: RateGroup) -> None:
+    report = group.report
     assert (report.hz, report.runs, report.merged, report.overruns) == (0.0, 0, 0, 0)
     assert set(astuple(report.lateness_us)) == set(astuple(report.exec_us)) == {0.0}
 
@@ -68,15 +73,13 @@ def test_the_horizon_forgets_and_the_worst_does_not() -> None:
     assert recorded([900.0] + [5.0] * round(0.9 * HORIZON_NS / PERIOD_NS)).report.lateness_us.max == 900.0
 
 
-def test_the_rate_is_that_of_the_horizon() -> None:
-    group = RateGroup("test", PERIOD_NS)
+def test_the_rate_is_that_of_the_horizon(group: RateGroup) -> None:
     for due in (*range(0, HORIZON_NS, PERIOD_NS), *range(HORIZON_NS, 5 * HORIZON_NS, 4 * PERIOD_NS)):
         group.record(due, due, due)
     assert group.rate_hz() == pytest.approx(250.0, rel=1e-2)
 
 
-def test_merged_runs_and_overruns_are_counted() -> None:
-    group = RateGroup("test", PERIOD_NS)
+def test_merged_runs_and_overruns_are_counted(group: RateGroup) -> None:
     group.record(0, 100, PERIOD_NS)
     assert group.overruns == 0
     group.record(PERIOD_NS, PERIOD_NS, 2 * PERIOD_NS + 1)
@@ -86,14 +89,12 @@ def test_merged_runs_and_overruns_are_counted() -> None:
     assert (group.runs, group.merged, group.overruns, group.stalls) == (4, 3, 2, 0)
 
 
-def test_the_delay_counts_from_the_first_run_that_was_missed() -> None:
-    group = RateGroup("test", PERIOD_NS)
+def test_the_delay_counts_from_the_first_run_that_was_missed(group: RateGroup) -> None:
     group.record(5 * PERIOD_NS, 5 * PERIOD_NS + 10, 5 * PERIOD_NS + 20, merged=2)
     assert (group.delay_ns, group.lateness_us, group.overruns) == (2 * PERIOD_NS + 20, pytest.approx(0.01), 1)
 
 
-def test_a_stall_is_an_error_and_an_overrun_a_warning_for_as_long_as_the_horizon() -> None:
-    group = RateGroup("test", PERIOD_NS)
+def test_a_stall_is_an_error_and_an_overrun_a_warning_for_as_long_as_the_horizon(group: RateGroup) -> None:
     stall_ns = round(ERROR_PERIODS * PERIOD_NS) + 1
     assert group.grade() == "good"
     for due_ns, took_ns, grade in (
