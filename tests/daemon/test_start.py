@@ -1,5 +1,8 @@
-"""Until a command runs, Ctrl-C just ends the process: no traceback from the middle of an import."""
+"""How the daemon's process begins: what it loads, how its log looks, and that Ctrl-C just ends it meanwhile."""
 
+import os
+import pty
+import re
 import signal
 import subprocess
 import sys
@@ -9,6 +12,9 @@ import pytest
 
 from tormagd import entry
 from tormagd.daemon import main as daemon_main
+
+# -- Ctrl-C until a command runs: no traceback from the middle of an import --------------------------------------------
+
 
 COMMANDS = {
     "tormagd": "import tormagd.entry; sys.exit(tormagd.entry.daemon())",
@@ -67,3 +73,102 @@ def test_ctrl_c_between_loading_and_running_is_quiet_too(monkeypatch: pytest.Mon
     monkeypatch.setattr(daemon_main, "main", Mock(side_effect=KeyboardInterrupt))
     assert entry.daemon() == entry.INTERRUPTED
     assert signal.getsignal(signal.SIGINT) == before
+
+
+# -- what is loaded, in one place: a module more shows here, and nothing of the training comes with it -----------------
+
+
+LOADED = """
+import sys
+import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.assembly.build
+import tormagd.hardware.serial_backend, tormagd.hardware.can_backend
+names = sorted(sys.modules)
+ours = [name for name in names if name.startswith(("tormagd.", "tormagd_client.", "firmware_protocol."))]
+print(*[name for name in ours if "__mypyc" not in name])
+print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
+"""
+ROOMS = {
+    "assembly",
+    "bounded_file",
+    "config",
+    "control",
+    "daemon",
+    "exact",
+    "force_file",
+    "hardware",
+    "inverse",
+    "keeping",
+    "keys",
+    "model",
+    "named_file",
+    "output",
+    "physics",
+    "safety",
+    "scenes",
+    "slices",
+    "toml_file",
+}
+LIBRARIES = (
+    "can",
+    "matplotlib",
+    "mcap",
+    "msgpack",
+    "msgspec",
+    "numpy",
+    "pandas",
+    "safetensors",
+    "scipy",
+    "serial",
+    "sklearn",
+    "torch",
+    "zmq",
+)
+
+
+def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
+    ours, libraries = subprocess.run(
+        [sys.executable, "-P", "-c", LOADED, *LIBRARIES], capture_output=True, text=True, check=True, timeout=60
+    ).stdout.splitlines()
+    assert {name.split(".")[1] for name in ours.split() if name.startswith("tormagd.")} == ROOMS
+    assert {name for name in ours.split() if name.startswith("tormagd_client.")} == {
+        "tormagd_client.endpoints",
+        "tormagd_client.keys",
+        "tormagd_client.messages",
+        "tormagd_client.printable",
+        "tormagd_client.regular_file",
+    }
+    assert {name for name in ours.split() if name.startswith("tormagd.model.")} == {
+        "tormagd.model.displacement",
+        "tormagd.model.features",
+        "tormagd.model.force_curve",
+        "tormagd.model.memory",
+        "tormagd.model.model_file",
+        "tormagd.model.rising",
+        "tormagd.model.shipped",
+    }
+    assert {name for name in ours.split() if name.startswith("tormagd.inverse.")} == {
+        "tormagd.inverse.choice",
+        "tormagd.inverse.nearest",
+        "tormagd.inverse.newton",
+        "tormagd.inverse.solution",
+    }
+    assert libraries.split() == ["can", "msgpack", "msgspec", "numpy", "safetensors", "serial", "zmq"]
+
+
+# -- the log: one line for each record, with its time where nobody else writes that down -------------------------------
+
+
+SAY = "import logging, tormagd.daemon.log as log; log.log_to_stderr(); logging.getLogger('room').warning('a\\x1b[2J')"
+
+
+@pytest.mark.parametrize(
+    ("opened", "time", "end"), [(pty.openpty, r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ", "\r\n"), (os.pipe, "", "\n")]
+)
+def test_a_line_has_its_time_on_a_terminal_and_none_for_the_journal(opened, time, end):
+    far, near = opened()
+    try:
+        subprocess.run([sys.executable, "-c", SAY], stderr=near, check=True, timeout=60)
+        assert re.fullmatch(rf"{time}WARNING room: a\S*{end}", os.read(far, 1024).decode())
+    finally:
+        os.close(far)
+        os.close(near)
