@@ -9,12 +9,14 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.control.records import TimedSetpoint
+from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
 from tormagd.daemon.source_clock import AHEAD_S, SETTLED_S
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, SourceReport, decode, encode
 
+PRIORITY = ("patient", "console")
 START_NS = 1_800_000_000_000_000_000
 "Some day on CLOCK_REALTIME that is second 0 of the control clock here."
 
@@ -96,6 +98,23 @@ def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over
 
 
 # -- who holds the brake -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("holder", "other", "passed"),
+    [
+        ("patient", "console", False),
+        ("console", "patient", True),
+        ("a", "console", True),
+        ("patient", "a", False),
+        ("a", "b", False),
+    ],
+)
+def test_what_is_listed_goes_before_what_comes_later_or_is_not(holder: str, other: str, passed: bool) -> None:
+    assert is_passed(Hold(holder), other, PRIORITY, is_stale=False) == passed
+    assert is_passed(Hold(holder), other, PRIORITY, is_stale=True)
+    assert not is_passed(Hold(holder, is_given=True), other, PRIORITY, is_stale=False)
+    assert not is_passed(Hold(holder), other, (), is_stale=False)
 
 
 def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is_stale(publishing: Publishing) -> None:

@@ -1,5 +1,6 @@
-"""Snapshots: what is not known is null, and nothing holds back a device that is not driven."""
+"""What is told: snapshots, where what is not known is null; codes; the way of a setpoint."""
 
+import math
 import time
 from typing import Any
 
@@ -11,13 +12,15 @@ from tormagd.config import Config
 from tormagd.control.core import Stepper
 from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, Outside, Plan
+from tormagd.daemon.causes import explanations
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
+from tormagd.daemon.way import Way
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
 from tormagd.scenes.scene import load_scene
-from tormagd_client.messages import BeliefReport, Telemetry, decode, encode, encode_ticks
+from tormagd_client.messages import BeliefReport, Explained, Telemetry, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
 BELIEF = {"scale": BeliefReport(value=1.02, sd=0.04, unit="", acts=True)}
@@ -214,3 +217,57 @@ def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(presen
     published = telemetry(MEASUREMENT, SafetyState(present))
     assert bool(limits_held(SafetyState(present), OUTPUT, PLAN)) == is_driven
     assert (published.governed_cf, published.setpoint_cf) == (1.4 if is_driven else None, 1.5)
+
+
+# -- codes, each with what a person needs to know about it -------------------------------------------------------------
+
+
+def test_codes_are_explained_by_their_table() -> None:
+    fault, limit = FAULTS[Fault.SKEW], LIMITS[Limit.SKEW]
+    assert explanations(("SKEW",), FAULTS) == (Explained("SKEW", fault.cause, fault.remedy),)
+    assert explanations(("SKEW",), LIMITS) == (Explained("SKEW", limit.cause, limit.remedy),)
+    found = explanations(("HOST_STALL",), LIMITS, {"HOST_STALL": "it stood still for 9 ms", "SKEW": "no"})
+    assert found == (Explained("HOST_STALL", "it stood still for 9 ms", LIMITS[Limit.HOST_STALL].remedy),)
+    assert explanations((), FAULTS) == ()
+
+
+# -- the way of a setpoint, part by part; what comes of it in a closed loop: tests/closed_loop/test_sources.py ---------
+
+
+def planned(stamp_s: float) -> Plan:
+    return Plan(1, 0.0, 1.0, 0.0, 1.0, None, 400.0, 70.0, 0.0, 1.0, (), stamp_s=stamp_s)
+
+
+def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -> None:
+    way = Way()
+    way.ticked(0.5, planned(-math.inf))
+    way.refresh()
+    found = way.report(400.0, 0.013)
+    assert (found.to_duty_us.max, found.total_ms) == (0.0, None)
+    for tick in range(1_000):
+        # a new one every 10 ms, 20 ms old when it is followed first
+        way.ticked(1.0 + tick * 1e-3, planned(1.0 + tick // 10 * 0.01 - 0.02))
+    way.refresh()
+    found = way.report(400.0, 0.013)
+    assert (found.to_duty_us.max, found.to_duty_us.p50) == (
+        pytest.approx(20_000.0, abs=1.0),
+        pytest.approx(20_000.0, rel=0.04),
+    )
+    # one that has gone stale ends no way
+    way.ticked(9.0, planned(-math.inf))
+    way.refresh()
+    assert way.report(None, 0.013).to_duty_us.max == pytest.approx(20_000.0, abs=1.0)
+
+
+def test_the_whole_way_is_the_sum_of_what_is_known_of_its_parts() -> None:
+    way = Way()
+    for tick in range(1, 100):
+        way.ticked(tick * 1e-2, planned(tick * 1e-2 - 0.02))
+    way.refresh()
+    found = way.report(400.0, 0.013)
+    assert (found.device_us, found.carriages_ms, found.total_ms) == (
+        400.0,
+        13.0,
+        pytest.approx(20.0 + 0.4 + 13.0, abs=0.7),
+    )
+    assert way.report(None, 0.013).total_ms is None
