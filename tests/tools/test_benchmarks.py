@@ -4,6 +4,9 @@ import argparse
 import contextlib
 import io
 import json
+import os
+import subprocess
+import time
 from pathlib import Path
 
 import benchmark
@@ -13,6 +16,7 @@ import pytest
 from benchmarks import inverse_report, inverse_workload, latency, loop, step, virtual_time
 from benchmarks.inverse_report import ROOT
 
+from firmware_protocol.c.build import BuildError
 from tormagd.assembly.build import build_core
 from tormagd.config import Config, RealTime, load_config
 from tormagd.lab.told import lines
@@ -219,6 +223,23 @@ def test_what_is_measured_is_a_configuration_that_tormagd_takes(tmp_path: Path) 
     config = load_config(loop.write_config(tmp_path, "/dev/null", loop.Stand(RealTime())))
     assert (config.rates.control_hz, config.rates.inference_hz) == (loop.CONTROL_HZ, loop.CONTROL_HZ)
     build_core(config)
+
+
+def test_the_host_in_c_is_built_without_a_warning_and_says_how_it_is_called(tmp_path: Path) -> None:
+    try:
+        host = loop.built_host(tmp_path)
+    except BuildError as error:
+        pytest.skip(str(error))
+    said = subprocess.run([host], check=False, capture_output=True, text=True)
+    assert (said.returncode, said.stderr) == (2, "reference_host PORT PERIOD_US SECONDS FIFO\n")
+
+
+def test_wake_ups_are_counted_by_thread_and_a_beat_is_drawn(tmp_path: Path) -> None:
+    _, share, hz = loop.spent(os.getpid(), lambda: [time.sleep(1e-3) for _ in range(50)])
+    assert 0.0 <= share < 1.0
+    assert 50.0 < hz["control"] <= hz["all"]
+    loop.draw(tmp_path / "beat.png", {"plan": {"p50": 20.0, "p99": 60.0}, "drive": {"p50": 30.0, "p99": 50.0}})
+    assert (tmp_path / "beat.png").stat().st_size > 1_000
 
 
 def test_the_bound_is_the_hops_and_a_period_and_less_than_half_a_millisecond() -> None:

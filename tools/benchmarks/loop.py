@@ -218,17 +218,23 @@ def wakeups(pid: int) -> dict[int, int]:
 def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
     """What the host in C prints, on a simulated device of its own; None without a C compiler."""
     with contextlib.suppress(BuildError), contextlib.ExitStack() as stack:
-        cc, folder = compiler(), Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
-        built, room = folder / "reference_host", FIRMWARE
-        sources = [TOOLS / "reference_host.c", *(room / f"{name}.c" for name in HOST_SOURCES)]
-        subprocess.run([cc, *HOST_FLAGS, f"-I{room}", *map(str, sources), "-o", str(built)], check=True)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
+        host = built_host(folder)
         start = partial(begun, stack, folder / LOG, environment=environment(None, folder))
         port = first_line(start(*own_machine(0, "tormagd.simulation", "--pty")))
         words = [port, str(1_000_000 // CONTROL_HZ), str(seconds), str(stand.realtime.fifo_priority)]
-        ran = subprocess.run([str(built), *words], check=True, capture_output=True, text=True)
+        ran = subprocess.run([str(host), *words], check=True, capture_output=True, text=True)
         found: dict[str, Any] = json.loads(ran.stdout)
         return found
     return None
+
+
+def built_host(folder: Path) -> Path:
+    """The host in C, built in that folder. Raises BuildError where there is no compiler."""
+    host, sources = folder / "reference_host", [f"{FIRMWARE / name}.c" for name in HOST_SOURCES]
+    command = [compiler(), *HOST_FLAGS, f"-I{FIRMWARE}", str(TOOLS / "reference_host.c"), *sources, "-o", str(host)]
+    subprocess.run(command, check=True)
+    return host
 
 
 @contextlib.contextmanager
