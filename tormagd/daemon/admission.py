@@ -40,7 +40,7 @@ GUARDED = {
 "Options of a guarded socket; times are in ms and s."
 NEWS_S = 10.0
 "At most one log line in this time."
-AT_ONCE = 2
+AT_ONCE = 4
 "Events taken in one slice at most."
 WATCHED = (
     zmq.EVENT_ACCEPTED
