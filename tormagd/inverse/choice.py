@@ -6,7 +6,7 @@ from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.solution import FieldSolver
 from tormagd.model.model_file import ForceModel
-from tormagd.physics.errors import DomainError
+from tormagd.physics.errors import DomainError, require_that
 
 
 class Choice(NamedTuple):
@@ -33,12 +33,10 @@ def named(
 ) -> Choice:
     """A search by its name, with its usual settings where none are given. Raises `DomainError` on another name, or a
     setting that the search does not have."""
-    if solver not in _USUAL:
-        raise DomainError("solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
+    require_that(solver in _USUAL, "solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
     settings = []
     for key, given, usual in zip(("step_mT", "neighbours"), (step_mT, neighbours), _USUAL[solver], strict=True):
-        if given is not None and not usual:
-            raise DomainError(f"solver.{key}", given, f"none beside solver.name = {solver!r}")
+        require_that(given is None or usual > 0, f"solver.{key}", given, f"none beside solver.name = {solver!r}")
         settings.append(usual if given is None else given)
     return Choice(solver, float(settings[0]), int(settings[1]), reason)
 
@@ -50,8 +48,7 @@ def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel
     where torch is not installed.
     """
     if choice.solver == "newton":
-        if not rises:
-            raise DomainError("solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")
+        require_that(rises, "solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")
         return RisingSearch(field_range_mT)
     fields_mT = field_grid(field_range_mT, choice.step_mT)
     if choice.solver == "nearest":
@@ -68,7 +65,6 @@ def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel
 
 def mean_error_N(model: ForceModel) -> float:
     """The mean error of the force that its training states of `model`. Raises `DomainError` where it states none."""
-    metrics = model.metadata.metrics
-    if "validation_mae_N" not in metrics:
-        raise DomainError("validation_mae_N", "missing in the model's metrics", "a model that states its mean error")
-    return metrics["validation_mae_N"]
+    name, metrics = "validation_mae_N", model.metadata.metrics
+    require_that(name in metrics, name, "missing in the model's metrics", "a model that states its mean error")
+    return metrics[name]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT, tie_N
 from tormagd.model.features import require_number
 from tormagd.model.force_curve import Floats, ForceCurve
-from tormagd.physics.errors import DomainError
+from tormagd.physics.errors import require_that
 
 MAX_GRID_POINTS = 100_000
 
@@ -24,11 +24,13 @@ def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[n
     low, high = field_range_mT
     require_number("field_range_mT", low)
     require_number("field_range_mT", high)
-    if not low < high:
-        raise DomainError("field_range_mT", field_range_mT, "a least field below the greatest")
-    if not 0 < step_mT <= high - low or (high - low) / step_mT >= MAX_GRID_POINTS:
-        allowed = f"above 0, at most the range ({high - low:g} mT), at most {MAX_GRID_POINTS} points"
-        raise DomainError("step_mT", step_mT, allowed)
+    require_that(low < high, "field_range_mT", field_range_mT, "a least field below the greatest")
+    require_that(
+        0 < step_mT <= high - low and (high - low) / step_mT < MAX_GRID_POINTS,
+        "step_mT",
+        step_mT,
+        f"above 0, at most the range ({high - low:g} mT), at most {MAX_GRID_POINTS} points",
+    )
     return np.linspace(low, high, int(np.ceil((high - low) / step_mT)) + 1)
 
 
@@ -52,8 +54,7 @@ class NearestFieldSearch:
     def __init__(self, fields_mT: NDArray[np.float64], neighbours: int = 8, batch: Batch | None = None) -> None:
         self._fields_mT, self._batch = fields_mT, batch
         points = len(self._fields_mT)
-        if not 1 <= neighbours <= points:
-            raise DomainError("neighbours", neighbours, f"1 to the number of grid points, {points}")
+        require_that(1 <= neighbours <= points, "neighbours", neighbours, f"1 to the number of grid points, {points}")
         self._neighbours = neighbours
         self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
 

@@ -11,7 +11,7 @@ from tormagd.model.features import FEATURES, FIELD, require_number
 from tormagd.model.force_curve import Floats, ForceCurve
 from tormagd.model.model_file import ForceModel
 from tormagd.model.network import to_network
-from tormagd.physics.errors import DomainError
+from tormagd.physics.errors import require_that
 
 torch.set_num_threads(1)  # a second thread costs more than it saves at these sizes, and waits for a busy processor
 
@@ -54,8 +54,7 @@ class RowByRow:
 
     def __init__(self, fields_mT: Floats, epsilon_N: float, predict_N: Callable[[ForceCurve, float], float]) -> None:
         require_number("epsilon_N", epsilon_N)
-        if epsilon_N < 0:
-            raise DomainError("epsilon_N", epsilon_N, "0 N or more")
+        require_that(epsilon_N >= 0, "epsilon_N", epsilon_N, "0 N or more")
         self._fields_mT: list[float] = fields_mT.tolist()
         self._epsilon_N, self._predict_N = epsilon_N, predict_N
 

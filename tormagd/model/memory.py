@@ -11,7 +11,7 @@ from itertools import compress, pairwise
 
 import msgspec
 
-from tormagd.physics.errors import DomainError, require
+from tormagd.physics.errors import require, require_that
 from tormagd.physics.relaxation import PronySeries
 
 MOST_TERMS = 8
@@ -34,8 +34,12 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             require("memory.times_s, count", len(series.times_s), 0, MOST_TERMS)
         for time_s in self.times_s:
             require("memory.times_s", time_s, 1e-3, LONGEST_S)
-        if any(before >= after for before, after in pairwise(self.times_s)):
-            raise DomainError("memory.times_s", self.times_s, "rising times")
+        require_that(
+            all(before < after for before, after in pairwise(self.times_s)),
+            "memory.times_s",
+            self.times_s,
+            "rising times",
+        )
         require("memory.turn_mT", self.turn_mT, 0.1, 1e5)
         # a gap that follows a greater lag might run after itself
         require("memory.lag_mT", self.lag_mT, 0.0, 0.25 * self.turn_mT)

@@ -34,7 +34,7 @@ from tormagd.model.features import (
 )
 from tormagd.model.force_curve import ForceCurve, Known, Network
 from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.physics.errors import DomainError
+from tormagd.physics.errors import DomainError, require_that
 
 Array: TypeAlias = NDArray[np.float64]
 Ranges: TypeAlias = dict[str, tuple[float, float]]
@@ -77,39 +77,40 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     boxes: dict[str, Ranges] | msgspec.UnsetType = msgspec.UNSET
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[\x21-\x7e]{1,64}", self.insert):
-            raise DomainError("insert", repr(self.insert[:80]), "1 to 64 printable characters without blanks")
-        if not re.fullmatch(r"[0-9a-f]{64}", self.training_data_sha256):
-            raise DomainError("training_data_sha256", repr(self.training_data_sha256[:80]), "64 hexadecimal digits")
-        if not 1 <= self.hidden <= MAX_HIDDEN:
-            raise DomainError("hidden", self.hidden, f"1 to {MAX_HIDDEN}")
-        if self.features != FEATURES:
-            raise DomainError("features", self.features, f"{FEATURES}, in this order")
-        if self.units != UNITS:
-            raise DomainError("units", self.units, str(UNITS))
+        require_that(
+            re.fullmatch(r"[\x21-\x7e]{1,64}", self.insert) is not None,
+            "insert",
+            repr(self.insert[:80]),
+            "1 to 64 printable characters without blanks",
+        )
+        require_that(
+            re.fullmatch(r"[0-9a-f]{64}", self.training_data_sha256) is not None,
+            "training_data_sha256",
+            repr(self.training_data_sha256[:80]),
+            "64 hexadecimal digits",
+        )
+        require_that(1 <= self.hidden <= MAX_HIDDEN, "hidden", self.hidden, f"1 to {MAX_HIDDEN}")
+        require_that(self.features == FEATURES, "features", self.features, f"{FEATURES}, in this order")
+        require_that(self.units == UNITS, "units", self.units, str(UNITS))
         _require_ranges("ranges", self.ranges)
         for name, box in (self.boxes or {}).items():
             _require_ranges(f"boxes.{name}", box)
         scaling = self.scaling
         numbers = (*scaling.input_offset, *scaling.input_gain, scaling.output_offset, scaling.output_gain)
-        if not all(abs(number) <= LARGEST for number in numbers):
-            raise DomainError("scaling", scaling, f"finite numbers within +-{LARGEST:g}")
-        if not scaling.output_gain > 0:
-            raise DomainError("scaling.output_gain", scaling.output_gain, "above 0")
+        is_finite = all(abs(number) <= LARGEST for number in numbers)
+        require_that(is_finite, "scaling", scaling, f"finite numbers within +-{LARGEST:g}")
+        require_that(scaling.output_gain > 0, "scaling.output_gain", scaling.output_gain, "above 0")
         for name, value in self.metrics.items():
-            if not math.isfinite(value):
-                raise DomainError(f"metrics.{name}", value, "a finite number")
+            require_that(math.isfinite(value), f"metrics.{name}", value, "a finite number")
 
 
 def _require_ranges(key: str, ranges: Ranges) -> None:
-    if set(ranges) != set(UNITS):
-        raise DomainError(key, sorted(ranges), f"one range for each of {', '.join(UNITS)}")
+    require_that(set(ranges) == set(UNITS), key, sorted(ranges), f"one range for each of {', '.join(UNITS)}")
     for name, (low, high) in ranges.items():
-        if not -LARGEST <= low <= high <= LARGEST:
-            raise DomainError(f"{key}.{name}", (low, high), f"[least, greatest], finite, within +-{LARGEST:g}")
+        is_range = -LARGEST <= low <= high <= LARGEST
+        require_that(is_range, f"{key}.{name}", (low, high), f"[least, greatest], finite, within +-{LARGEST:g}")
     low, high = ranges["force_N"]
-    if not low < high:
-        raise DomainError(f"{key}.force_N", (low, high), "a greatest force above the least")
+    require_that(low < high, f"{key}.force_N", (low, high), "a greatest force above the least")
 
 
 class PhysicalLayers(NamedTuple):
@@ -287,11 +288,9 @@ def _tensor(name: str, content: dict[str, Any]) -> Array:
 def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return `value` as an unwritable float64 copy; raise `DomainError` on another shape or a number not finite."""
     source = np.asarray(value)
-    if source.dtype.kind != "f":
-        raise DomainError(name, source.dtype, "floating-point numbers")
+    require_that(source.dtype.kind == "f", name, source.dtype, "floating-point numbers")
     array = source.astype(np.float64)
-    if array.shape != shape:
-        raise DomainError(name, f"shape {array.shape}", f"shape {shape}")
+    require_that(array.shape == shape, name, f"shape {array.shape}", f"shape {shape}")
     refused = array[~(np.abs(array) <= LARGEST)]
     if refused.size:
         raise DomainError(name, refused.flat[0], f"finite numbers within +-{LARGEST:g}")

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from tormagd.model.features import FEATURES, Scaling
 from tormagd.model.model_file import MAX_HIDDEN, ForceModel, ModelMetadata
-from tormagd.physics.errors import DomainError
+from tormagd.physics.errors import require_that
 
 
 class ForceNetwork(nn.Module):
@@ -25,8 +25,7 @@ class ForceNetwork(nn.Module):
 
     def __init__(self, scaling: Scaling, hidden: int = 50, *, seed: int = 0) -> None:
         super().__init__()
-        if not 1 <= hidden <= MAX_HIDDEN:
-            raise DomainError("hidden", hidden, f"1 to {MAX_HIDDEN}")
+        require_that(1 <= hidden <= MAX_HIDDEN, "hidden", hidden, f"1 to {MAX_HIDDEN}")
         for name in ("input_offset", "input_gain", "output_offset", "output_gain"):
             self.register_buffer(name, torch.tensor(getattr(scaling, name), dtype=torch.float64))
         generator = torch.Generator().manual_seed(seed)

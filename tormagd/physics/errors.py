@@ -1,4 +1,4 @@
-"""The one error of this room, and the check that raises it."""
+"""The one error of this room, and the checks that raise it."""
 
 from typing import Any, TypeAlias, TypeVar
 
@@ -22,6 +22,12 @@ class DomainError(ValueError):
     def __reduce__(self) -> tuple[type["DomainError"], tuple[str, object, str]]:
         # exceptions are rebuilt from their text by default: one raised in a process pool's worker would break the pool
         return type(self), (self.variable, self.value, self.allowed)
+
+
+def require_that(condition: bool, variable: str, value: object, allowed: str) -> None:
+    """Raise `DomainError` unless the condition holds."""
+    if not condition:
+        raise DomainError(variable, value, allowed)
 
 
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:

@@ -19,7 +19,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from tormagd.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
-from tormagd.physics.errors import DomainError, Real, require
+from tormagd.physics.errors import Real, require, require_that
 from tormagd.physics.field import REFERENCE_PERMEABILITY
 
 MU0_H_M = 4e-7 * math.pi
@@ -40,8 +40,12 @@ class Geometry:
     def __post_init__(self) -> None:
         for name in ("inner_radius_m", "outer_radius_m", "thickness_m", "roller_radius_m"):
             require(name, getattr(self, name), 1e-5, 1.0)
-        if not self.inner_radius_m < self.outer_radius_m:
-            raise DomainError("outer_radius_m", self.outer_radius_m, f"above inner_radius_m, {self.inner_radius_m}")
+        require_that(
+            self.inner_radius_m < self.outer_radius_m,
+            "outer_radius_m",
+            self.outer_radius_m,
+            f"above inner_radius_m, {self.inner_radius_m}",
+        )
 
 
 TORMAG = Geometry(inner_radius_m=0.004, outer_radius_m=0.011, thickness_m=0.020, roller_radius_m=0.020)

@@ -10,7 +10,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta, Struct
 
-from tormagd.physics.errors import DomainError, require
+from tormagd.physics.errors import DomainError, require, require_that
 from tormagd.physics.force import Elastomer
 from tormagd.toml_file import read_toml
 
@@ -113,6 +113,5 @@ INSERTS = {item.name: item for item in _FILE.insert}
 
 def insert(name: str) -> Insert:
     """The insert of that name, such as "MRE-50-40"; `DomainError` listing the names if there is none."""
-    if name not in INSERTS:
-        raise DomainError("insert", repr(name), "one of " + ", ".join(INSERTS))
+    require_that(name in INSERTS, "insert", repr(name), "one of " + ", ".join(INSERTS))
     return INSERTS[name]
