@@ -4,7 +4,6 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, generate_latest, start_http_server
 from prometheus_client.core import (
@@ -60,16 +59,6 @@ def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
     return Outcome({"address": address}, "the daemon goes on")
 
 
-class Family(NamedTuple):
-    """A metric, with its values by those of its labels; what is not known has no sample."""
-
-    kind: type[CounterMetricFamily] | type[GaugeMetricFamily]
-    name: str
-    text: str
-    labels: tuple[str, ...]
-    values: Mapping[tuple[str, ...], float | None]
-
-
 class Scrape(Collector):
     """Asks the daemon anew each time, by a connection of its own: scrapes come in threads of their own."""
 
@@ -93,16 +82,28 @@ class Scrape(Collector):
         yield InfoMetricFamily("tormag", "What runs", about | {"firmware": status.link.firmware or ""})
         states = {state: state == status.operating_state for state in STATES}
         yield StateSetMetricFamily("tormag_operating_state", "The operating state", states)
-        for each in _families(status):
-            family = each.kind(f"tormag_{each.name}", each.text, labels=each.labels)
-            for key, value in each.values.items():
-                if value is not None:
-                    family.add_metric(key, value)
-            if each.labels or family.samples:
-                yield family
+        yield from _families(status)
 
 
-def _families(status: Status) -> Iterator[Family]:
+def _family(
+    kind: type[CounterMetricFamily] | type[GaugeMetricFamily],
+    name: str,
+    text: str,
+    labels: tuple[str, ...],
+    values: Mapping[tuple[str, ...], float | None],
+    unit: float = 1.0,
+) -> Iterator[Metric]:
+    """A metric, with its values by those of its labels; what is not known has no sample, and what has no labels either
+    is not there."""
+    family = kind(f"tormag_{name}", text, labels=labels)
+    for key, value in values.items():
+        if value is not None:
+            family.add_metric(key, value * unit)
+    if labels or family.samples:
+        yield family
+
+
+def _families(status: Status) -> Iterator[Metric]:
     link, setpoints, rates = status.link, status.setpoints, status.rates
     sources, trip_us = setpoints.by_source, status.link.round_trip_us
     for name, text, value, unit in (
@@ -120,7 +121,7 @@ def _families(status: Status) -> Iterator[Family]:
         ("setpoint_age_seconds", "Of the newest setpoint", status.setpoint_age_ms, MILLI),
         ("link_running", "Whether the device answers", float(link.state == "RUNNING"), 1.0),
     ):
-        yield Family(GAUGE, name, text, (), {(): None if value is None else value * unit})
+        yield from _family(GAUGE, name, text, (), {(): value}, unit)
     for name, text, count in (
         ("setpoints_accepted", "Setpoints that were taken", setpoints.accepted),
         ("setpoints_refused", "Setpoints that were not valid", setpoints.refused),
@@ -133,7 +134,7 @@ def _families(status: Status) -> Iterator[Family]:
         ("link_repeated_frames", "Frames that came twice", link.repeated),
         ("peers_refused", "Connections that were not let in", status.peers.refused),
     ):
-        yield Family(COUNTER, name, text, (), {(): count})
+        yield from _family(COUNTER, name, text, (), {(): count})
     for kind, name, text, label, values in (
         (GAUGE, "fault", "Latched faults, 1 for each that is there", "code", dict.fromkeys(status.faults, 1.0)),
         (GAUGE, "limit", "Limits, 1 for each that holds the force back now", "code", dict.fromkeys(status.limits, 1.0)),
@@ -170,7 +171,7 @@ def _families(status: Status) -> Iterator[Family]:
             {} if trip_us is None else {"p50": trip_us.p50 * MICRO, "p99": trip_us.p99 * MICRO},
         ),
     ):
-        yield Family(kind, name, text, (label,), {(key,): value for key, value in values.items()})
+        yield from _family(kind, name, text, (label,), {(key,): value for key, value in values.items()})
     for name, text, label, reports in (
         (
             "source_delay_seconds",
@@ -191,7 +192,7 @@ def _families(status: Status) -> Iterator[Family]:
             {n: it.exec_us for n, it in rates.items()},
         ),
     ):
-        shown: dict[tuple[str, ...], float | None] = {
-            (key, each): getattr(it, each) * MICRO for key, it in reports.items() for each in PERCENTILES
+        shown: dict[tuple[str, ...], float] = {
+            (key, each): getattr(it, each) for key, it in reports.items() for each in PERCENTILES
         }
-        yield Family(GAUGE, name, text, (label, "percentile"), shown)
+        yield from _family(GAUGE, name, text, (label, "percentile"), shown, MICRO)
