@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from firmware_protocol.build import settle
 from tormagd.config import load_config
 from tormagd.output import write_line
@@ -16,9 +18,6 @@ from tormagd.replay.rebuild import Recorded, ReplayError, differences, rebuilt, 
 from tormagd.replay.rehearse import changed, rehearse, script
 from tormagd.replay.rerun import rerun
 from tormagd_client.endpoints import ConfigError
-
-NESTED = ("first_damage", "difference")
-"Of a rerun: tuples with names, or None."
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -47,19 +46,14 @@ def main(arguments: list[str] | None = None) -> int:
             if options.settings or options.faults:
                 result |= _rehearsed(known, box, options)
             else:
-                result |= _rerun(known, box, options.from_s)
+                done = rerun(rebuilt(known), known.columns, box.entries, options.from_s)
+                result["rerun"] = msgspec.to_builtins(done)
         except ReplayError as error:
             raise ReplayError(f"{options.file}: {error}") from error
     except (ConfigError, RecordingError, ReplayError) as error:
         print(error, file=sys.stderr)
         return 2
     return 0 if write_line(json.dumps(result), sys.stdout) is None else 1
-
-
-def _rerun(known: Recorded, box: BlackBoxFile, from_s: float) -> dict[str, Any]:
-    done = rerun(rebuilt(known), known.columns, box.entries, from_s)
-    nested = {name: each and each._asdict() for name, each in done._asdict().items() if name in NESTED}
-    return {"rerun": done._asdict() | nested}
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
@@ -73,9 +67,9 @@ def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) 
         "plant": options.plant,
         "faults": options.faults,
         "settings": options.settings,
-        "recorded": todo.recorded._asdict(),
-        "simulated": simulated._asdict(),
-        "instead": None if instead is None else instead._asdict(),
+        "recorded": msgspec.to_builtins(todo.recorded),
+        "simulated": msgspec.to_builtins(simulated),
+        "instead": msgspec.to_builtins(instead),
     }
 
 

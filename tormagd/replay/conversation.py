@@ -36,7 +36,13 @@ class Found(NamedTuple):
     frame: int | None = None
 
 
-class Damage(NamedTuple):
+def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
+    """Where two plain data, which stand at `where`, differ first; None where they are the same to the bit."""
+    found = first_difference(recorded, replayed)
+    return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
+
+
+class Damage(msgspec.Struct, frozen=True):
     """The first damaged frame: which of the file's, when, and why it was refused."""
 
     frame: int
@@ -113,15 +119,13 @@ class Conversation:
         """What it remembers otherwise than was recorded."""
         if self._wire is None:
             return None
-        found = first_difference(recorded, self._wire.connection.memory())
-        return None if found is None else Found(f"state.connection.{found[0]}", *found[1:], self.frame)
+        return differing("state.connection", recorded, self._wire.connection.memory(), self.frame)
 
     def compare(self, recorded: Measurement | None) -> Found | None:
         """What it measures otherwise than the recorded step was given."""
         if self._wire is None:
             return None
-        found = first_difference(plain(recorded), plain(self._wire.connection.measurement))
-        return None if found is None else Found(f"measurement.{found[0]}".strip("."), *found[1:], self.frame)
+        return differing("measurement", plain(recorded), plain(self._wire.connection.measurement), self.frame)
 
     def read(self, entry: Any) -> None:
         """Something came."""

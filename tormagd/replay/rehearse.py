@@ -16,7 +16,7 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, checked
 from tormagd.control.records import TimedSetpoint
 from tormagd.replay.rebuild import ReplayError
-from tormagd.replay.rerun import SETPOINT, ticks_of
+from tormagd.replay.rerun import SETPOINT, name_of, ticks_of
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
@@ -34,7 +34,7 @@ SEED = 1
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
 
 
-class Happened(NamedTuple):
+class Happened(msgspec.Struct, frozen=True):
     """Faults with when each first was latched, and limits with for how long each was held, s; times from the file's
     first tick. `refused` are commands that were."""
 
@@ -93,12 +93,12 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
     commands: list[tuple[float, str]] = []
     try:
         for entry in entries:
-            if isinstance(entry, list) and entry and entry[0] == journal.PLAN:
+            if name_of(entry) == journal.PLAN:
                 now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
                 setpoints.append(
                     (now_s - first_s, None if fields is None else _later(TimedSetpoint(*fields), -first_s))
                 )
-            elif isinstance(entry, list) and entry and entry[0] == journal.COMMAND:
+            elif name_of(entry) == journal.COMMAND:
                 name, now_s, was_refused = msgspec.convert(entry[1:4], tuple[str, float, bool])
                 if not was_refused:
                     commands.append((now_s - first_s, name))

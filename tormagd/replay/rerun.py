@@ -1,7 +1,9 @@
 """The core over what it was given: bit for bit the same, or the first tick and field that differ."""
 
 from bisect import bisect_right
-from typing import Any, NamedTuple
+from functools import reduce
+from operator import or_
+from typing import Any
 
 import msgspec
 
@@ -15,12 +17,12 @@ from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.daemon.inference_loop import PLAN_ERRORS
 from tormagd.daemon.telemetry import tick_record
-from tormagd.exact import first_difference, packed, plain, restore, restored
+from tormagd.exact import packed, plain, restore, restored
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.inverse.solution import Answer
 from tormagd.recording.black_box import frames_in, is_tick
-from tormagd.replay.conversation import Conversation, Damage, Found
+from tormagd.replay.conversation import Conversation, Damage, Found, differing
 from tormagd.replay.rebuild import ReplayError
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import RefusedError
@@ -33,9 +35,27 @@ UNTAKEN = (
 SETPOINT = tuple[float, float, float, float | None, float | None, tuple[float, ...], float, int, bool]
 NOT_THE_CORES = 1
 "The first column of a record is the clock's."
+MEASURED = {
+    "received_s": "received_s",
+    "device_time_s": "device_time_s",
+    "left_mm": "device_left_mm",
+    "right_mm": "device_right_mm",
+    "left_current_A": "left_current_A",
+    "right_current_A": "right_current_A",
+    "force_N": "device_force_N",
+    "handle_mm": "device_handle_mm",
+    "temperature_C": "device_temperature_C",
+    "supply_V": "supply_V",
+    "sensed_s": "sensed_s",
+    "reported_s": "reported_s",
+    "delay_s": "delay_s",
+}
+"The numbers of a measurement, and the columns that they stand in."
+QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s", "device_clock_drift")
+"The columns of its `LinkQuality`, in its order."
 
 
-class Difference(NamedTuple):
+class Difference(msgspec.Struct, frozen=True):
     """Where a replay first gave something else. `tick` counts from 1 at the file's first, `time_s` from there. `frame`
     is where it is about what was written, or what was measured and remembered after that frame; it counts likewise."""
 
@@ -47,7 +67,7 @@ class Difference(NamedTuple):
     frame: int | None
 
 
-class Rerun(NamedTuple):
+class Rerun(msgspec.Struct, frozen=True):
     """What came of it: `ticks` were the same to the bit, from `from_s` to `to_s` after the file's first; `snapshots` of
     the whole state were compared too; over `gaps` something is missing, and it went on from the next snapshot.
 
@@ -118,7 +138,9 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
             if running.is_known:
                 ticks, to_s = ticks + 1, time_s
     passed = running.conversation
-    damage = passed.first_damage and passed.first_damage._replace(time_s=passed.first_damage.time_s - first_s)
+    damage = passed.first_damage and msgspec.structs.replace(
+        passed.first_damage, time_s=passed.first_damage.time_s - first_s
+    )
     link = passed.frames, passed.damaged, passed.resynchronised, damage
     return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, *link, difference)
 
@@ -128,7 +150,7 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
     found: int | None = None
     waiting: int | None = None
     for place, entry in enumerate(entries):
-        if _name(entry) == journal.STATE:
+        if name_of(entry) == journal.STATE:
             waiting = place
         elif place in records and waiting is not None:
             if found is not None and records[place].monotonic_s > until_s:
@@ -158,7 +180,7 @@ class _Running:
 
     def take(self, entry: Any, record: TickRecord) -> Found | None:
         """One entry that is no tick; what differs. `record` is the next tick's. Raises UNTAKEN."""
-        name = _name(entry)
+        name = name_of(entry)
         self.conversation.frame += len(frames_in(entry))
         if name == journal.STATE:
             return self._begin(entry)
@@ -245,9 +267,7 @@ class _Running:
         if self.is_known:
             self.snapshots += 1
             for what, recorded, own in (("step", entry[1], self._stepper), ("plan", entry[2], self._planner)):
-                found = first_difference(recorded, plain(own))
-                if found is not None and differs is None:
-                    differs = Found(f"state.{what}.{found[0]}", *found[1:])
+                differs = differs or differing(f"state.{what}", recorded, plain(own))
             differs = differs or self.conversation.compare_memory(connection)
         self.conversation.begin(connection)
         restore(self._stepper, entry[1], KNOWN)
@@ -260,47 +280,21 @@ def measurement_of(record: TickRecord) -> Measurement | None:
     """What the step was given."""
     if record.measurement is None:
         return None
-    told = [
-        record.received_s, record.device_time_s, record.device_left_mm, record.device_right_mm, record.left_current_A,
-        record.right_current_A, record.device_force_N, record.device_handle_mm, record.device_temperature_C,
-        record.supply_V, record.sensed_s, record.reported_s, record.delay_s, record.link_unanswered,
-        record.link_damaged, record.link_unsent, record.link_round_trip_s, record.device_clock_drift,
-    ]  # fmt: skip
-    numbers = [number for number in told if number is not None]
-    if len(numbers) < len(told) or record.device_mode is None:
+    numbers = {name: getattr(record, column) for name, column in MEASURED.items()}
+    quality = [getattr(record, column) for column in QUALITY]
+    if None in (*numbers.values(), *quality) or record.device_mode is None:
         raise ValueError("a measurement in parts: allowed is a whole one, or none")
-    (
-        received_s, device_time_s, left_mm, right_mm, left_A, right_A, force_N, handle_mm, temperature_C, supply_V,
-        sensed_s, reported_s, delay_s, *link,
-    ) = numbers  # fmt: skip
-    switches, faults = Switches(0), DeviceFault(0)
-    for name in record.device_switches:
-        switches |= Switches[name]
-    for name in record.device_faults:
-        faults |= DeviceFault[name]
     return Measurement(
-        record.measurement,
-        received_s,
-        device_time_s,
-        left_mm,
-        right_mm,
-        left_A,
-        right_A,
-        force_N,
-        handle_mm,
-        DeviceMode[record.device_mode],
-        switches,
-        faults,
-        temperature_C,
-        supply_V,
-        sensed_s,
-        reported_s,
-        delay_s,
-        LinkQuality(*link),
+        number=record.measurement,
+        mode=DeviceMode[record.device_mode],
+        switches=reduce(or_, [Switches[name] for name in record.device_switches], Switches(0)),
+        faults=reduce(or_, [DeviceFault[name] for name in record.device_faults], DeviceFault(0)),
+        link=LinkQuality(*quality),
+        **numbers,
     )
 
 
-def _name(entry: Any) -> str:
+def name_of(entry: Any) -> str:
     """An entry's name; empty for a tick."""
     if isinstance(entry, str):
         return entry
