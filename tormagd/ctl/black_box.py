@@ -4,7 +4,7 @@ import shutil
 import time
 from pathlib import Path
 
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd_client.blocking import Client
 
 POLL_S = 0.1
@@ -33,11 +33,7 @@ def black_box(client: Client, copy: Path | None) -> Outcome:
         time.sleep(POLL_S)
     if copy is None:
         return Outcome({"file": str(written)}, f"{written}\ntormagctl replay runs it again, tormagctl plot draws it")
-    try:
-        with written.open("rb") as source, copy.open("xb") as target:
-            shutil.copyfileobj(source, target)
-    except OSError as error:
-        raise usage_error(
-            f"{error.filename}: {error.strerror}", f"it is {written} on the daemon's machine: fetch it from there"
-        ) from error
+    hint = f"it is {written} on the daemon's machine: fetch it from there"
+    with as_usage_error(OSError, hint=hint), written.open("rb") as source, copy.open("xb") as target:
+        shutil.copyfileobj(source, target)
     return Outcome({"file": str(copy), "original": str(written)}, f"{copy} (also {written})")

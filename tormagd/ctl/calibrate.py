@@ -22,7 +22,7 @@ from tormagd.ctl.calibrate_device import calibrate_device
 from tormagd.ctl.calibrate_motors import calibrate_motors
 from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, Run, armed, interrupted_run, reach, seconds_bar
 from tormagd.ctl.interrupt import interrupted_by
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, through
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
@@ -124,7 +124,7 @@ def _ask_fitter(*arguments: str) -> dict[str, Any]:
                 if is_interrupted():
                     fitter.terminate()
     try:
-        answer: dict[str, Any] = msgspec.json.decode(said)
+        answer = msgspec.json.decode(said, type=dict[str, dict[str, Any]])
     except msgspec.DecodeError as error:
         if is_interrupted():
             raise interrupted_run() from error
@@ -137,8 +137,7 @@ def _ask_fitter(*arguments: str) -> dict[str, Any]:
     if "error" in answer:
         told = answer["error"]
         raise CommandError(Exit.REFUSED, told["code"], told["message"], told["hint"])
-    result: dict[str, Any] = answer["result"]
-    return result
+    return answer["result"]
 
 
 def _text(result: dict[str, Any]) -> str:
@@ -186,10 +185,8 @@ def calibrate(
     for name, path in (("--out", out), ("--csv", csv)):
         if path is not None:
             require_new(path, name)
-    try:
+    with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
         scene = load_scene(config.scene)
-    except ConfigError as error:
-        raise usage_error(str(error), "correct the scene, or give the daemon's own --config") from error
     if not is_agreed:
         _agree()
     most_N = scene.force.most_N

@@ -80,7 +80,7 @@ class Run:
         self._ticks, self._is_interrupted = ticks, is_interrupted
         self._heard_s = time.monotonic()
 
-    def play(self, waveform: Waveform, bar: "tqdm[Any] | None" = None) -> Columns:
+    def play(self, waveform: Waveform, bar: "tqdm[Any]") -> Columns:
         """Publish `waveform` and return what the ticks of that time said: one array for each column asked for.
 
         A value that was null is NaN. Raises CommandError: FAULT or REFUSED where the device stops rendering on the way,
@@ -90,8 +90,7 @@ class Run:
         start_s = time.monotonic()
         while (t_s := time.monotonic() - start_s) < waveform.duration_s:
             rows += self.exchange(waveform.at(t_s).force_N)
-            if bar is not None:
-                bar.update(time.monotonic() - start_s - t_s)
+            bar.update(time.monotonic() - start_s - t_s)
         table = np.array(rows, dtype=np.float64).reshape(-1, len(self._columns))
         return dict(zip(self._columns, table.T, strict=True))
 

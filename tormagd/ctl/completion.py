@@ -17,8 +17,7 @@ def completion(parser: ArgumentParser, shell: str) -> Outcome:
 def script(parser: ArgumentParser, shell: str) -> str:
     """The script that completes `parser`'s program in `shell`, `bash` or `zsh`: what is a path, by the files there."""
     _complete_paths(parser)
-    made: str = shtab.complete(parser, shell=shell)
-    return made
+    return str(shtab.complete(parser, shell=shell))
 
 
 def _complete_paths(parser: ArgumentParser) -> None:

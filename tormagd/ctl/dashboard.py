@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
 from tormagd.dashboard.live import Live
 from tormagd.dashboard.recorded import Recorded
 from tormagd.dashboard.server import LOOPBACK, serve
@@ -42,10 +42,8 @@ async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
 
 
 async def _recorded(path: Path, port: int) -> None:
-    try:
+    with as_usage_error(ValueError, hint="give a file that tormagctl record has made"):
         shown = Recorded(read_recording(path), path.name)
-    except ValueError as error:
-        raise usage_error(str(error), "give a file that tormagctl record has made") from error
     await serve(shown, port, _ready)
 
 

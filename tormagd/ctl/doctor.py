@@ -133,9 +133,8 @@ def core(found: Headroom) -> Finding:
 
 def configured_rate(row: Rate) -> Finding:
     """Whether one of the configured rates is held, and with margin."""
-    text = f"{row.hz} Hz takes {row.used:.0%} of what there is"
     verdict = Verdict.OK if row.holds else Verdict.WARN if row.used <= 1.0 else Verdict.FAIL
-    return Finding(f"{row.loop} rate", verdict, text, row.change)
+    return Finding(f"{row.loop} rate", verdict, f"{row.hz} Hz takes {row.used:.0%} of what there is", row.change)
 
 
 def preemption(config: Config, machine: Machine) -> Finding:
@@ -153,8 +152,12 @@ def preemption(config: Config, machine: Machine) -> Finding:
         found = f"dynamic, {asked[1] if asked else 'default'} model"
     else:
         found = "full, but not PREEMPT_RT" if re.search(r"\bPREEMPT\b", version) else "none or voluntary"
-    remedy = "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or boot with preempt=full"
-    return _finding("preemption", is_real_time, found, remedy)
+    return _finding(
+        "preemption",
+        is_real_time,
+        found,
+        "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or boot with preempt=full",
+    )
 
 
 def governor(config: Config, machine: Machine) -> Finding:
@@ -201,8 +204,12 @@ def cores(config: Config, machine: Machine) -> Finding:
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:
-        found = f"{count} online, realtime.cpus asks for {impossible}"
-        return Finding("cores", Verdict.FAIL, found, f"name cores 0..{count - 1}")
+        return Finding(
+            "cores",
+            Verdict.FAIL,
+            f"{count} online, realtime.cpus asks for {impossible}",
+            f"name cores 0..{count - 1}",
+        )
     return _finding("cores", count >= 2, f"{count} online", "use a machine with at least 2 cores")
 
 
@@ -251,8 +258,12 @@ def huge_pages(config: Config, machine: Machine) -> Finding:
     """Whether the kernel stops processes to make huge pages of their memory."""
     active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
     found = active[1] if active else "not in this kernel"
-    remedy = "echo madvise | sudo tee /sys/kernel/mm/transparent_hugepage/enabled"
-    return _finding("huge pages", found != "always", found, remedy)
+    return _finding(
+        "huge pages",
+        found != "always",
+        found,
+        "echo madvise | sudo tee /sys/kernel/mm/transparent_hugepage/enabled",
+    )
 
 
 def run_directory(config: Config, machine: Machine) -> Finding:
@@ -263,8 +274,12 @@ def run_directory(config: Config, machine: Machine) -> Finding:
     directory = os.path.dirname(address.removeprefix("ipc://"))  # noqa: PTH120
     path = machine.path(directory)
     if not path.is_dir():
-        remedy = "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own"
-        return Finding("run directory", Verdict.FAIL, f"{directory} does not exist", remedy)
+        return Finding(
+            "run directory",
+            Verdict.FAIL,
+            f"{directory} does not exist",
+            "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own",
+        )
     is_open = os.access(path, os.W_OK | os.X_OK)
     return _finding(
         "run directory",
@@ -286,8 +301,12 @@ def port(config: Config, machine: Machine) -> Finding:
     shown = name if target == name else f"{name} ({target})"
     path = machine.path(target)
     if not path.exists():
-        remedy = "plug the device in and switch it on; install systemd/udev/60-tormag.rules for the name /dev/tormag"
-        return Finding("device port", Verdict.FAIL, f"{shown} does not exist", remedy)
+        return Finding(
+            "device port",
+            Verdict.FAIL,
+            f"{shown} does not exist",
+            "plug the device in and switch it on; install systemd/udev/60-tormag.rules for the name /dev/tormag",
+        )
     is_open = os.access(path, os.R_OK | os.W_OK)
     return _finding(
         "device port",

@@ -115,7 +115,8 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         change = ""
     elif loop == "control" and late_us.p99 > TICK_OVER_STEP * step.p99 and in_time > busy:
         change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
+    elif found.build == "interpreted":
+        change = f"compile the core: {REMEDY}"
     else:
-        can_compile = found.build == "interpreted"
-        change = f"compile the core: {REMEDY}" if can_compile else f"a faster processor, or less than {hz} Hz"
+        change = f"a faster processor, or less than {hz} Hz"
     return Rate(loop, hz, configured, round(used, 3), used <= MOST_USED, change)

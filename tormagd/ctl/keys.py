@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
 from tormagd.keys import load_folder
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
@@ -26,7 +26,7 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
     if client is not None and names:
         raise usage_error("--client stands alone: it makes a pair that no list of this machine has", HINT)
     made = []
-    try:
+    with as_usage_error(OSError, ConfigError, hint=HINT):
         if client is not None:
             return _outcome([_made(client, "client", folder, folder)])
         if not (folder / f"{SERVER}{PUBLIC}").exists() or not names:
@@ -34,20 +34,14 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
         for role, listed in clients.items():
             (folder / role).mkdir(mode=0o700, exist_ok=True)
             made += [_made(name, role, folder, folder / role) for name in listed]
-    except OSError as error:
-        raise usage_error(f"{error.filename}: {error.strerror}", HINT) from error
-    except ConfigError as error:
-        raise usage_error(str(error), HINT) from error
     return _outcome(made)
 
 
 def show_keys(path: Path) -> Outcome:
     """The fingerprint of the key in a file, or of every `NAME.key` in a folder."""
-    try:
+    with as_usage_error(ConfigError, hint="give a .key or .key_secret file, or a folder of them"):
         found = load_folder(path) if path.is_dir() else [(path.stem, load_public(path).decode())]
         keys = [{"name": name, "fingerprint": fingerprint(public)} for name, public in found]
-    except ConfigError as error:
-        raise usage_error(str(error), "give a .key or .key_secret file, or a folder of them") from error
     return Outcome({"keys": keys}, "\n".join(f"{key['fingerprint']}  {key['name']}" for key in keys) or "no keys")
 
 

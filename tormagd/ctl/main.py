@@ -9,7 +9,6 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -17,7 +16,7 @@ import msgspec
 from tormagd import __version__
 from tormagd.config import Config, load_config
 from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL, Option
-from tormagd.ctl.outcome import Outcome, exit_code, print_error, print_outcome, usage_error
+from tormagd.ctl.outcome import Outcome, as_usage_error, exit_code, print_error, print_outcome, usage_error
 from tormagd.output import write_line
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.errors import ClientError
@@ -61,7 +60,10 @@ def _run(options: argparse.Namespace) -> Outcome:
     known: dict[str, Any] = {"command": options.command, "config_file": options.config, "wait_s": options.wait}
     with contextlib.ExitStack() as stack:
         if command.has_daemon:
-            known["config"] = _configuration(options.config)
+            with as_usage_error(
+                ConfigError, hint="correct the file; tormagd --check --config FILE shows what is in force"
+            ):
+                known["config"] = load_config(options.config)
             known["endpoints"] = _endpoints(known["config"].endpoints, options)
         else:
             known["parser"] = parser()
@@ -73,15 +75,6 @@ def _run(options: argparse.Namespace) -> Outcome:
         module, _, name = command.function.partition(".")
         function: Callable[..., Outcome] = getattr(import_module(f"tormagd.ctl.{module}"), name)
         return function(**given, **{need: known[need] for need in command.needs})
-
-
-def _configuration(path: Path | None) -> Config:
-    try:
-        return load_config(path)
-    except ConfigError as error:
-        raise usage_error(
-            str(error), "correct the file; tormagd --check --config FILE shows what is in force"
-        ) from error
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:

@@ -2,6 +2,8 @@
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from functools import partialmethod
 from typing import Any, TextIO
@@ -42,6 +44,16 @@ def exit_code(error: ClientError) -> Exit:
 def usage_error(message: str, hint: str) -> CommandError:
     """Something in the arguments, or in a file they name, cannot be used."""
     return CommandError(Exit.USAGE, "usage", message, hint)
+
+
+@contextmanager
+def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
+    """What is raised within, of these kinds, is something that cannot be used: its own words are a usage error's."""
+    try:
+        yield
+    except kinds as error:
+        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+        raise usage_error(said, hint) from error
 
 
 class Outcome(msgspec.Struct, frozen=True):

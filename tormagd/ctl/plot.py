@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
 from tormagd.recording.plot import save_plot
 from tormagd.recording.reader import RecordingError, read_recording
 from tormagd.recording.series import bands, tracking_rms_N
@@ -10,10 +10,8 @@ from tormagd.recording.series import bands, tracking_rms_N
 
 def plot(source: Path, target: Path) -> Outcome:
     """Draw `source` into `target`. Raises CommandError (USAGE) where one cannot be read or the other not written."""
-    try:
+    with as_usage_error(RecordingError, hint="give a file that tormagctl record has made"):
         recording = read_recording(source)
-    except RecordingError as error:
-        raise usage_error(str(error), "give a file that tormagctl record has made") from error
     try:
         save_plot(recording, target, source.stem)
     except ValueError as error:

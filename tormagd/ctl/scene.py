@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from tormagd.config import Config
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.process import answer_of
 from tormagd.scenes.measured import Measured, MeasuredScene, is_met, measured, on_first, required
 from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
@@ -207,10 +207,8 @@ def _known(scene: Scene) -> tuple[Measured, MeasuredScene] | None:
 
 
 def _loaded(name: str) -> Scene:
-    try:
+    with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
         return load_scene(name)
-    except ConfigError as error:
-        raise usage_error(str(error), "tormagctl scene list shows the shipped ones") from error
 
 
 def _derived(name: str, config: Path | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from tormagd.config import LEAST_INFERENCE_HZ
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene import as_toml, check_scene
 from tormagd.scenes.scene import LEAST_CONTROL_HZ, Scene
 from tormagd.scenes.signal import recorded
@@ -82,15 +82,12 @@ def _write(out: Path, tables: Tables, insert: str) -> None:
 
 
 def _has_reserve(tables: Tables, checked: Outcome) -> bool:
-    most_N: float = checked.result["most_N"]
-    return bool(tables["force"]["most_N"] <= RESERVED * most_N)
+    return bool(tables["force"]["most_N"] <= RESERVED * checked.result["most_N"])
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
-    try:
+    with as_usage_error(ConfigError, hint="a CSV with the columns t_s,force_N"):
         time_s, force_N = recorded(force_file)
-    except ConfigError as error:
-        raise usage_error(str(error), "a CSV with the columns t_s,force_N") from error
     least_N, most_N = _rounded(float(force_N.min()), math.floor), _rounded(float(force_N.max()), math.ceil)
     if not least_N < most_N:
         raise usage_error(
@@ -112,11 +109,12 @@ def _from_answers(name: str) -> Tables:
     most_N = _number("greatest force, N", 2.0)
     tolerance_N = _number("RMS error of the force that is tolerated, N", TOLERATED * (most_N - least_N))
     resolution_N = _number("smallest difference of force that matters, N", 2.0 * tolerance_N)
-    bandwidth_hz = _number("how fast a force rises: it takes half a period of, Hz", 0.2)
-    hold_s = _number("and is held then, s", 0.0)
+    signal = {
+        "bandwidth_hz": _number("how fast a force rises: it takes half a period of, Hz", 0.2),
+        "hold_s": _number("and is held then, s", 0.0),
+    }
     slowest_mm_s = _number("slowest handle, mm/s at the roller", 42.0)
     fastest_mm_s = _number("fastest handle, mm/s", slowest_mm_s)
-    signal = {"bandwidth_hz": bandwidth_hz, "hold_s": hold_s}
     return _tables(name, said, least_N, most_N, resolution_N, tolerance_N, signal, (slowest_mm_s, fastest_mm_s))
 
 

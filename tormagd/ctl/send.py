@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from tormagd.ctl.interrupt import interrupted_by
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.watch import Watch, require_range
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.force_file import ForceFileError
@@ -41,15 +41,17 @@ def send(
     `wait_s`, or where it leaves on the way; FAULT as soon as the device is in FAULT; REFUSED where the scene does not
     allow such forces (nothing is sent), or the setpoints were not rendered.
     """
-    try:
+    with as_usage_error(
+        WaveformError,
+        ForceFileError,
+        hint="correct it and send again; tormagctl send --help shows the choices",
+    ):
         if what.lower().endswith(".csv"):
             waveform = read_csv(Path(what))
             lasts_s = min(waveform.duration_s, duration_s or math.inf)
         else:
             lasts_s = duration_s or 10.0
             waveform = shape(what, from_N, to_N, frequency_hz, lasts_s)
-    except (WaveformError, ForceFileError) as error:
-        raise usage_error(str(error), "correct it and send again; tormagctl send --help shows the choices") from error
     if valid_for_ms < 1e3 / rate_hz:
         raise usage_error(
             f"--valid-for-ms = {valid_for_ms:g}: allowed is at least one period, {1e3 / rate_hz:g} ms",

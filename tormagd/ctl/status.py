@@ -42,8 +42,11 @@ def status_text(known: Status, colour: Colour) -> str:
     state = known.operating_state
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
     is_running = known.link.state == "RUNNING"
-    flags = ["homed" if known.is_homed else colour.yellow("not homed"), *(["busy"] if known.is_busy else [])]
-    flags += ["open"] if known.is_open else []
+    flags = [
+        "homed" if known.is_homed else colour.yellow("not homed"),
+        *(["busy"] if known.is_busy else []),
+        *(["open"] if known.is_open else []),
+    ]
     lines = [
         f"state     {paint(state)}, {', '.join(flags)}",
         *_codes(known.faults, known.fault_details, "fault", colour.red),
@@ -91,14 +94,14 @@ def _device(known: Status, colour: Colour) -> list[str]:
     used."""
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
-    lines = [
+    # without a folder nothing was to be kept
+    refusal = kept.refusal if kept.folder else ""
+    return [
         f"device    {shown.scale:.2f} ± {shown.scale_sd:.2f} times the model {shown.offset_N:+.3f} N, sensor's zero "
-        f"{shown.sensor_zero_N:+.3f} ± {shown.sensor_zero_sd_N:.3f} N{age}"
+        f"{shown.sensor_zero_N:+.3f} ± {shown.sensor_zero_sd_N:.3f} N{age}",
+        *_said("believed  ", believed(known.belief, ("scale", "offset", "sensor_zero")), str),
+        *_explained(refusal, refusal and "tormagctl calibrate --device, which keeps a new profile", colour.yellow),
     ]
-    lines += _said("believed  ", believed(known.belief, ("scale", "offset", "sensor_zero")), str)
-    if kept.folder and kept.refusal:  # without a folder nothing was to be kept
-        lines += _explained(kept.refusal, "tormagctl calibrate --device, which keeps a new profile", colour.yellow)
-    return lines
 
 
 def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
@@ -220,15 +223,15 @@ def firmware(client: Client) -> Outcome:
 def firmware_text(link: LinkReport, colour: Colour) -> str:
     """The report in half a dozen lines; what is not known shows as `-`."""
     paint = colour.green if link.state == "RUNNING" else colour.yellow
-    lines = [f"link        {paint(link.state)} on {link.port} ({link.backend})"]
-    lines += [f"            {colour.yellow(link.cause)}"] if link.cause else []
-    lines += [f"            next: {link.remedy}"] if link.remedy else []
     last = f", the last: {link.last_loss}" if link.last_loss else ""
     ours, theirs = link.daemon_schema, link.firmware_schema
     fits = (
         UNKNOWN if theirs is None else "the daemon's too" if theirs == ours else colour.red(f"the daemon's is {ours}")
     )
-    lines += [
+    lines = [
+        f"link        {paint(link.state)} on {link.port} ({link.backend})",
+        *_said(" " * 12, link.cause, colour.yellow),
+        *_said(" " * 12, link.remedy and f"next: {link.remedy}", str),
         f"firmware    {_shown(link.firmware)}, device {_shown(link.serial_number)}",
         f"schema      {_shown(theirs)} ({fits}), protocol {link.protocol_version}",
         f"losses      {link.losses} since the daemon started{last}",

@@ -125,11 +125,11 @@ def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
     return table
 
 
-def _grid(*widths: int) -> Table:
-    """Columns of these widths; what is longer is cut."""
+def _grid(*widths: int, is_cut: bool = True) -> Table:
+    """Columns of these widths; what is longer is cut, or goes on in the next line."""
     table = Table.grid(padding=(0, 1, 0, 0))
     for width in widths:
-        table.add_column(width=width, no_wrap=True, overflow="ellipsis")
+        table.add_column(width=width, no_wrap=is_cut, overflow="ellipsis")
     return table
 
 
@@ -162,9 +162,7 @@ def _codes(seen: Seen, width: int) -> Table:
     """Faults first, then what has held the force back lately, the longest first, each with cause and remedy."""
     newest = seen.telemetry[-1] if seen.telemetry else seen.status
     times = Counter(code for each in seen.telemetry for code in each.limits)
-    table = Table.grid(padding=(0, 1, 0, 0))
-    table.add_column(width=LABEL)
-    table.add_column(width=width - LABEL - 1)
+    table = _grid(LABEL, width - LABEL - 1, is_cut=False)
     for code in newest.faults:
         table.add_row(Text("FAULT", "bold red"), _code(code, "", "bold red", seen.explained))
     for code, count in times.most_common():
