@@ -20,6 +20,18 @@ BLACK, BLUE, ORANGE, SKY, GREEN, PINK = "#222222", "#0072b2", "#e69f00", "#56b4e
 RED, GREY = "#d32f2f", "#9e9e9e"
 STATE_COLOURS = {"DISABLED": "#d0d0d0", "ENABLED": GREEN, "PAUSED": SKY, "FAULT": RED}
 LIMIT_COLOURS = (ORANGE, PINK, BLUE, "#8d6e63", "#7e57c2", "#f0c419")
+LINES = {
+    # measured lies under what was wanted: it is the noisy one, and the eye compares the two edges
+    "force": (
+        ("measured_cf", "measured", ORANGE, "-", 1.3),
+        ("governed_cf", "governed (what the device can do)", BLUE, "-", 1.5),
+        ("setpoint_cf", "asked", BLACK, "--", 1.3),
+    ),
+    # both carriages do nearly the same, as do wish and measurement: the upper line is thin, so that the lower one shows
+    "gap": (("gap_mm", "measured", SKY, "-", 2.6), ("gap_setpoint_mm", "wanted", BLACK, "-", 0.7)),
+    "duty": (("left_duty", "left", SKY, "-", 2.6), ("right_duty", "right", BLACK, "-", 0.7)),
+}
+"Of each panel, the lowest first: quantity, name, colour, style and width."
 
 
 def figure(recording: Recording, title: str) -> Figure:
@@ -35,14 +47,13 @@ def figure(recording: Recording, title: str) -> Figure:
     heights = (4.2, 2.2, 1.6, 0.3 + 0.3 * lanes)
     force, gap, duty, lane = fig.subplots(4, 1, sharex=True, height_ratios=heights)
 
-    _force_panel(force, recording)
-    # both carriages do nearly the same, as do wish and measurement: the upper line is thin, so that the lower one shows
-    for axes, quantity, label, lower, upper in (
-        (gap, "gap", "gap (mm)", ("gap_mm", "measured", SKY), ("gap_setpoint_mm", "wanted", BLACK)),
-        (duty, "duty", "drive duty", ("left_duty", "left", SKY), ("right_duty", "right", BLACK)),
+    for axes, quantity, label in (
+        (force, "force", "force (N)"),
+        (gap, "gap", "gap (mm)"),
+        (duty, "duty", "drive duty"),
     ):
-        for (name, text, colour), width in ((lower, 2.6), (upper, 0.7)):
-            _line(axes, series(recording, name), text, colour, "-", width)
+        for name, text, colour, style, width in LINES[quantity]:
+            _line(axes, series(recording, name), text, colour, style, width)
         _dress(axes, label, quantity)
     duty.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
     duty.set_ylim(-1.08, 1.08)
@@ -81,15 +92,7 @@ def _headline(recording: Recording, title: str, faults: Iterable[Band]) -> str:
     return "  ·  ".join(parts)
 
 
-def _force_panel(axes: Axes, recording: Recording) -> None:
-    # measured lies under what was wanted: it is the noisy one, and the eye compares the two edges
-    _line(axes, series(recording, "measured_cf"), "measured", ORANGE, "-", 1.3)
-    _line(axes, series(recording, "governed_cf"), "governed (what the device can do)", BLUE, "-", 1.5)
-    _line(axes, series(recording, "setpoint_cf"), "asked", BLACK, "--", 1.3)
-    _dress(axes, "force (N)", "force")
-
-
-def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float = 1.2) -> None:
+def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:
     if data is None:
         return
     cuts = np.flatnonzero(np.diff(data.t_s) > BREAK_S) + 1
