@@ -71,10 +71,6 @@ def _fields(thing: object) -> tuple[str, ...]:
     )
 
 
-def _changes(thing: object) -> bool:
-    return not isinstance(thing, Value) and bool(_fields(thing))
-
-
 def restored(data: Any, known: Kinds) -> Any:
     """What `data` stand for. Raises InexactError."""
     if type(data) in _AS_THEY_ARE:
@@ -112,7 +108,7 @@ def restore(thing: Any, data: Any, known: Kinds) -> None:
     for field, told in fields.items():
         own = getattr(thing, field)
         try:
-            if _changes(own):
+            if _fields(own) and not isinstance(own, Value):
                 restore(own, told, known)
             elif isinstance(own, deque):
                 own.clear()

@@ -30,6 +30,8 @@ _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place that one of msgspec's ends with."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
+_NOTHING = object()
+"No value of a table: TOML's and JSON's may be None."
 
 
 class TomlError(ValueError):
@@ -149,12 +151,15 @@ def _value_at(tables: dict[str, Any], message: str) -> str:
     """
     if "`$." not in message:
         return ""
-    value: Any = tables
-    for key in message.rsplit("`$.", 1)[1].rstrip("`").split("[")[0].split("."):
-        if not isinstance(value, dict) or key not in value:
-            return ""
-        value = value[key]
-    return "" if isinstance(value, dict) else f" (it is {in_short(value)})"
+    value = _at(tables, message.rsplit("`$.", 1)[1].rstrip("`").split("[")[0].split("."))
+    return "" if value is _NOTHING or isinstance(value, dict) else f" (it is {in_short(value)})"
+
+
+def _at(table: Any, key: Sequence[str]) -> Any:
+    """What `key`, a path through tables, leads to; _NOTHING where it leads nowhere."""
+    for name in key:
+        table = table.get(name, _NOTHING) if isinstance(table, dict) else _NOTHING
+    return table
 
 
 def line_of(text: str, key: Sequence[str]) -> int | None:
@@ -173,14 +178,9 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
 
     for end in range(number, min(number + MOST_LINES, len(lines)) + 1):  # a value may go on in the lines below
         try:
-            table: Any = tomllib.loads("\n".join(lines[:end]))
+            return _at(tomllib.loads("\n".join(lines[:end])), key) is not _NOTHING
         except ValueError:
             continue
-        for name in key:
-            if not isinstance(table, dict) or name not in table:
-                return False
-            table = table[name]
-        return True
     return False
 
 

@@ -322,10 +322,9 @@ def _checksum(header: dict[str, str], tensors: dict[str, Array]) -> str:
     return digest.hexdigest()
 
 
-def _json_header(data: bytes) -> dict[str, dict[str, str]]:
+def _json_header(data: bytes) -> dict[str, dict[str, Any]]:
     (length,) = struct.unpack_from("<Q", data)
-    decoded: dict[str, dict[str, str]] = msgspec.json.decode(data[8 : 8 + length])
-    return decoded
+    return msgspec.json.decode(data[8 : 8 + length], type=dict[str, dict[str, Any]])
 
 
 def _canonical(data: bytes) -> bytes:

@@ -6,6 +6,7 @@ import msgspec
 import zmq
 
 from tormagd_client.messages import VERSION, MessageError
+from tormagd_client.printable import require
 from tormagd_client.wire import Keys, connect
 
 TIME_COLUMN = "t_ns"
@@ -26,8 +27,7 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
     rows: tuple[tuple[Value, ...], ...]
 
     def __post_init__(self) -> None:
-        if self.v != VERSION:
-            raise ValueError(f"v = {self.v!r}: allowed is {VERSION}")
+        require(self.v == VERSION, "v", self.v, f"{VERSION}")
         if not 0 < len(self.columns) <= MAX_COLUMNS or self.columns[0] != TIME_COLUMN:
             raise ValueError(
                 f"columns = {list(self.columns)[:4]!r}...: allowed are 1..{MAX_COLUMNS} names, {TIME_COLUMN} first"

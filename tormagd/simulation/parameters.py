@@ -60,8 +60,12 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
     times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
 
     def __post_init__(self) -> None:
-        is_paired = len(self.fractions) == len(self.times_s)
-        require(is_paired, "fractions", self.fractions, f"one for each of {self.times_s}")
+        require(
+            len(self.fractions) == len(self.times_s),
+            "fractions",
+            self.fractions,
+            f"one for each of {self.times_s}",
+        )
         require(sum(self.fractions) < 1.0, "fractions", self.fractions, "a sum under 1")
 
 
@@ -114,8 +118,7 @@ class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
             shares, paired = getattr(self, one), getattr(self, other)
             require(len(shares) == len(paired), one, shares, f"one for each of {paired}")
         require(sum(self.play_shares) < 1.0, "play_shares", self.play_shares, "a sum under 1")
-        is_whole = abs(sum(self.spring_shares) - 1.0) < 1e-9
-        require(is_whole, "spring_shares", self.spring_shares, "a sum of 1")
+        require(abs(sum(self.spring_shares) - 1.0) < 1e-9, "spring_shares", self.spring_shares, "a sum of 1")
 
 
 class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
@@ -267,8 +270,12 @@ class _Between(Struct, frozen=True, forbid_unknown_fields=True):
     second: SecondParameters | None = None
 
     def __post_init__(self) -> None:
-        is_one = (self.pad is None) != (self.second is None)
-        require(is_one, "carriages", self.carriages, "a plant with one of [pad] and [second] between its magnets")
+        require(
+            (self.pad is None) != (self.second is None),
+            "carriages",
+            self.carriages,
+            "a plant with one of [pad] and [second] between its magnets",
+        )
 
 
 def _kind(tables: dict[str, Any]) -> type[PlantParameters | _Between]:
