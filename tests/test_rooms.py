@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "exact": set(),
     "keeping": set(),
     "slices": set(),
+    "interrupt": set(),
     "keys": FILES | {"config"},
     "entry": set(),  # it loads the daemon or tormagctl by name, never both
     "physics": FILES,
@@ -42,8 +43,9 @@ MAY_IMPORT = {
     "recording": FILES | {"messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "messages", "output", "recording", "safety"},
-    "ctl": FILES | {"dashboard", "force_file", "client", "config", "messages", "output", "keys", "scenes", "recording"},
-    "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices"},
+    "ctl": FILES
+    | {"dashboard", "force_file", "client", "config", "messages", "output", "interrupt", "keys", "scenes", "recording"},
+    "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices", "interrupt"},
     "headroom": {"config", "output", "daemon", "control", "assembly", "simulation", "closed_loop"},
     "replay": LOWEST
     | {

@@ -21,9 +21,9 @@ from tormagd.config import Config
 from tormagd.ctl.calibrate_device import calibrate_device
 from tormagd.ctl.calibrate_motors import calibrate_motors
 from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, Run, armed, interrupted_run, reach, seconds_bar
-from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, through
+from tormagd.interrupt import interrupted_by
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints

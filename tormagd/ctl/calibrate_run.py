@@ -13,10 +13,10 @@ import numpy.typing as npt
 import zmq
 from tqdm import tqdm
 
-from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
+from tormagd.interrupt import interrupted_by
 from tormagd.recording.ticks import Value, decode_ticks, listening
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints

@@ -15,8 +15,8 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.interrupt import interrupted_by
 from tormagd.output import write_line
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints

@@ -11,8 +11,8 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.interrupt import interrupted_by
 from tormagd.output import write_line
 from tormagd.recording.ticks import decode_ticks, listening
 from tormagd.recording.writer import RecordingWriter

@@ -32,7 +32,7 @@ LINK_COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronis
 def status(client: Client) -> Outcome:
     """What the daemon is doing. The exit code is FAULT while the device is in FAULT."""
     result = client.request("status")
-    known = understood(result)
+    known = understood(result, Status)
     code = Exit.FAULT if known.operating_state == "FAULT" else Exit.DONE
     return Outcome(result, status_text(known, Colour(sys.stdout)), code)
 
@@ -216,7 +216,7 @@ def _late_ticks(blamed: Mapping[str, int]) -> list[str]:
 def firmware(client: Client) -> Outcome:
     """The daemon's report on its link: the keys of `--json` are those of `link` in the status."""
     result = client.request("status")
-    known = understood(result).link
+    known = understood(result, Status).link
     return Outcome(result["link"], firmware_text(known, Colour(sys.stdout)))
 
 

@@ -8,17 +8,16 @@ import termios
 import time
 import tty
 from collections import deque
-from collections.abc import Iterator
 
 from rich.console import Console
 from rich.live import Live
 
-from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import Outcome, is_terminal, usage_error
 from tormagd.ctl.top_screen import Seen, screen
+from tormagd.interrupt import interrupted_by
 from tormagd_client.blocking import Client
 from tormagd_client.errors import not_understood
-from tormagd_client.messages import Explained, MessageError, Telemetry
+from tormagd_client.messages import Explained, MessageError, Status, Telemetry
 from tormagd_client.wire import Pending, understood
 
 REDRAW_S = 0.2
@@ -37,9 +36,11 @@ def top(client: Client) -> Outcome:
     start_s = time.monotonic()
     with (
         interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted,
-        _single_keys(),
+        contextlib.ExitStack() as terminal,
         Live(console=console, screen=True, auto_refresh=False) as live,
     ):
+        terminal.callback(termios.tcsetattr, sys.stdin, termios.TCSADRAIN, termios.tcgetattr(sys.stdin))
+        tty.setcbreak(sys.stdin)  # keys are read as they are struck, and not shown
         while not is_interrupted():
             live.update(screen(watcher.look(), *console.size), refresh=True)
             if select.select([sys.stdin], [], [], REDRAW_S)[0] and sys.stdin.read(1) in ("q", ""):
@@ -70,27 +71,15 @@ class Watcher:
             self._heard_s = now_s
             self._telemetry += arrived
             self._ask(now_s, {*arrived[-1].faults, *arrived[-1].limits})
-        for each in (*self._status.limit_details, *self._status.fault_details):
-            self._explained[each.code] = each
+        self._explained |= {each.code: each for each in (*self._status.limit_details, *self._status.fault_details)}
         return Seen(self._telemetry, self._status, self._explained, now_s - self._heard_s)
 
     def _ask(self, now_s: float, codes: set[str]) -> None:
         """Asks for the status now and then, and takes the answer; only of a daemon that is heard."""
         result = None if self._asked is None else self._client.answer(self._asked)
         if result is not None:
-            self._status = understood(result)
+            self._status = understood(result, Status)
             self._asked = None
         if now_s >= self._ask_s or (self._asked is None and not codes <= self._explained.keys()):
             self._asked = self._client.ask("status")
             self._ask_s = now_s + ASK_S
-
-
-@contextlib.contextmanager
-def _single_keys() -> Iterator[None]:
-    """Keys are read as they are struck, and not shown."""
-    before = termios.tcgetattr(sys.stdin)
-    tty.setcbreak(sys.stdin)
-    try:
-        yield
-    finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

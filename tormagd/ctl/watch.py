@@ -122,7 +122,7 @@ class Watch:
         if result is None:
             return
         self._asked, self._look_s = None, now_s + LOOK_S
-        status = understood(result)
+        status = understood(result, Status)
         held = held_back(status, self._source)
         self._limits |= dict.fromkeys(status.limits)
         self._looks += 1

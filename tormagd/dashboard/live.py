@@ -115,8 +115,7 @@ class Live:
             events.put_nowait(data)
 
     def _learn(self, status: Status) -> None:
-        for each in (*status.fault_details, *status.limit_details):
-            self._explained[each.code] = each
+        self._explained |= {each.code: each for each in (*status.fault_details, *status.limit_details)}
 
     def _shown_status(self) -> dict[str, object]:
         return {"status": self._status, "explained": self._explained}

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_protocol.c.build import BuildError
+from tormagd.interrupt import interrupted_by
 from tormagd.output import write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
@@ -40,15 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = parser()
     options = command.parse_args(arguments)
     ask_for_slices()  # a real device has a processor of its own
-    stopping = False
-
-    def stop(_signal: int, _frame: object) -> None:
-        nonlocal stopping
-        stopping = True
-
     with contextlib.ExitStack() as resources:
-        for number in (signal.SIGTERM, signal.SIGINT):  # before anything is opened: all of it is closed again
-            resources.callback(signal.signal, number, signal.signal(number, stop))
+        # before anything is opened: all of it is closed again
+        is_stopped = resources.enter_context(interrupted_by(signal.SIGTERM, signal.SIGINT))
         try:
             device, door = _opened(options, resources)
             truth = options.truth and resources.enter_context(options.truth.open("w", encoding="utf-8"))
@@ -57,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if write_line(door.address, sys.stdout) is not None:
             print(f"{command.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
             return 1
-        punctuality = serve(device, door, lambda: stopping, truth)
+        punctuality = serve(device, door, is_stopped, truth)
     if punctuality.late:
         print(
             f"fell behind real time {punctuality.late} times, by {punctuality.worst_s * 1e3:.1f} ms at worst; "

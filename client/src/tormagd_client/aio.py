@@ -19,7 +19,6 @@ from tormagd_client.wire import (
     Connections,
     answered,
     asked,
-    described,
     understood,
 )
 
@@ -42,11 +41,11 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
 
     async def status(self, wait_s: float = math.inf) -> Status:
         """What the daemon is doing."""
-        return understood(await self._result("status", {}, min(wait_s, self._wait_s)))
+        return understood(await self._result("status", {}, min(wait_s, self._wait_s)), Status)
 
     async def describe(self) -> Description:
         """What the daemon runs."""
-        return described(await self.request("describe"))
+        return understood(await self.request("describe"), Description)
 
     async def arm(self, timeout_s: float = 30.0) -> None:
         """Home both carriages and enable: whoever holds the handle has to know."""

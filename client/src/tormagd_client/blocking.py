@@ -17,7 +17,6 @@ from tormagd_client.wire import (
     Pending,
     answered,
     asked,
-    described,
     understood,
 )
 
@@ -59,11 +58,11 @@ class Client(Connections["zmq.Socket[bytes]"]):
     def status(self, wait_s: float = math.inf) -> Status:
         """What the daemon is doing; an answer is waited for no longer than `wait_s` or what the client waits for any.
         Raises as `request` and `understood` do."""
-        return understood(self._result(self.ask("status"), min(wait_s, self._wait_s)))
+        return understood(self._result(self.ask("status"), min(wait_s, self._wait_s)), Status)
 
     def describe(self) -> Description:
-        """What the daemon runs. Raises as `request` and `described` do."""
-        return described(self.request("describe"))
+        """What the daemon runs. Raises as `status`."""
+        return understood(self.request("describe"), Description)
 
     def arm(self, timeout_s: float = 30.0) -> None:
         """Home both carriages and enable: whoever holds the handle has to know. Raises as `request`."""

@@ -134,21 +134,12 @@ def answered(data: bytes, pending: Pending) -> dict[str, Any] | None:
     return reply.result or {}
 
 
-def understood(result: dict[str, Any]) -> Status:
-    """The answer to `status`; what a newer daemon says besides is passed over.
+def understood(result: dict[str, Any], kind: type[T]) -> T:
+    """The answer to `status` or to `describe`; what a newer daemon says besides is passed over.
 
     Its texts are made printable: they are a person's to read. Raises UnreachableError, naming the daemon's version,
     where something is missing or of another type.
     """
-    return _known(result, Status)
-
-
-def described(result: dict[str, Any]) -> Description:
-    """The answer to `describe`, as `understood` has the one to `status`."""
-    return _known(result, Description)
-
-
-def _known(result: dict[str, Any], kind: type[T]) -> T:
     try:
         return msgspec.convert(_printable(result), kind)
     except (msgspec.ValidationError, RecursionError) as error:

@@ -1,8 +1,8 @@
-"""Ending a long command by a signal, between two of its steps."""
+"""Ending a long run by a signal, between two of its steps."""
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 
 
@@ -17,9 +17,7 @@ def interrupted_by(*signals: signal.Signals) -> Iterator[Callable[[], bool]]:
     def note(number: int, frame: FrameType | None) -> None:
         arrived.append(number)
 
-    before = {number: signal.signal(number, note) for number in signals}
-    try:
+    with ExitStack() as handlers:
+        for number in signals:
+            handlers.callback(signal.signal, number, signal.signal(number, note))
         yield lambda: bool(arrived)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
