@@ -150,14 +150,6 @@ def _text(result: dict[str, Any]) -> str:
     )
 
 
-def require_new(path: Path, option: str) -> None:
-    """Raise CommandError (USAGE) where `path` exists or cannot be made: before anything moves."""
-    if path.exists():
-        raise usage_error(f"{option} {path} exists", "give another name; nothing is overwritten")
-    if not path.parent.is_dir():
-        raise usage_error(f"{option} {path}: {path.parent} is not a directory", "give a file in one you may write to")
-
-
 def calibrate(
     config: Config,
     endpoints: Endpoints,
@@ -182,9 +174,14 @@ def calibrate(
             "--out is the file of a model or of a log",
             "leave it out: the daemon keeps the profile" if device else "give one",
         )
-    for name, path in (("--out", out), ("--csv", csv)):
-        if path is not None:
-            require_new(path, name)
+    # before anything moves
+    for option, path in (("--out", out), ("--csv", csv)):
+        if path is not None and path.exists():
+            raise usage_error(f"{option} {path} exists", "give another name; nothing is overwritten")
+        if path is not None and not path.parent.is_dir():
+            raise usage_error(
+                f"{option} {path}: {path.parent} is not a directory", "give a file in one you may write to"
+            )
     with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
         scene = load_scene(config.scene)
     if not is_agreed:

@@ -12,11 +12,8 @@ KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 "Environment variables that stand for `--key` and `--server-key`."
 
 
-class Option(NamedTuple):
-    """An argument: what `argparse.ArgumentParser.add_argument` takes."""
-
-    names: tuple[str, ...]
-    settings: dict[str, Any]
+Option = tuple[tuple[str, ...], dict[str, Any]]
+"An argument: what `argparse.ArgumentParser.add_argument` takes, by place and by name."
 
 
 class Command(NamedTuple):
@@ -33,7 +30,7 @@ class Command(NamedTuple):
 
 def option(*names: str, **settings: Any) -> Option:
     """An argument of a command."""
-    return Option(names, settings)
+    return names, settings
 
 
 def number(text: str) -> float:

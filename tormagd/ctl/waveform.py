@@ -36,21 +36,21 @@ class Waveform(NamedTuple):
 def through(points: Sequence[tuple[float, float]]) -> Waveform:
     """Straight lines through these times, from 0 on and rising, and forces."""
     times_s, forces_N = zip(*points, strict=True)
-    return _lines(times_s, [forces_N])
+    return _lines(times_s, forces_N)
 
 
-def _lines(times_s: Sequence[float], columns: Sequence[Sequence[float] | None]) -> Waveform:
-    """Straight lines between samples, whose columns are in the order of Sample's fields, None where there is none."""
-    forces_N = columns[0]
-    assert forces_N is not None  # every waveform is of forces
+def _lines(times_s: Sequence[float], forces_N: Sequence[float], *others: Sequence[float] | None) -> Waveform:
+    """Straight lines between samples; `others` are in the order of Sample's other fields, None where there is none."""
 
     def at(t_s: float) -> Sample:
         right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
         share = (t_s - times_s[right - 1]) / (times_s[right] - times_s[right - 1])
         share = min(max(share, 0.0), 1.0)
-        force_N, *others = [None if c is None else c[right - 1] + (c[right] - c[right - 1]) * share for c in columns]
-        assert force_N is not None
-        return Sample(force_N, *others)
+
+        def there(column: Sequence[float]) -> float:
+            return column[right - 1] + (column[right] - column[right - 1]) * share
+
+        return Sample(there(forces_N), *(None if column is None else there(column) for column in others))
 
     return Waveform(times_s[-1], at, min(forces_N), max(forces_N))
 
@@ -102,4 +102,4 @@ def read_csv(path: Path) -> Waveform:
     table = read_forces(path)
     start_s = table["t_s"][0]
     times_s = array("d", (time_s - start_s for time_s in table["t_s"]))
-    return _lines(times_s, [table.get(name) for name in ("force_N", *OPTIONAL_COLUMNS)])
+    return _lines(times_s, table["force_N"], *(table.get(name) for name in OPTIONAL_COLUMNS))

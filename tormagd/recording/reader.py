@@ -202,8 +202,7 @@ def _flat(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, float | tu
         case list() if all(isinstance(item, str) for item in value):
             yield prefix, tuple(value)
         case dict() | list() if depth > 0:
-            members = value.items() if isinstance(value, dict) else enumerate(value)
-            for name, inner in members:
+            for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
                 yield from _flat(f"{prefix}.{name}" if prefix else str(name), inner, depth - 1)
         case _:
             raise ValueError(f"{prefix} = {str(value)[:80]}: allowed are numbers, strings and short lists of them")

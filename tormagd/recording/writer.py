@@ -176,8 +176,7 @@ class RecordingWriter:
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
     """A channel of JSON messages that obey this schema, in the file that `mcap` writes."""
-    data = msgspec.json.encode(schema)
-    schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=data)
+    schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=msgspec.json.encode(schema))
     return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
 
 

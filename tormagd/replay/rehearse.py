@@ -121,8 +121,7 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
     """The script in the closed loop. `faults` are those of the simulated device, as in encoder_jump@12.5, from the
     file's first tick. Raises ReplayError."""
     try:
-        injected = [parse_fault(fault) for fault in faults]
-        delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in injected]
+        delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in map(parse_fault, faults)]
         hand = RecordedHand(tuple(time_s + todo.begins_s for time_s in todo.hand.times_s), todo.hand.positions_mm)
         device = VirtualDevice(load_plant(plant), hand, delayed, SEED)
     except (FaultError, PlantError) as error:

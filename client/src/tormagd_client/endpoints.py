@@ -62,7 +62,9 @@ class Endpoints(Strict, frozen=True):
 
     def is_guarded(self, name: str) -> bool:
         """Whether the daemon lets in only whom it has the key of."""
-        return not _is_local(getattr(self, name)) or (self.curve is not None and self.curve.also_local)
+        matched = _TCP.fullmatch(getattr(self, name))
+        is_local = matched is None or _is_loopback(matched[1])
+        return not is_local or (self.curve is not None and self.curve.also_local)
 
 
 def require_usable(endpoints: Endpoints) -> None:
@@ -126,11 +128,6 @@ def _tcp_place(name: str, address: str, has_keys: bool) -> str:
         else "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys in [endpoints.curve]",
     )
     return f"{'127.0.0.1' if host == 'localhost' else host}:{int(port)}"
-
-
-def _is_local(address: str) -> bool:
-    matched = _TCP.fullmatch(address)
-    return matched is None or _is_loopback(matched[1])
 
 
 def _is_loopback(host: str) -> bool:
