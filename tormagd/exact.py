@@ -13,7 +13,7 @@ a constant.
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from enum import Enum
 from typing import Any
 
@@ -136,15 +136,10 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
 
 
 def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
-    inner: Iterable[tuple[Any, Any]]
-    if isinstance(data, dict):
-        inner = data.items()
-    elif isinstance(data, list | tuple):
-        inner = enumerate(data)
-    else:
+    if not isinstance(data, dict | list | tuple):
         yield path, data
         return
-    for name, each in inner:
+    for name, each in data.items() if isinstance(data, dict) else enumerate(data):
         # a type's name says nothing that its field's does not
         is_kind = isinstance(data, dict) and len(data) == 1 and isinstance(each, dict | list | tuple)
         yield from _leaves(path if is_kind else f"{path}.{name}" if path else str(name), each)

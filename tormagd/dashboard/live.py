@@ -5,7 +5,7 @@ import contextlib
 import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
@@ -29,6 +29,9 @@ WAITING = 50
 class Live:
     """Listens to the daemon of `client`, and tells every browser the same bytes. `run` it beside them."""
 
+    about: ClassVar[dict[str, Any]] = {"kind": "live"}
+    "What the page begins with."
+
     def __init__(self, client: AsyncClient, status: Status, description: Description) -> None:
         self._client, self._status = client, status
         self._kept: deque[Telemetry] = deque(maxlen=KEPT)
@@ -39,11 +42,6 @@ class Live:
         self._why_silent = ""
         self._portrait = {"portrait": description.portrait}
         self._learn(status)
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """What the page begins with."""
-        return {"kind": "live"}
 
     async def run(self) -> None:
         """Never ends by itself; a daemon that goes is waited for."""

@@ -7,7 +7,7 @@ which is the opposite of what table 2.4 measured.
 """
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 from tormagd.physics.errors import Real, require
 
@@ -33,10 +33,8 @@ class ThesisFieldLaw:
     At 95 mm the slope is zero, so the inverse loses half of its digits there.
     """
 
-    @property
-    def gap_range_mm(self) -> tuple[float, float]:
-        """Smallest and largest gap for which the law holds, mm."""
-        return _EQ7_MIN_MM, _EQ7_MAX_MM
+    gap_range_mm: ClassVar[tuple[float, float]] = (_EQ7_MIN_MM, _EQ7_MAX_MM)
+    "Smallest and largest gap for which the law holds, mm."
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
         require("gap_mm", gap_mm, *self.gap_range_mm)
@@ -62,16 +60,13 @@ class PowerFieldLaw:
     Raises `DomainError` unless 1e-6 <= coefficient <= 1e3 and -6 <= exponent <= -0.1.
     """
 
+    gap_range_mm: ClassVar[tuple[float, float]] = (1.0, 1e4)
     coefficient: float = 0.44
     exponent: float = -1.3
 
     def __post_init__(self) -> None:
         require("coefficient", self.coefficient, 1e-6, 1e3)
         require("exponent", self.exponent, -6.0, -0.1)
-
-    @property
-    def gap_range_mm(self) -> tuple[float, float]:
-        return 1.0, 1e4
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
         require("gap_mm", gap_mm, *self.gap_range_mm)
