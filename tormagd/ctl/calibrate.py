@@ -22,7 +22,7 @@ from tormagd.ctl.calibrate_device import calibrate_device
 from tormagd.ctl.calibrate_motors import calibrate_motors
 from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, Run, armed, interrupted_run, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ctl.waveform import Waveform, through
+from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.interrupt import interrupted_by
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
@@ -87,7 +87,7 @@ def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> 
 def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
     """From the least force to the most and back at a steady rate."""
     half_s = (forces.most_N - forces.least_N) / rate_N_s
-    return through([(0.0, forces.least_N), (half_s, forces.most_N), (2.0 * half_s, forces.least_N)])
+    return by_legs(forces.least_N, [(half_s, forces.most_N), (half_s, forces.least_N)])
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:

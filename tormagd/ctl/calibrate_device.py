@@ -13,7 +13,7 @@ import numpy as np
 
 from tormagd.ctl.calibrate_run import MOVING_MM_S, SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
-from tormagd.ctl.waveform import Sample, Waveform, through
+from tormagd.ctl.waveform import Sample, Waveform, by_legs
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import ProfileReport, Status
@@ -39,16 +39,13 @@ DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
 def lesson(forces: Range) -> tuple[Waveform, Waveform]:
     """What is asked so that the device shows itself, and the steps that judge what came of it."""
     low_N = forces.least_N + CLEAR_N
-    ramps: list[tuple[float, float]] = [(0.0, low_N)]
-    for ramp_s in RAMPS_S:
-        for force_N in (forces.most_N, low_N):
-            ramps.append((ramps[-1][0] + ramp_s, force_N))
+    ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (forces.most_N, low_N)]
     levels_N = [low_N + share * (forces.most_N - low_N) for share in STEP_SHARES]
 
     def on_steps(t_s: float) -> Sample:
         return Sample(levels_N[min(int(t_s / STEP_S), len(levels_N) - 1)])
 
-    return through(ramps), Waveform(STEP_S * len(levels_N), on_steps, low_N, forces.most_N)
+    return by_legs(low_N, ramps), Waveform(STEP_S * len(levels_N), on_steps, low_N, forces.most_N)
 
 
 def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:

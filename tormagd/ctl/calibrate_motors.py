@@ -12,7 +12,7 @@ import numpy as np
 
 from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
-from tormagd.ctl.waveform import Waveform, through
+from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 
@@ -48,20 +48,11 @@ LONGEST_HOLE_S = 0.02
 
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
     """The forces to ask for: ramps, then jumps, `rounds` times."""
-    low, high = forces.least_N + CLEAR_N, forces.most_N
-    points = [(0.0, low)]
-
-    def go(force_N: float, duration_s: float) -> None:
-        points.append((points[-1][0] + duration_s, force_N))
-
-    for _ in range(rounds):
-        for ramp_s in RAMPS_S:
-            go(high, ramp_s)
-            go(low, ramp_s)
-        for share in JUMP_SHARES:
-            go(low + share * (high - low), 1e-3)
-            go(points[-1][1], JUMP_S)
-    return through(points)
+    low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
+    ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]
+    # each there in a millisecond, and held
+    jumps = [(lasts_s, low_N + share * (high_N - low_N)) for share in JUMP_SHARES for lasts_s in (1e-3, JUMP_S)]
+    return by_legs(low_N, rounds * (ramps + jumps))
 
 
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:

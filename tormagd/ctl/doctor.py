@@ -376,10 +376,12 @@ def _table(table: tuple[Rate, ...]) -> str:
     lines = [
         f"\nrates (at most {MOST_USED:.0%} used is held with margin; * is configured):",
         "  loop          Hz    used  held  to hold it",
+        *(
+            f"{'*' if row.configured else ' '} {row.loop:<10}{row.hz:>6}{row.used:>8.0%}  "
+            f"{'yes' if row.holds else 'no':<4}  {row.change}".rstrip()
+            for row in table
+        ),
     ]
-    for row in table:
-        mark, held = "*" if row.configured else " ", "yes" if row.holds else "no"
-        lines.append(f"{mark} {row.loop:<10}{row.hz:>6}{row.used:>8.0%}  {held:<4}  {row.change}".rstrip())
     return "\n".join(lines)
 
 

@@ -45,11 +45,8 @@ class Machine:
 
     def limit(self, name: str) -> float:
         """The soft limit `name` of this process, infinity for unlimited; 0 where it is not listed."""
-        for line in (self.text("/proc/self/limits") or "").splitlines():
-            if line.startswith(name):
-                value = line[len(name) :].split()[0]
-                return float("inf") if value == "unlimited" else float(value)
-        return 0.0
+        found = re.search(rf"^{name}\s+(\S+)", self.text("/proc/self/limits") or "", re.MULTILINE)
+        return 0.0 if found is None else float(found[1].replace("unlimited", "inf"))
 
     def has_capability(self, bit: int) -> bool:
         """Whether this process holds an effective capability, by its number in capabilities(7)."""
@@ -58,9 +55,8 @@ class Machine:
 
     def cores(self) -> int:
         """The number of processors online; 1 where the kernel does not say."""
-        ranges = (self.text("/sys/devices/system/cpu/online") or "0").split(",")
-        bounds = [re.findall(r"\d+", part) for part in ranges]
-        return sum(int(b[-1]) - int(b[0]) + 1 for b in bounds if b) or 1
+        ranges = re.findall(r"(\d+)(?:-(\d+))?", self.text("/sys/devices/system/cpu/online") or "0")
+        return sum(int(last or first) - int(first) + 1 for first, last in ranges) or 1
 
     def taken(self) -> Taken:
         """The counters now (proc_stat(5), Documentation/accounting/psi); zeros where there is no such file."""

@@ -4,6 +4,7 @@ import math
 from array import array
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,10 +34,10 @@ class Waveform(NamedTuple):
     most_N: float
 
 
-def through(points: Sequence[tuple[float, float]]) -> Waveform:
-    """Straight lines through these times, from 0 on and rising, and forces."""
-    times_s, forces_N = zip(*points, strict=True)
-    return _lines(times_s, forces_N)
+def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
+    """Straight lines from a force on: each leg lasts so long, s, and ends at such a force, N."""
+    times_s = [0.0, *accumulate(lasts_s for lasts_s, _ in legs)]
+    return _lines(times_s, [start_N, *(force_N for _, force_N in legs)])
 
 
 def _lines(times_s: Sequence[float], forces_N: Sequence[float], *others: Sequence[float] | None) -> Waveform:

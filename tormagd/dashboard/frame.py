@@ -1,6 +1,7 @@
 """What the page shows of one moment, live or recorded: the seconds before it, and what holds the force back."""
 
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
@@ -43,7 +44,5 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
 def late_counts(lateness_us: Iterable[float]) -> list[int]:
     """How many of these are in each bar of the histogram."""
-    counts = [0] * (len(LATE_US) + 1)
-    for late_us in lateness_us:
-        counts[bisect_right(LATE_US, late_us)] += 1
-    return counts
+    counts = Counter(bisect_right(LATE_US, late_us) for late_us in lateness_us)
+    return [counts[bar] for bar in range(len(LATE_US) + 1)]

@@ -45,8 +45,7 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def require_number(name: str, value: float) -> None:
     """Raise `DomainError` when `value` is NaN, infinite or beyond `LARGEST`."""
-    if not -LARGEST <= value <= LARGEST:
-        raise DomainError(name, value, f"a finite number within +-{LARGEST:g}")
+    require_that(-LARGEST <= value <= LARGEST, name, value, f"a finite number within +-{LARGEST:g}")
 
 
 def require_features(features: NDArray[np.float64]) -> None:

@@ -61,8 +61,7 @@ def load_public(path: Path) -> bytes:
 
 def fingerprint(public: bytes | str) -> str:
     """What people compare when a key has changed hands: 16 hexadecimal digits of SHA-256 over the key."""
-    digest = hashlib.sha256(z85.decode(public)).hexdigest()[:16]
-    return ":".join(digest[start : start + 4] for start in range(0, len(digest), 4))
+    return hashlib.sha256(z85.decode(public)).digest()[:8].hex(":", 2)
 
 
 def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
