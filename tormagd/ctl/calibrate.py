@@ -68,10 +68,12 @@ def calibrate_insert(
     with tempfile.TemporaryDirectory(prefix="tormag") as folder:
         table = Path(folder) / "sweep.csv"
         write_sweeps(table, sweeps)
-        arguments = [str(table), "--insert", insert, "--out", str(out)]
-        arguments += ["--inner-radius-mm", str(scene.insert.inner_radius_mm)]
-        arguments += [] if training_csv is None else ["--csv", str(training_csv)]
-        result = _ask_fitter(*arguments)
+        result = _ask_fitter(
+            str(table),
+            *("--insert", insert, "--out", str(out)),
+            *("--inner-radius-mm", str(scene.insert.inner_radius_mm)),
+            *([] if training_csv is None else ["--csv", str(training_csv)]),
+        )
     return Outcome(result, _text(result))
 
 

@@ -85,29 +85,6 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     scene = _loaded(name)
     known = _known(scene)
     share = None if known is None else _core_share(known[1], derived)
-    least_N, most_N = derived["least_N"], derived["most_N"]
-    result = {"scene": scene.name, "core_share": share, "core_share_allowed": scene.budget.core_share} | derived
-    lines = [
-        f"{scene.name}: taken",
-        f"forces     {scene.force.least_N:g}..{scene.force.most_N:g} N of the device's {least_N:.2f}..{most_N:.2f}"
-        + torque_range(scene),
-        f"resolution {scene.force.resolution_N:g} N, the device's is {derived['least_resolution_N']:.2g}",
-    ]
-    if scene.force.least_N < least_N:
-        lines.append(f"           below {least_N:.2f} N it gets that: a passive device has a least force (limit F_MIN)")
-    lines.append(
-        "signal     not stated: nothing is known of how fast the force changes"
-        if derived["missed_rms_N"] is None
-        else f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
-        f"{1e3 * scene.force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster"
-    )
-    if scene.signal is not None and scene.signal.setpoint_hz is not msgspec.UNSET:
-        lines.append(f"           its publisher sends {scene.signal.setpoint_hz:g} times a second")
-    lines.append(
-        "cost       not measured: docs/guides/scene.md says how"
-        if share is None
-        else f"cost       {share:.1%} of a processor, {scene.budget.core_share:.0%} are allowed"
-    )
     if share is not None and share > scene.budget.core_share:
         raise CommandError(
             Exit.REFUSED,
@@ -116,6 +93,31 @@ def check_scene(name: str, config: Path | None) -> Outcome:
             f"budget.core_share = {scene.budget.core_share:g}",
             "leave terms out, or lower the rates: tormagctl scene explain says what that costs",
         )
+    force, signal, least_N = scene.force, scene.signal, derived["least_N"]
+    lines = [
+        f"{scene.name}: taken",
+        f"forces     {force.least_N:g}..{force.most_N:g} N of the device's {least_N:.2f}..{derived['most_N']:.2f}"
+        + torque_range(scene),
+        f"resolution {force.resolution_N:g} N, the device's is {derived['least_resolution_N']:.2g}",
+        *(
+            [f"           below {least_N:.2f} N it gets that: a passive device has a least force (limit F_MIN)"]
+            if force.least_N < least_N
+            else []
+        ),
+        "signal     not stated: nothing is known of how fast the force changes"
+        if derived["missed_rms_N"] is None
+        else f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
+        f"{1e3 * force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster",
+        *(
+            [f"           its publisher sends {signal.setpoint_hz:g} times a second"]
+            if signal is not None and signal.setpoint_hz is not msgspec.UNSET
+            else []
+        ),
+        "cost       not measured: docs/guides/scene.md says how"
+        if share is None
+        else f"cost       {share:.1%} of a processor, {scene.budget.core_share:.0%} are allowed",
+    ]
+    result = {"scene": scene.name, "core_share": share, "core_share_allowed": scene.budget.core_share} | derived
     return Outcome(result, "\n".join(lines))
 
 

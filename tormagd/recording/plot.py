@@ -3,6 +3,7 @@
 import io
 from collections.abc import Iterable
 from datetime import UTC, datetime
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -81,14 +82,18 @@ def save_plot(recording: Recording, path: Path, title: str) -> None:
 
 
 def _headline(recording: Recording, title: str, faults: Iterable[Band]) -> str:
-    parts = [title]
     error_N = tracking_rms_N(recording)
-    if error_N is not None:
-        parts.append(f"measured minus asked {error_N * 1e3:.0f} mN rms (sensor noise and approach included)")
     names = ", ".join(band.name for band in faults)
-    parts.append(f"faults: {names}" if names else "no fault")
-    if not recording.is_complete:
-        parts.append("recording cut short")
+    parts = [
+        title,
+        *(
+            []
+            if error_N is None
+            else [f"measured minus asked {error_N * 1e3:.0f} mN rms (sensor noise and approach included)"]
+        ),
+        f"faults: {names}" if names else "no fault",
+        *([] if recording.is_complete else ["recording cut short"]),
+    ]
     return "  ·  ".join(parts)
 
 
@@ -113,13 +118,11 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
 
 def _lanes(axes: Axes, states: tuple[Band, ...], limits: tuple[Band, ...], faults: tuple[Band, ...]) -> None:
     """One lane for the operating state, one for every limit and fault that occurred, each with its name and share."""
-    rows: list[tuple[str, list[tuple[Band, str]]]] = []
-    if states:
-        rows.append(("state", [(band, STATE_COLOURS.get(band.name, GREY)) for band in states]))
-    rows += [
-        (f"limit {band.name}", [(band, LIMIT_COLOURS[index % len(LIMIT_COLOURS)])]) for index, band in enumerate(limits)
+    rows: list[tuple[str, list[tuple[Band, str]]]] = [
+        *([("state", [(band, STATE_COLOURS.get(band.name, GREY)) for band in states])] if states else []),
+        *((f"limit {band.name}", [(band, colour)]) for band, colour in zip(limits, cycle(LIMIT_COLOURS), strict=False)),
+        *([(f"FAULT {band.name}", [(band, RED)]) for band in faults] or [("no faults", [])]),
     ]
-    rows += [(f"FAULT {band.name}", [(band, RED)]) for band in faults] or [("no faults", [])]
     for row, (_, parts) in enumerate(rows):
         for band, colour in parts:
             axes.broken_barh([(a, b - a) for a, b in band.spans_s], (row - 0.38, 0.76), facecolors=colour, linewidth=0)
