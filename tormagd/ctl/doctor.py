@@ -388,9 +388,8 @@ def _table(table: tuple[Rate, ...]) -> str:
 def _text(findings: tuple[Finding, ...]) -> str:
     colour = Colour(sys.stdout)
     paint = {Verdict.OK: colour.green, Verdict.WARN: colour.yellow, Verdict.FAIL: colour.red}
-    lines = []
-    for finding in findings:
-        lines.append(f"{paint[finding.verdict](f'{finding.verdict:<4}')}  {finding.name:<14}  {finding.found}")
-        if finding.remedy:
-            lines.append(f"{'':20}  next: {finding.remedy}")
-    return "\n".join(lines)
+    return "\n".join(
+        f"{paint[finding.verdict](f'{finding.verdict:<4}')}  {finding.name:<14}  {finding.found}"
+        + (f"\n{'':20}  next: {finding.remedy}" if finding.remedy else "")
+        for finding in findings
+    )

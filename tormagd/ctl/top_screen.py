@@ -76,13 +76,15 @@ def screen(seen: Seen, width: int, height: int) -> RenderableType:
 def _head(seen: Seen, width: int) -> Text:
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state = printable(newest.operating_state)
-    head = Text(no_wrap=True, overflow="ellipsis")
-    head.append(f" {state} ", STATE_STYLES.get(state, "reverse"))
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
-    head.append(f"  {', '.join(flags)}", "" if newest.is_homed else "yellow")
-    head.append(torque(newest.measured_cf, status.roller_radius_mm))
-    if seen.silent_s > SILENT_S:
-        head.append(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")
+    head = Text.assemble(
+        (f" {state} ", STATE_STYLES.get(state, "reverse")),
+        (f"  {', '.join(flags)}", "" if newest.is_homed else "yellow"),
+        torque(newest.measured_cf, status.roller_radius_mm),
+        *([(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")] if seen.silent_s > SILENT_S else []),
+        no_wrap=True,
+        overflow="ellipsis",
+    )
     minutes = status.uptime_s / 60.0
     up = (
         f"{minutes / 60.0:.1f} h"
@@ -176,12 +178,9 @@ def _codes(seen: Seen, width: int) -> Table:
 
 
 def _code(code: str, how_long: str, style: str, explained: Mapping[str, Explained]) -> Text:
-    text = Text.assemble((printable(code), style), how_long)
     known = explained.get(code)
-    if known is not None:
-        text.append(f": {known.cause}")
-        text.append(f"\nnext: {known.remedy}", "italic")
-    return text
+    why = "" if known is None else Text.assemble(f": {known.cause}", (f"\nnext: {known.remedy}", "italic"))
+    return Text.assemble((printable(code), style), how_long, why)
 
 
 def columns(
