@@ -5,7 +5,7 @@ The simulator is not the device that was recorded: so it runs with the recorded 
 """
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -41,6 +41,13 @@ class Happened(msgspec.Struct, frozen=True):
     faults: dict[str, float]
     limits: dict[str, float]
     refused: list[str]
+
+    def note(self, at_s: float, faults: Iterable[str], held: Iterable[str], for_s: float) -> None:
+        """What there was in one tick: its faults, and the limits that were held for so long."""
+        for fault in faults:
+            self.faults.setdefault(str(fault), round(at_s, 3))
+        for limit in dict.fromkeys(map(str, held)):
+            self.limits[limit] = round(self.limits.get(limit, 0.0) + for_s, 6)
 
 
 class Script(NamedTuple):
@@ -161,10 +168,9 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
             _, setpoint = setpoints.pop()
             newest = None if setpoint is None else _later(setpoint, todo.begins_s)
         sample = loop.tick(newest)
-        for fault in sample.safety.faults:
-            happened.faults.setdefault(str(fault), round(time_s, 3))
-        if sample.safety.operating_state in DRIVEN:
-            _add_limits(happened.limits, (*sample.plan.limits, *sample.output.limits), period_s)
+        is_driven = sample.safety.operating_state in DRIVEN
+        held = (*sample.plan.limits, *sample.output.limits) if is_driven else ()
+        happened.note(time_s, sample.safety.faults, held, period_s)
     return happened
 
 
@@ -172,16 +178,9 @@ def _recorded(ticks: list[TickRecord]) -> Happened:
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
     before_s = first_s
     for tick in ticks:
-        for fault in tick.faults:
-            happened.faults.setdefault(fault, round(tick.monotonic_s - first_s, 3))
-        _add_limits(happened.limits, tick.limits, tick.monotonic_s - before_s)
+        happened.note(tick.monotonic_s - first_s, tick.faults, tick.limits, tick.monotonic_s - before_s)
         before_s = tick.monotonic_s
     return happened
-
-
-def _add_limits(limits: dict[str, float], held: Sequence[str], time_s: float) -> None:
-    for limit in dict.fromkeys(map(str, held)):
-        limits[limit] = round(limits.get(limit, 0.0) + time_s, 6)
 
 
 def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:

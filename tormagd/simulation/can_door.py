@@ -93,10 +93,8 @@ class CanDoor:
 
 def _remove_abandoned(path: Path) -> None:
     """Removes a socket that nobody listens at."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
         try:
             probe.connect(str(path))
         except ConnectionRefusedError:
             path.unlink()
-        except FileNotFoundError:
-            return
