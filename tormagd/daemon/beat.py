@@ -17,7 +17,6 @@ KERNEL = "kernel"
 "To blame where nothing of ours ran: the thread was not given the processor, or was stopped."
 NEWS_NS = 10_000_000_000
 "At most one log line about late beats in this time."
-
 COUNTED = 7
 "The times of every seventh beat are kept: no period of anything else."
 
@@ -140,8 +139,8 @@ class Phases:
 
     def refresh(self) -> None:
         """Makes the report of one phase anew: of each in turn."""
-        self._refreshed += 1
         name = list(self._spent)[self._refreshed % len(self._spent)]
+        self._refreshed += 1
         self.report[name] = self._spent[name].summary()
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
