@@ -286,7 +286,7 @@ def print_timing(shown: Shown) -> None:
     late, spent = control["lateness_us"], control["exec_us"]
     print(
         f"control    {shown.kept:.1%} of the periods kept, late p50 {late['p50']:.0f} p99 {late['p99']:.0f} us, "
-        f"step p50 {spent['p50']:.0f} p99 {spent['p99']:.0f} us"
+        f"driven after p50 {spent['p50']:.0f} p99 {spent['p99']:.0f} us"
     )
     print(f"host       {host_line(shown.host, shown.worst_stall_ms)}")
     spent = inference["exec_us"]
