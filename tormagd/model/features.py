@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.physics.errors import DomainError, require_that
+from tormagd.physics.errors import DomainError
 
 FEATURES = ("displacement_mm", "rate_mm_s", "field_mT", "cip_percent")
 UNITS = {"displacement_mm": "mm", "rate_mm_s": "mm/s", "field_mT": "mT", "cip_percent": "%", "force_N": "N"}
@@ -45,17 +45,17 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def require_number(name: str, value: float) -> None:
     """Raise `DomainError` when `value` is NaN, infinite or beyond `LARGEST`."""
-    require_that(-LARGEST <= value <= LARGEST, name, value, f"a finite number within +-{LARGEST:g}")
+    # asked several times in every plan: what is allowed is put into words only where it does not hold
+    if not -LARGEST <= value <= LARGEST:
+        raise DomainError(name, value, f"a finite number within +-{LARGEST:g}")
 
 
 def require_features(features: NDArray[np.float64]) -> None:
     """Raise `DomainError` unless `features` is n x 4, finite and within +-`LARGEST`."""
-    require_that(
-        features.ndim == 2 and features.shape[1] == len(FEATURES),
-        "features",
-        f"an array of shape {features.shape}",
-        f"n x 4 in the order {', '.join(FEATURES)}",
-    )
+    if features.ndim != 2 or features.shape[1] != len(FEATURES):
+        raise DomainError(
+            "features", f"an array of shape {features.shape}", f"n x 4 in the order {', '.join(FEATURES)}"
+        )
     refused = ~(np.abs(features) <= LARGEST)
     if refused.any():
         row, column = np.argwhere(refused)[0]
