@@ -37,7 +37,7 @@ from machines.own import own_machine
 from machines.processes import begun, first_line, is_linked
 from matplotlib.figure import Figure
 
-from firmware_protocol.c.build import ROOM as FIRMWARE, BuildError, compiler
+from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compiler
 from tormagd.config import Config, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
@@ -63,8 +63,6 @@ WARM_UP_S = 1.0
 TELEMETRY_EVERY = 20
 PLAN_QUANTILES = ("p50", "p99")
 SHARES = ("core_share", "alone_share")
-HOST_SOURCES = "codec", "crc", "framing", "messages", "tormag"
-HOST_FLAGS = "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2"
 COLUMNS = ("t_ns", "lateness_us", "exec_us", "received_s")
 "What is read of a recorded tick; a stub has not all of them."
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
@@ -231,9 +229,8 @@ def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
 
 def built_host(folder: Path) -> Path:
     """The host in C, built in that folder. Raises BuildError where there is no compiler."""
-    host, sources = folder / "reference_host", [f"{FIRMWARE / name}.c" for name in HOST_SOURCES]
-    command = [compiler(), *HOST_FLAGS, f"-I{FIRMWARE}", str(TOOLS / "reference_host.c"), *sources, "-o", str(host)]
-    subprocess.run(command, check=True)
+    host, sources = folder / "reference_host", [TOOLS / "reference_host.c", *(ROOM / f"{name}.c" for name in FIRMWARE)]
+    subprocess.run([compiler(), *STRICT, "-O2", f"-I{ROOM}", *map(str, sources), "-lm", "-o", str(host)], check=True)
     return host
 
 

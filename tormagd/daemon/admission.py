@@ -209,7 +209,7 @@ class Admission:
         return tuple(PeerReport(*peer, count) for peer, count in self._refusals.items())
 
     def tell(self, now_s: float) -> None:
-        """Says in the log whether peers were refused: once a telemetry period."""
+        """Says in the log whether peers were refused: some times a second."""
         new = self.refused - self._told
         if new and now_s >= self._tell_s:
             log.warning("refused %d peers, the newest at %s", new, self._newest)

@@ -1,7 +1,7 @@
 """The black box: all that the core decides on, and all that passes between it and the device, is handed to another
 process, which keeps the newest of it.
 
-The control thread writes references into a journal, which become bytes in the slack behind each tick; those of 20 ticks
+The control thread writes references into a journal, which become bytes behind each tick; those of 20 ticks
 go into a socket. It waits for nobody: what the socket does not take is lost and counted. Files are the other's
 business, and it outlives this process, however that ends.
 """
@@ -139,7 +139,7 @@ class BlackBox:
         return self._folder / name
 
     def look(self) -> None:
-        """Takes what the other process has said: once a telemetry period."""
+        """Takes what the other process has said: some times a second."""
         self._ask()
         while self._socket is not None:
             try:

@@ -146,10 +146,6 @@ class Endpoint:
             is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
         return is_newer
 
-    def has_listener(self, name: str) -> bool:
-        """Whether anybody is connected to this endpoint: nothing has to be packed for nobody."""
-        return self.admission.is_connected(name)
-
     def publish(self, telemetry: Telemetry) -> None:
         """Sends one telemetry message to whoever listens."""
         self._send(self._telemetry, "telemetry", encode(telemetry))
@@ -187,7 +183,7 @@ class Endpoint:
         return most
 
     def tell(self, now_s: float) -> None:
-        """Counts and tells what was not read: once a telemetry period."""
+        """Counts and tells what was not read: some times a second."""
         self._count_oversize(now_s)
         self._tell_drops(now_s)
         self.admission.tell(now_s)

@@ -121,13 +121,14 @@ class TelemetryLoop:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
         start_ns = time.monotonic_ns()
-        endpoint = self._endpoint
+        endpoint, is_connected = self._endpoint, self._endpoint.admission.is_connected
         # with this very snapshot those are answered who wait now; who asks later waits for the next
         self._status, self._answers = None, min(endpoint.waiting, REQUESTS)
-        if endpoint.has_listener("telemetry") or self._answers:
+        # nothing is packed for nobody
+        if is_connected("telemetry") or self._answers:
             self._newest = self._snapshot(start_ns * 1e-9)
             endpoint.publish(self._newest)
-        if endpoint.has_listener("recording"):
+        if is_connected("recording"):
             endpoint.publish_ticks(list(self._ticks))
         self._ticks.clear()
         # before anything is learned of a new device

@@ -1,4 +1,4 @@
-"""The CAN backend: python-can opens the bus, the event loop watches its descriptor.
+"""The CAN backend: python-can opens the bus, which is drained whenever it is asked for.
 
 Any python-can interface whose bus has a descriptor will do: `socketcan` in the field, `slcan` and `udp_multicast` on
 the bench, `tormagsim` for the simulated device.

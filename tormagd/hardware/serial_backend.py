@@ -1,4 +1,4 @@
-"""The serial backend: pyserial opens and configures the port, the event loop watches its descriptor."""
+"""The serial backend: pyserial opens and configures the port; its descriptor is read and written without waiting."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""An open serial port: frames are written to its descriptor, and read from it whenever it is readable."""
+"""An open serial port: frames are written to its descriptor, and what has come is read from it when it is asked for."""
 
 import contextlib
 import os

@@ -12,7 +12,6 @@ import math
 import os
 import select
 import signal
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +26,7 @@ from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
 from tormagd.control.records import TimedSetpoint
+from tormagd.interrupt import interrupted_by
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
@@ -185,13 +185,13 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:
-    stopping = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopping.set())
-    with serial.Serial(path, baud, timeout=0, exclusive=True) as port:
+    with (
+        interrupted_by(signal.SIGINT, signal.SIGTERM) as is_stopped,
+        serial.Serial(path, baud, timeout=0, exclusive=True) as port,
+    ):
         tap(
             port,
             log,
             lambda pty: print(f"{pty}  # give this to the daemon as device.port", flush=True),
-            stopping.is_set,
+            is_stopped,
         )

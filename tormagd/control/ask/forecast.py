@@ -60,8 +60,6 @@ _LONG_SHARE: Final = EVERY * GRID_S / (LONG_S + EVERY * GRID_S)
 _SHORT_SHARE: Final = EVERY * GRID_S / (SHORT_S + EVERY * GRID_S)
 _MIN_BYTES: Final = MIN_HISTORY * array("d").itemsize
 _MAX_BYTES: Final = HISTORY * array("d").itemsize
-
-
 _LONGEST: Final = BEAT_DELAYS[-1]
 
 
@@ -255,7 +253,6 @@ def _search(history: Array) -> list[tuple[list[float], float]]:
     unlike: list[float] = (apart.min(axis=1) / TAPS).tolist()
     weight = 1.0 / (apart * apart)
     changes[:, TAPS] = 1.0
-    # which numpy multiplies as stacks of matrices
     sums = ((changes[:, : TAPS + 1] * weight[:, None]) @ changes.transpose(0, 2, 1)).tolist()
     return [
         ([] if each > UNLIKE_N * UNLIKE_N else _constants(rows), each) for rows, each in zip(sums, unlike, strict=True)
