@@ -92,7 +92,7 @@ def measure(
 
     rates = tuple(AtRates(*hz, judge((), hz), NO_COST) for hz in RATES_HZ)
     hz = cheapest(rates, tolerance_N)
-    terms = _alone(lambda out, mode: case(out, hz, samples[0], mode), scene.signal.is_known_ahead, runs)
+    terms = _alone(lambda out, mode: case(out, hz, samples[0], mode), runs)
     left_out: tuple[str, ...] = ()  # nothing can be told from a scene that the full model does not meet
     if is_met(rates[0].judged, tolerance_N):
         left_out = spared(terms, tolerance_N, lambda out: all(is_good(item, tolerance_N) for item in judge(out, hz)))
@@ -106,15 +106,12 @@ def measure(
     return with_costs(unpriced, name)
 
 
-def _alone(case: Callable[[Iterable[str], bool], Case], is_known_ahead: bool, runs: Runs) -> tuple[Without, ...]:
-    """Each term left out alone. Without a preview in the setpoints nothing changes where it is not used."""
-    tried = [term for term in TERMS if is_known_ahead or term != "preview"]
-    found = runs([case(out, mode) for mode in MODES for out in [(), *((term,) for term in tried)]])
+def _alone(case: Callable[[Iterable[str], bool], Case], runs: Runs) -> tuple[Without, ...]:
+    """Each term left out alone."""
+    found = runs([case(out, mode) for mode in MODES for out in [(), *((term,) for term in TERMS)]])
     terms = []
     for term in TERMS:
-        frozen_N, learning_N = (
-            found[case((term,), mode)] - found[case((), mode)] if term in tried else 0.0 for mode in MODES
-        )
+        frozen_N, learning_N = (found[case((term,), mode)] - found[case((), mode)] for mode in MODES)
         terms.append(Without(term, frozen_N, learning_N, NO_COST))
     return tuple(terms)
 

@@ -5,7 +5,7 @@ orderings are refused with the key's path, the value and what is allowed.
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -56,6 +56,13 @@ class Sources(Strict, frozen=True):
             names,
             f"at most {MOST_LISTED} different printable names",
         )
+
+
+class Handle(Strict, frozen=True):
+    """The handle of the brake."""
+
+    push_sign: Literal[1, -1] = 1
+    "1 where pushing on moves the handle to greater places of its encoder, as in `handle_mm`; else -1."
 
 
 class Rates(Strict, frozen=True):
@@ -191,6 +198,7 @@ class Config(Strict, frozen=True):
     device: Device = msgspec.field(default_factory=Device)
     endpoints: Endpoints = msgspec.field(default_factory=Endpoints)
     sources: Sources = msgspec.field(default_factory=Sources)
+    handle: Handle = msgspec.field(default_factory=Handle)
     rates: Rates = msgspec.field(default_factory=Rates)
     realtime: RealTime = msgspec.field(default_factory=RealTime)
     motor: Motor = msgspec.field(default_factory=Motor)

@@ -127,19 +127,6 @@ def test_without_the_forecast_nothing_is_remembered(after) -> None:
     assert full != plain(Forecast()) == without
 
 
-def test_without_the_preview_what_follows_is_not_looked_at(after, told) -> None:
-    ahead = {"preview_N": tuple(1.0 + 0.005 * step for step in range(1, 35)), "preview_dt_s": 0.002}
-
-    def speed_mm_s(core: Core, **setpoint: object) -> float:
-        planner = after(core, 20)
-        for _ in range(10):  # from rest, a gap gains speed with a time constant of 25 ms
-            plan = told(planner, 1.0, **setpoint)
-        return plan.gap_speed_mm_s
-
-    assert speed_mm_s(core_without(), **ahead) < -20.0
-    assert speed_mm_s(core_without("preview"), **ahead) == speed_mm_s(core_without("preview"))
-
-
 @pytest.mark.parametrize("names", [(), ("lag",)])
 def test_without_the_lag_late_carriages_stay_late(moving, planned, names: tuple[str, ...]) -> None:
     """Carriages that are always a millimetre behind, while what comes is known."""

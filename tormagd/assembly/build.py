@@ -44,6 +44,8 @@ SENSED_N = 0.001
 "A step of the force sensor's message."
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
+STANDBY_N = 0.3
+"So much over the force of the open gap a hand may feel of a brake that waits."
 DEPTHS = 9
 "Between the scene's depth and the model's greatest, at which a pad's force is looked at whether it rises."
 LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
@@ -228,6 +230,12 @@ def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
     between = f"allowed is {reach.min_N:.2f}..{reach.max_N:.2f}, what model {scene.insert.model} gives in these gaps"
     if not reach.min_N < scene.force.most_N <= reach.max_N:
         raise ConfigError(f"scene {scene.name}: force.most_N = {scene.force.most_N:g}: {between}")
+    standby_N, most_N = scene.force.standby_N, min(reach.min_N + STANDBY_N, scene.force.most_N)
+    if standby_N is not UNSET and not reach.min_N < standby_N <= most_N:
+        raise ConfigError(
+            f"scene {scene.name}: force.standby_N = {standby_N:g}: allowed is above {reach.min_N:.3g}, what the open "
+            f"gap gives, to {most_N:.3g}"
+        )
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:

@@ -20,7 +20,7 @@ from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.move.reference import Reference
 from tormagd.control.plausible import Leap
-from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint
+from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint, Travel, Wall
 from tormagd.exact import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.inverse.solution import Answer, FieldSolution, Question, Reach
@@ -30,11 +30,11 @@ from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, SafetyState
 from tormagd_client.messages import TickRecord
 
-FORMAT = 6
+FORMAT = 7
 "Of the entries and of the states in them: raised when one comes, is removed or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
-    *(Measured, Handle, Turn, Leap, Reference, Plan, Outside),
+    *(Measured, Handle, Travel, Turn, Wall, Leap, Reference, Plan, Outside),
     *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
 )
 "All records that stages keep, or that were given to them: what `exact` reads back."

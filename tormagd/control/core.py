@@ -14,6 +14,7 @@ from firmware_protocol.codec import DriveMode
 from tormagd.config import Config
 from tormagd.control.aim.aim import Aim, Element
 from tormagd.control.ask.governor import Governor
+from tormagd.control.ask.way import Way
 from tormagd.control.believe.believe import Believe, Learned
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.sensor import Disputed
@@ -47,6 +48,7 @@ class Planner:
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
         self.believe = Believe(config, scene, element.nominal, followed, element.portrait.min_N)
         gap_speed_mm_s = config.position.gap_speed_mm_s
+        self.way = Way(config.handle.push_sign)
         self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
         self.aim = Aim(config, scene, element)
         self.planned = self.aim.begin(now_s, 0, 0.0)
@@ -61,7 +63,8 @@ class Planner:
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
-        ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s)
+        travel = self.way.update(measured, is_sensor_believed=belief.sensor_doubted_s == 0.0)
+        ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s, travel)
         plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
         # how late the carriages are is learned from this plan's gap, and acts in the next one
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)

@@ -15,8 +15,24 @@ from tormagd.safety.operating_state import DeviceRequest
 
 
 @final
+class Wall(Value):
+    """An elastic wall at `place_mm` on the way of the handle that pushes on; until then it feels `friction_N`."""
+
+    def __init__(self, place_mm: float, stiffness_N_mm: float, friction_N: float = 0.0) -> None:
+        self.place_mm: Final = place_mm
+        self.stiffness_N_mm: Final = stiffness_N_mm
+        self.friction_N: Final = friction_N
+
+    def force_N(self, handle_mm: float) -> float:
+        """The force on a handle that pushes on and is there."""
+        return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
+
+
+@final
 class TimedSetpoint(Value):
-    """The newest valid setpoint.
+    """The newest valid setpoint: a law of the force over the handle's way and place, `asked_N`.
+
+    force_N                      of a handle that pushes on, where there is no `wall`
 
     stamp_s                      when the publisher meant it, on the clock of `now_s`
     valid_for_s                  how long after the stamp it is followed
@@ -24,6 +40,8 @@ class TimedSetpoint(Value):
     preview_N                    the forces that follow it, `preview_dt_s` apart
     holder                       numbers the publishers that have held the brake, one after the other
     is_contested                 somebody else sends setpoints too
+    withdraw_N                   of a handle that withdraws; None where it is alike both ways
+    wall                         what is pushed against
     """
 
     def __init__(
@@ -37,6 +55,8 @@ class TimedSetpoint(Value):
         preview_dt_s: float = 0.0,
         holder: int = 0,
         is_contested: bool = False,
+        withdraw_N: float | None = None,
+        wall: Wall | None = None,
     ) -> None:
         self.force_N: Final = force_N
         self.stamp_s: Final = stamp_s
@@ -47,6 +67,17 @@ class TimedSetpoint(Value):
         self.preview_dt_s: Final = preview_dt_s
         self.holder: Final = holder
         self.is_contested: Final = is_contested
+        self.withdraw_N: Final = withdraw_N
+        self.wall: Final = wall
+
+    def asked_N(self, travel: "Travel") -> float:
+        """The force for a handle that is there and goes that way. A brake that withdraws from a wall is asked for the
+        wall's friction: it cannot push the handle back."""
+        if not travel.is_pushing and self.withdraw_N is not None:
+            return self.withdraw_N
+        if self.wall is None:
+            return self.force_N
+        return self.wall.force_N(travel.place_mm) if travel.is_pushing else self.wall.friction_N
 
     @property
     def preview_s(self) -> float:
@@ -57,6 +88,20 @@ class TimedSetpoint(Value):
     def preview_slope_N_s(self) -> float:
         """The mean slope of a preview that is there."""
         return (self.preview_N[-1] - self.force_N) / self.preview_s
+
+
+@final
+class Travel(Value):
+    """Where the handle is and how it moves, positive pushing on. A handle that was turned back, or is held while it is
+    pulled back, is withdrawing."""
+
+    def __init__(self, place_mm: float, rate_mm_s: float, is_pushing: bool = True) -> None:
+        self.place_mm: Final = place_mm
+        self.rate_mm_s: Final = rate_mm_s
+        self.is_pushing: Final = is_pushing
+
+
+AT_REST: Final = Travel(0.0, 0.0)
 
 
 @final
@@ -164,7 +209,8 @@ class Belief(Value):
 class Ask(Value):
     """The force to render.
 
-    force_N     now
+    asked_N     what the setpoint asks for now; None without one
+    force_N     of that, what to render now
     path_N      (7) at `path.PATH_S` after the moment that is planned for
     age_s       the setpoint's age, None without one
     limits      what holds the force back
@@ -180,7 +226,9 @@ class Ask(Value):
         limits: tuple[Limit, ...],
         foresight: float = 0.0,
         is_meant: bool = False,
+        asked_N: float | None = None,
     ) -> None:
+        self.asked_N: Final = asked_N
         self.force_N: Final = force_N
         self.path_N: Final = path_N
         self.age_s: Final = age_s
@@ -204,7 +252,7 @@ class Plan(Value):
     """Where the gap should go, and why.
 
     number            lets a recording say which plan a tick used
-    setpoint_N        the publisher's force, None without a setpoint, and its age `setpoint_age_s`
+    setpoint_N        the force that the publisher asks for, None without a setpoint, and its age `setpoint_age_s`
     stamp_s           of the setpoint that the force follows; -inf where it follows none
     governed_N        the force to render now
     predicted_N       the force that the device is expected to show now; None where the model does not know

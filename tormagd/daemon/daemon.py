@@ -68,6 +68,7 @@ class Daemon:
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, self._lose_link)
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
+        self._endpoint.inbox.has_way = core.scene.element == "torque"
         self._keys = keys
         rates = config.rates
         self._box = box or BlackBox(None, {}, rates.control_hz)

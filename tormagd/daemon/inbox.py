@@ -8,7 +8,7 @@ import math
 import shlex
 from collections import deque
 
-from tormagd.control.records import TimedSetpoint
+from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence
@@ -74,6 +74,8 @@ class SetpointInbox:
     """
 
     def __init__(self, priority: tuple[str, ...] = ()) -> None:
+        self.has_way = True
+        "What is controlled has a handle that goes either way, and is no pad."
         self.accepted = 0
         self.refused = 0
         self.dropped = 0
@@ -94,6 +96,8 @@ class SetpointInbox:
         """Takes one message; True if it became the newest setpoint. `now_s` is the control clock."""
         try:
             setpoint = decode(data, Setpoint)
+            if not self.has_way:
+                _refuse_way(setpoint)
             return self._judge(setpoint, now_s, (realtime_ns - setpoint.stamp_ns) * 1e-9)
         except MessageError as error:
             self.refused += 1
@@ -207,6 +211,7 @@ class SetpointInbox:
     def _timed(self, source: _Source, now_s: float) -> TimedSetpoint:
         """The source's newest setpoint, on the control clock, which no setting of the time moves."""
         setpoint = source.setpoint
+        wall = setpoint.contact
         return TimedSetpoint(
             setpoint.servo_cf,
             source.stamp_s,
@@ -217,6 +222,8 @@ class SetpointInbox:
             (setpoint.preview_dt_ms or 0.0) * 1e-3,
             self.hold.number,
             now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s),
+            setpoint.withdraw_cf,
+            wall and Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
         )
 
     def _make_room(self, name: str, now_s: float) -> None:
@@ -279,6 +286,12 @@ class SetpointInbox:
             cause=source.cause,
             remedy=source.remedy,
         )
+
+
+def _refuse_way(setpoint: Setpoint) -> None:
+    for name in ("withdraw_cf", "contact"):
+        if getattr(setpoint, name) is not None:
+            raise MessageError(f"{name}: allowed is servo_cf alone, as the scene's element is a pad")
 
 
 def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float) -> tuple[str, str]:

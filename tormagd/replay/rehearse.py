@@ -16,7 +16,7 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, checked
 from tormagd.control.records import TimedSetpoint
 from tormagd.replay.rebuild import ReplayError
-from tormagd.replay.rerun import SETPOINT, name_of, ticks_of
+from tormagd.replay.rerun import name_of, planned_for, ticks_of
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
@@ -101,10 +101,8 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
     try:
         for entry in entries:
             if name_of(entry) == journal.PLAN:
-                now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
-                setpoints.append(
-                    (now_s - first_s, None if fields is None else _later(TimedSetpoint(*fields), -first_s))
-                )
+                now_s, setpoint = planned_for(entry)
+                setpoints.append((now_s - first_s, None if setpoint is None else _later(setpoint, -first_s)))
             elif name_of(entry) == journal.COMMAND:
                 name, now_s, was_refused = msgspec.convert(entry[1:4], tuple[str, float, bool])
                 if not was_refused:

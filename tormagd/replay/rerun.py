@@ -32,7 +32,9 @@ UNTAKEN = (
     TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
 )  # fmt: skip
 "What the core raises at values of a kind that no part of it makes."
-SETPOINT = tuple[float, float, float, float | None, float | None, tuple[float, ...], float, int, bool]
+SETPOINT = tuple[
+    float, float, float, float | None, float | None, tuple[float, ...], float, int, bool, float | None, Any
+]
 NOT_THE_CORES = 1
 "The first column of a record is the clock's."
 MEASURED = {
@@ -53,6 +55,12 @@ MEASURED = {
 "The numbers of a measurement, and the columns that they stand in."
 QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s", "device_clock_drift")
 "The columns of its `LinkQuality`, in its order."
+
+
+def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
+    """When a plan of a black box began, s, and for which setpoint. Raises InexactError and msgspec.ValidationError."""
+    now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
+    return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
 
 
 class Difference(msgspec.Struct, frozen=True):
@@ -208,8 +216,7 @@ class _Running:
                     raise ValueError("something written without a step")
                 self._of_frames = self._of_frames or self.conversation.wrote(entry, self._output)
             case journal.PLAN:
-                now_s, setpoint = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
-                timed = None if setpoint is None else TimedSetpoint(*setpoint)
+                now_s, timed = planned_for(entry)
                 try:
                     self._planner.plan(now_s, timed, self._stepper.measured)
                 except PLAN_ERRORS as error:

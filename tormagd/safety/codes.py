@@ -94,6 +94,7 @@ class Limit(StrEnum):
     OTHER_SOURCE = "OTHER_SOURCE"
     TAKEOVER = "TAKEOVER"
     RANGE = "RANGE"
+    STANDBY = "STANDBY"
     F_MIN = "F_MIN"
     F_MAX = "F_MAX"
     RATE = "RATE"
@@ -388,6 +389,13 @@ LIMITS: dict[Limit, Explanation] = {
     Limit.RANGE: Explanation(
         "the setpoint is outside the scene's range",
         "ask within the range, or change the scene",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
+    ),
+    Limit.STANDBY: Explanation(
+        "less force was asked for than the scene waits at, force.standby_N",
+        "none is needed: the brake is nearer to a force that comes",
         Reaction.LIMITED,
         100.0,
         "at once",

@@ -41,6 +41,14 @@ class Force(Strict, frozen=True):
     "How fast the force is let go when its publisher is gone, and how fast it goes to another publisher's."
     most_release_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 20.0
     "How fast it may be lost at most, whatever fails. A device that opens faster than that is refused."
+    standby_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
+    """Where the brake waits while less is asked: nearer to the forces that come, and felt as drag. At most F_min and
+    0.3 N."""
+
+    @property
+    def waiting_N(self) -> float:
+        """The least that is asked of the device while somebody sends setpoints."""
+        return self.least_N if self.standby_N is UNSET else max(self.least_N, self.standby_N)
 
 
 class Bandwidth(Strict, frozen=True):
@@ -117,7 +125,6 @@ class Terms(Strict, frozen=True):
     `hysteresis`  how far the field lags behind that of its gap is told by the model, from where the gap has been
     `slope`       setpoints are carried along their slope to now and ahead
     `forecast`    a force that repeats itself is foreseen
-    `preview`     what a publisher says will follow is used
     `lag`         how late the carriages are is learned, and made up for
     `motor`       the duty that the reference takes of the motors is fed forward: for its speed and acceleration, the
                   dry friction of gearbox and screw, and the magnets' pull, which limits the opening speed as well
@@ -137,7 +144,6 @@ class Terms(Strict, frozen=True):
     hysteresis: bool = True
     slope: bool = True
     forecast: bool = True
-    preview: bool = True
     lag: bool = True
     motor: bool = True
     learning: bool = True
@@ -252,6 +258,8 @@ class Scene(Strict, frozen=True):
             value = getattr(self.insert, key)
             if value != getattr(usual, key):
                 raise ValueError(f"insert.{key} = {value:g}: allowed only where element is torque")
+        if self.force.standby_N is not UNSET:
+            raise ValueError(f"force.standby_N = {self.force.standby_N:g}: allowed only where element is torque")
         if self.handle != Handle():
             raise ValueError("handle: allowed only where element is torque, [finger] tells how a pad is pressed")
 

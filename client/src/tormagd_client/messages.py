@@ -23,14 +23,37 @@ MAX_FORCE_N = 1_000.0  # a value no brake of this size can mean; `ask` keeps to 
 MAX_VALIDITY_MS = 60_000.0
 MAX_DISPLACEMENT_MM = 2.0  # since the handle last turned: friction is mobilised there, and more means nothing
 MAX_RATE_MM_S = 300.0  # no hand moves a handle faster
+MAX_PLACE_MM = 10_000.0
+MAX_STIFFNESS_N_MM = 100.0  # bone
 
 
 class MessageError(ValueError):
     """A message that was refused: the text says which field, its value and what is allowed."""
 
 
+class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An elastic wall on the way of the handle, as `handle_mm` of the telemetry counts it, positive pushing on: the
+    force is `friction_N` before it, and `stiffness_N_mm` more for each mm behind it."""
+
+    handle_mm: float
+    stiffness_N_mm: float
+    friction_N: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, least, most in (
+            ("handle_mm", -MAX_PLACE_MM, MAX_PLACE_MM),
+            ("stiffness_N_mm", 0.0, MAX_STIFFNESS_N_MM),
+            ("friction_N", 0.0, MAX_FORCE_N),
+        ):
+            value = getattr(self, name)
+            require(least <= value <= most, f"contact.{name}", value, f"{least:g}..{most:g}")
+
+
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A force to render, from one publisher. `stamp_ns` is CLOCK_REALTIME at the publisher.
+
+    `servo_cf` is of a handle that pushes on; `withdraw_cf` of one that withdraws, and without it both are alike. With a
+    `contact` the force follows the handle against that wall, and `servo_cf` is not looked at.
 
     `displacement_mm` (since the handle turned) and `rate_mm_s` say at which handle motion the force is meant; without
     them, and of a brake's handle that slides, the daemon uses the motion it measures. `preview_N` holds the forces that
@@ -48,6 +71,8 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     preview_N: tuple[float, ...] | None = None
     preview_dt_ms: float | None = None
     session: int | None = None
+    withdraw_cf: float | None = None
+    contact: Contact | None = None
 
     def __post_init__(self) -> None:
         require(self.v == VERSION, "v", self.v, f"{VERSION}")
@@ -61,6 +86,7 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         for name, least, most in (
             ("displacement_mm", 0.0, MAX_DISPLACEMENT_MM),
             ("rate_mm_s", -MAX_RATE_MM_S, MAX_RATE_MM_S),
+            ("withdraw_cf", 0.0, MAX_FORCE_N),
         ):
             value = getattr(self, name)
             require(value is None or least <= value <= most, name, value, f"{least:g}..{most:g}")

@@ -164,7 +164,7 @@ class Aim:
         return Plan(
             number=self.number,
             time_s=now_s,
-            setpoint_N=None if setpoint is None else setpoint.force_N,
+            setpoint_N=ask.asked_N,
             setpoint_age_s=ask.age_s,
             governed_N=ask.force_N,
             predicted_N=belief.predicted_N,

@@ -1,8 +1,10 @@
 """The force asked of the device, now and ahead, from the publisher's setpoint, with the reason for every difference.
 
-now       the setpoint, within what the scene allows and the device gives
-ahead     its preview; without one its slope, and the forecast as far as that is trusted
-path      where what comes is known: the forces along the gap's path that misses least of them
+now       what the setpoint asks for at the handle's place and way, within what the scene allows and the device gives
+ahead     its wall, as the handle moves; its preview; without one its slope, and the forecast as far as that is trusted
+path      where what comes is known: the forces along the gap's path that misses least of them, but before a wall none
+          that is EARLY_N over what is felt there
+blend     from one wall to the next, at the scene's release rate
 decay     without a setpoint, or with one that is too old: to F_min at the scene's release rate
 takeover  from one publisher's force to the next one's, at the same rate
 """
@@ -15,7 +17,7 @@ from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
 from tormagd.control.ask.path import PATH_S, TIMES_S, Path
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.filter import low_pass
-from tormagd.control.records import Ask, TimedSetpoint
+from tormagd.control.records import AT_REST, Ask, TimedSetpoint, Travel, Wall
 from tormagd.model.features import LARGEST, require_number
 from tormagd.model.force_curve import within
 from tormagd.physics.errors import DomainError
@@ -26,12 +28,17 @@ from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 _LARGEST: Final[float] = LARGEST
 SLOPE_FILTER_S: Final = 0.003
 AHEAD_S: Final = 0.05
+SEEN_S: Final = 0.15
+"A handle is expected to go on as it does for so long: a wall slows it."
 "Setpoints are carried forward along their slope, or past the end of their preview, by no more than this."
 MIN_TIMES: Final = 9
 "So many of TIMES_S are looked at even where a preview ends before, and of a forecast."
 _FORECAST_S: Final = TIMES_S[:MIN_TIMES]
 OUTRUN_N: Final = 0.02
 "Where the path misses what is known ahead by more, the carriages are too slow: the limit RATE."
+
+EARLY_N: Final = 0.1
+"So much more than before a wall a handle may feel there: the least RMS error would brake it earlier."
 
 Bounds = tuple[float, float]
 "The least and the greatest force that the scene allows and the device gives."
@@ -60,7 +67,11 @@ class Governor:
     sent_N: float | None
     "Where the carriages were sent, as a force; None where it is not known what comes."
     expected_N: float | None
-    "The force by now along the path of a preview, behind the carriages' lag."
+    "The force by now along the path of a preview or to a wall, behind the carriages' lag."
+    wall: Wall | None
+    "Of the setpoint that the force follows."
+    blend_N: float
+    "What is left of the difference of the walls before to this one."
 
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
@@ -69,11 +80,11 @@ class Governor:
         use."""
         self._has_slope: Final = terms.slope
         self._has_forecast: Final = terms.forecast
-        self._has_preview: Final = terms.preview
         self._portrait: Final = portrait
         self._path: Final = Path(portrait, gap_speed_mm_s)
         self._gap_speed_mm_s: Final = gap_speed_mm_s
-        self._min_N: Final = force.least_N
+        self._least_N: Final = force.least_N
+        self._min_N: Final = force.waiting_N
         self._max_N: Final = force.most_N
         self._release_N_s: Final = force.release_N_s
         self.forecast = Forecast()
@@ -85,10 +96,13 @@ class Governor:
         self.holder, self.is_passing = 0, False
         self._forget()
 
-    def update(self, now_s: float, setpoint: TimedSetpoint | None, device: DeviceFit, lag_s: float) -> Ask:
+    def update(
+        self, now_s: float, setpoint: TimedSetpoint | None, device: DeviceFit, lag_s: float, travel: Travel = AT_REST
+    ) -> Ask:
         """Return what is asked of `device` at `now_s`.
 
-        `setpoint` is None without a publisher. `lag_s` is the carriages' lag: what is known ahead is looked at this
+        `setpoint` is None without a publisher. `travel` is the handle's. `lag_s` is the carriages' lag: what is known
+        ahead is looked at this
         much further on. A setpoint that jumps is followed at once, within the scene's and the device's bounds. Decay to
         F_min without a valid setpoint, and takeover by a new publisher, go at the scene's release rate.
 
@@ -107,19 +121,27 @@ class Governor:
             return self._decay(dt_s, lowest_N, age_s, stale)
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
         # what comes is told from what is asked: the least that the device makes is learned, and so it varies
-        allowed_N = min(max(setpoint.force_N, self._min_N), self._max_N)
-        force_N, limits = _within_reach(setpoint.force_N, allowed_N, lowest_N, highest_N)
+        asked_N = setpoint.asked_N(travel) + self._blended(setpoint, travel, dt_s)
+        allowed_N = min(max(asked_N, self._min_N), self._max_N)
+        force_N, limits = self._within_reach(asked_N, allowed_N, lowest_N, highest_N)
         if setpoint.is_contested:
             limits = (*limits, Limit.OTHER_SOURCE)
-        self._hear(setpoint, allowed_N, force_N, device)
+        heard_N = min(max(setpoint.force_N, self._min_N), self._max_N)
+        self._hear(setpoint, heard_N, force_N, device)
         bounds = min(max(self._min_N, lowest_N), highest_N), min(max(self._max_N, lowest_N), highest_N)
         governed_N, foresight = force_N, 1.0
-        if setpoint.preview_N and self._has_preview:
-            path_N, expected_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
-            governed_N = within(expected_N, bounds)
+        if setpoint.wall is not None or (setpoint.withdraw_N is not None and not travel.is_pushing):
+            self._foreseen(setpoint.stamp_s, heard_N, age_s)
+            path_N = self._against(setpoint.wall, travel, dt_s, force_N, bounds, device, lag_s)
+            governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
+        elif setpoint.preview_N:
+            path_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
+            governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
         else:
-            foresight = self._foreseen(setpoint.stamp_s, allowed_N, age_s)
+            foresight = self._foreseen(setpoint.stamp_s, heard_N, age_s)
             path_N = self._continued(max(age_s, 0.0), dt_s, force_N, foresight, bounds, device, lag_s)
+        if self.blend_N != 0.0 and setpoint.wall is None:
+            path_N = [within(each_N + self.blend_N, bounds) for each_N in path_N]
         if abs(governed_N - force_N) > OUTRUN_N:
             limits = (*limits, Limit.RATE)
         if self.is_passing and self._passes(path_N[0], dt_s):
@@ -127,7 +149,7 @@ class Governor:
             path_N, self.sent_N, self.expected_N = [governed_N] * len(PATH_S), None, None
             limits, foresight = (*limits, Limit.TAKEOVER), 0.0
         self.asked_N, self.above_N = path_N[0], max(path_N[0] - lowest_N, 0.0)
-        return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True)
+        return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def foresee(self) -> bool:
         """Make a forecast for the next plans, and return whether one was due: for the time between plans."""
@@ -139,13 +161,50 @@ class Governor:
         if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
             self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
             self.forecast.forget()
-        elif spacing_s > MAX_STEP_S or not self._has_slope:
+        elif spacing_s > MAX_STEP_S or not self._has_slope or setpoint.wall is not None:
             self.slope_N_s = 0.0
         elif spacing_s > 0.0:
             rate_N_s = device.scale * self._portrait.force_rate_N_s(device.model_N(force_N), self._gap_speed_mm_s)
             slope_N_s = min(max((allowed_N - self.last_N) / spacing_s, -rate_N_s), rate_N_s)
             self.slope_N_s = low_pass(self.slope_N_s, slope_N_s, spacing_s, SLOPE_FILTER_S)
         self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
+
+    def _blended(self, setpoint: TimedSetpoint, travel: Travel, dt_s: float) -> float:
+        """What is added to the law of this setpoint, so that the force goes over to it along a ramp."""
+        if setpoint.holder != self.holder or self.stamp_s == -math.inf:
+            self.blend_N = 0.0  # a takeover has a ramp of its own
+        elif setpoint.wall != self.wall:
+            before_N = self.last_N if self.wall is None else self.wall.force_N(travel.place_mm)
+            wall = setpoint.wall
+            self.blend_N += before_N - (setpoint.force_N if wall is None else wall.force_N(travel.place_mm))
+        self.wall = setpoint.wall
+        left_N = max(abs(self.blend_N) - self._release_N_s * dt_s, 0.0) if travel.is_pushing else 0.0
+        self.blend_N = math.copysign(left_N, self.blend_N)
+        return self.blend_N
+
+    def _against(
+        self,
+        wall: Wall | None,
+        travel: Travel,
+        dt_s: float,
+        force_N: float,
+        bounds: Bounds,
+        device: DeviceFit,
+        lag_s: float,
+    ) -> list[float]:
+        """The forces at PATH_S of a handle that pushes against a wall, or withdraws. Updates `sent_N` and
+        `expected_N`."""
+        if wall is None or not travel.is_pushing:
+            self.sent_N, self.expected_N = None, None
+            return [force_N] * len(PATH_S)
+        place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
+        wanted_N = [
+            within(wall.force_N(place_mm + rate_mm_s * min(lag_s + after_s, SEEN_S)) + added_N, bounds)
+            for after_s in TIMES_S
+        ]
+        early_N = within(wall.friction_N + added_N, bounds) + EARLY_N
+        most_N = [early_N if place_mm + rate_mm_s * after_s < wall.place_mm else math.inf for after_s in PATH_S]
+        return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _foreseen(self, stamp_s: float, allowed_N: float, age_s: float) -> float:
         """How far the forecast is trusted after this setpoint."""
@@ -164,11 +223,8 @@ class Governor:
         bounds: Bounds,
         device: DeviceFit,
         lag_s: float,
-    ) -> tuple[list[float], float]:
-        """Return the forces at PATH_S on the best path for a preview, and the force by now behind the carriages' lag.
-
-        The path begins `soon_s` after the setpoint's stamp.
-        """
+    ) -> list[float]:
+        """The forces at PATH_S on the best path for a preview, which begins `soon_s` after the setpoint's stamp."""
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
             self.slope_N_s = setpoint.preview_slope_N_s
@@ -177,14 +233,28 @@ class Governor:
         else:
             self.forecast.forget()
         wanted_N = _wanted_N(setpoint, soon_s + lag_s, bounds, self.forecast)
+        return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s)
+
+    def _pursued(
+        self,
+        wanted_N: list[float],
+        dt_s: float,
+        force_N: float,
+        bounds: Bounds,
+        device: DeviceFit,
+        lag_s: float,
+        most_N: list[float] | None = None,
+    ) -> list[float]:
+        """The forces at PATH_S on the best path for `wanted_N`, none over `most_N`. Updates `sent_N` and
+        `expected_N`."""
         from_N, sent_N = self._left_from(force_N)
-        path_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, wanted_N, device, lag_s)
+        path_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, wanted_N, device, lag_s, most_N)
         # the path sets out sooner by as much as the carriages come later
         expected_N = from_N if self.is_passing or self.expected_N is None else self.expected_N
         if dt_s > 0.0:
             expected_N += dt_s / (lag_s + dt_s) * (path_N[0] - expected_N)
         self.expected_N = expected_N
-        return [within(each_N, bounds) for each_N in path_N], expected_N
+        return [within(each_N, bounds) for each_N in path_N]
 
     def _continued(
         self,
@@ -224,6 +294,20 @@ class Governor:
         self.is_passing = abs(to_N - self.asked_N) > self._release_N_s * dt_s
         return self.is_passing
 
+    def _within_reach(
+        self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
+    ) -> tuple[float, tuple[Limit, ...]]:
+        """Of what is asked, what the scene allows of it and the device gives: never over the scene's greatest, unless
+        the open gap itself makes more."""
+        limits: tuple[Limit, ...] = ()
+        if allowed_N != asked_N:
+            limits = (Limit.STANDBY,) if self._least_N <= asked_N < allowed_N else (Limit.RANGE,)
+        if allowed_N < lowest_N:
+            return lowest_N, (*limits, Limit.F_MIN)
+        if allowed_N > highest_N:
+            return highest_N, (*limits, Limit.F_MAX)
+        return allowed_N, limits
+
     def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
         # a device that is found to make less than was believed is not asked for more above its least than it was
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
@@ -235,6 +319,7 @@ class Governor:
         """No setpoint is followed."""
         self.stamp_s, self.slope_N_s, self.last_N = -math.inf, 0.0, 0.0
         self.sent_N, self.expected_N = None, None
+        self.wall, self.blend_N = None, 0.0
         self.forecast.forget()
 
 
@@ -257,19 +342,6 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
     if not -_LARGEST <= sum(setpoint.preview_N) <= _LARGEST:
         for force_N in setpoint.preview_N:
             require_number("preview_N", force_N)
-
-
-def _within_reach(
-    setpoint_N: float, allowed_N: float, lowest_N: float, highest_N: float
-) -> tuple[float, tuple[Limit, ...]]:
-    """Of the setpoint, what the scene allows of it and the device gives: never over the scene's greatest, unless the
-    open gap itself makes more."""
-    limits: tuple[Limit, ...] = () if allowed_N == setpoint_N else (Limit.RANGE,)
-    if allowed_N < lowest_N:
-        return lowest_N, (*limits, Limit.F_MIN)
-    if allowed_N > highest_N:
-        return highest_N, (*limits, Limit.F_MAX)
-    return allowed_N, limits
 
 
 def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:

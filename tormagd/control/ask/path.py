@@ -49,12 +49,20 @@ class Path:
         return abs(away_mm) < NEAR_S * self._gap_speed_mm_s
 
     def pursue(
-        self, from_N: float, sent_N: float, dt_s: float, wanted_N: list[float], device: DeviceFit, lag_s: float
+        self,
+        from_N: float,
+        sent_N: float,
+        dt_s: float,
+        wanted_N: list[float],
+        device: DeviceFit,
+        lag_s: float,
+        most_N: list[float] | None = None,
     ) -> tuple[list[float], float]:
         """Return the forces (7) at PATH_S along the best path for `wanted_N` (n) at TIMES_S, and the force to send.
 
         `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`. The returned force is
-        that of the gap to send the carriages to now.
+        that of the gap to send the carriages to now. `most_N` (7) opens the path where it would give more; None: no
+        bound.
 
         The gap follows its carriages with the time constant SPEEDING_UP_S plus `lag_s`. So the carriages are sent ahead
         of the path by its speed times this time.
@@ -72,6 +80,9 @@ class Path:
             weights.append(LASTS_S[place] * slope_N_mm * slope_N_mm)
         sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(from_N))
         path_mm = nearest_path_mm(sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
+        if most_N is not None:
+            for place, force_N in enumerate(most_N):
+                path_mm[place] = max(path_mm[place], portrait.gap_mm_at(device.model_N(force_N)))
         forces_N: list[float] = []
         left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for to_mm in path_mm:

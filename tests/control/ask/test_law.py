@@ -1,0 +1,155 @@
+"""What is asked over the handle's place and way: a wall, another force for withdrawing, and where the brake waits."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from tormagd.control.aim.portrait import Portrait
+from tormagd.control.ask.governor import EARLY_N, Governor
+from tormagd.control.ask.way import SLID_MM, Way
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.records import Ask, Handle, Measured, TimedSetpoint, Travel, Wall
+from tormagd.model.displacement import TURN_MM, Turn
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import Force
+
+PORTRAIT = Portrait(
+    np.linspace(95.0, 45.0, 19).tolist(), np.linspace(0.4, 2.2, 19).tolist(), np.linspace(0.01, 0.1, 19).tolist()
+)
+SCENE = Force(least_N=0.0, most_N=2.0, resolution_N=0.1, tolerance_rms_N=0.05)
+WALL = Wall(10.0, 0.25, 0.6)
+PERIOD_S = 0.002
+
+
+class Following:
+    """A governor with a handle, one plan a call."""
+
+    def __init__(self, scene: Force = SCENE) -> None:
+        self.governor = Governor(0.0, PORTRAIT, scene, 38.0)
+        self.now_s = 0.0
+
+    def ask(self, travel: Travel, force_N: float = 0.0, **law: object) -> Ask:
+        self.now_s += PERIOD_S
+        setpoint = TimedSetpoint(force_N, self.now_s, 0.1, **law)
+        return self.governor.update(self.now_s, setpoint, DeviceFit(), 0.0, travel)
+
+
+@pytest.fixture
+def following() -> Following:
+    return Following()
+
+
+@pytest.mark.parametrize(("rate_mm_s", "is_slow"), [(3.0, True), (10.0, False), (60.0, False)])
+def test_a_handle_feels_the_wall_where_it_is_and_at_most_a_little_before(following, rate_mm_s, is_slow) -> None:
+    """The gap itself follows 1.4 N/s at most, the wall rises by 0.75, 2.5 and 15."""
+    most_N = WALL.friction_N + EARLY_N
+    before_N = 0.0
+    for place_mm in np.arange(-20.0, 14.0, rate_mm_s * PERIOD_S).tolist():
+        ask = following.ask(Travel(place_mm, rate_mm_s), wall=WALL)
+        assert ask.asked_N == WALL.force_N(place_mm)
+        if place_mm < WALL.place_mm:
+            before_N = ask.path_N[0]
+            assert before_N <= most_N + 1e-3
+    assert before_N > WALL.friction_N + (0.0 if is_slow else 0.05)
+    assert (ask.path_N[0] == pytest.approx(ask.asked_N, abs=0.03)) is is_slow
+    assert (Limit.RATE in ask.limits) is not is_slow
+
+
+def test_from_one_wall_to_the_next_the_force_goes_along_a_ramp(following: Following) -> None:
+    at = Travel(14.0, 0.0)
+    for _ in range(1000):
+        before = following.ask(at, wall=WALL)
+    steps_N = []
+    for wall in [Wall(10.0, 0.05, 0.6)] * 100 + [None] * 100:
+        ask = following.ask(at, force_N=1.6, wall=wall)
+        steps_N.append(ask.asked_N - before.asked_N)
+        before = ask
+    assert max(map(abs, steps_N)) <= SCENE.release_N_s * PERIOD_S + 1e-9
+    assert ask.asked_N == pytest.approx(1.6)
+
+
+@pytest.mark.parametrize(
+    ("law", "asked_N"),
+    [({"withdraw_N": 0.5}, 0.5), ({"withdraw_N": 0.5, "wall": WALL}, 0.5), ({"wall": WALL}, 0.6), ({}, 1.5)],
+)
+def test_a_handle_that_withdraws_is_asked_for_its_own_force(following: Following, law, asked_N: float) -> None:
+    following.ask(Travel(14.0, 5.0), 1.5, **law)
+    ask = following.ask(Travel(14.0, -5.0, is_pushing=False), 1.5, **law)
+    assert (ask.asked_N, ask.path_N) == (asked_N, [asked_N] * 7)
+
+
+def test_a_force_that_repeats_is_remembered_over_a_withdrawal(following: Following) -> None:
+    for number in range(3000):
+        is_pushing = number % 1000 < 900
+        force_N = 1.2 + 0.2 * math.sin(math.tau * 1.1 * following.now_s)
+        following.ask(Travel(0.0, 5.0, is_pushing), force_N, withdraw_N=0.4)
+        following.governor.foresee()
+    assert following.governor.forecast.trust > 0.5
+
+
+@pytest.mark.parametrize(
+    ("asked_N", "rendered_N", "limits"), [(0.0, 0.6, (Limit.STANDBY,)), (0.6, 0.6, ()), (0.9, 0.9, ())]
+)
+def test_a_brake_waits_at_its_standby_and_says_so(asked_N: float, rendered_N: float, limits) -> None:
+    waiting = Following(msgspec.structs.replace(SCENE, standby_N=0.6))
+    for _ in range(3):
+        ask = waiting.ask(Travel(0.0, 10.0), asked_N)
+    assert (ask.force_N, ask.limits) == (rendered_N, limits)
+
+
+def test_without_a_publisher_nothing_waits() -> None:
+    waiting = Following(msgspec.structs.replace(SCENE, standby_N=0.6))
+    waiting.ask(Travel(0.0, 10.0))
+    assert waiting.governor.update(2.0, None, DeviceFit(), 0.0).force_N == 0.4
+
+
+class Pushed:
+    """A way whose handle and force sensor the test moves, with the encoder's sign of pushing on."""
+
+    def __init__(self, push_sign: int) -> None:
+        self._way, self._sign, self._turn = Way(push_sign), push_sign, Turn(1.0, 0.0, 0.0)
+
+    def at(self, place_mm: float, hand_N: float, *, is_sensor_believed: bool = True) -> Travel:
+        """The handle there, while the hand gives this force, positive pushing on."""
+        encoder_mm = self._sign * place_mm
+        self._turn = self._turn.moved_to(encoder_mm)
+        direction = self._turn.direction
+        handle = Handle(self._turn.displacement_mm(encoder_mm), 5.0, self._turn)
+        against_N = self._sign * direction * hand_N
+        measured = Measured(1, True, 0.0, 40.0, 40.0, 0.0, 0.0, against_N, handle, encoder_mm, 0.0, 0.0)
+        return self._way.update(measured, is_sensor_believed)
+
+
+@pytest.mark.parametrize("push_sign", [1, -1])
+def test_a_held_handle_withdraws_once_the_hand_pulls(push_sign: int) -> None:
+    pushed = Pushed(push_sign)
+    assert all(pushed.at(place_mm, 1.5).is_pushing for place_mm in np.arange(0.0, 5.0, 0.1))
+    back_mm = 4.9 - 2.0 * TURN_MM
+    assert pushed.at(back_mm, 0.2).is_pushing
+    pulled = pushed.at(back_mm, -0.2)
+    assert (pulled.is_pushing, pulled.place_mm, pulled.rate_mm_s) == (False, pytest.approx(back_mm), -5.0)
+    assert not pushed.at(back_mm + 2.0 * TURN_MM, -0.2).is_pushing
+    assert pushed.at(back_mm + 2.0 * TURN_MM, 0.3).is_pushing
+
+
+def test_a_sensor_that_is_not_believed_shows_no_way_but_a_handle_that_comes_back_does() -> None:
+    pushed = Pushed(1)
+    pushed.at(5.0, 1.5)
+    assert pushed.at(4.8, -0.5, is_sensor_believed=False).is_pushing
+    assert not pushed.at(5.0 - 1.01 * SLID_MM, -0.5, is_sensor_believed=False).is_pushing
+
+
+def test_a_tremor_of_a_held_handle_changes_no_way() -> None:
+    pushed = Pushed(1)
+    pushed.at(5.0, 1.5)
+    for time_s in np.arange(0.0, 2.0, 0.001):
+        swing = math.sin(math.tau * 8.0 * time_s)
+        assert pushed.at(5.0 + 0.1 * swing, 1.0 + 0.5 * swing).is_pushing
+
+
+def test_a_silent_device_keeps_its_place_and_way() -> None:
+    pushed = Pushed(1)
+    pushed.at(5.0, 1.5)
+    assert pushed._way.update(None, is_sensor_believed=True) == Travel(5.0, 0.0)
