@@ -54,11 +54,23 @@ class Element:
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
         """One step that ends at that time, at that gap, with the handle at that mean speed."""
+        self.prepare(time_s, gap_mm)
+        self.slide(speed_mm_s)
+
+    def prepare(self, time_s: float, gap_mm: float) -> None:
+        """What of a step does not depend on the handle: field, memory, warmth, and the level it slides at."""
         moment_Tm = self._field.advance(gap_mm)
         driving_N = self._force.at(moment_Tm) * self._warmth.advance(time_s)
         relaxed_N, self._memory = self._relax.advance(self._memory, driving_N)
         # relaxing from a high force may pull the insert off the shaft, but never push the handle on
         self.kinetic_N = max(relaxed_N, 0.0)
+
+    def resisting_N(self, speed_mm_s: float) -> float:
+        """The force at the end of the step that is prepared, were this the handle's mean speed; nothing changes."""
+        return self._friction.advance(self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s)[0]
+
+    def slide(self, speed_mm_s: float) -> None:
+        """The rest of the step that is prepared, with the handle at that mean speed."""
         self.force_N, self._deflection_mm = self._friction.advance(
             self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s
         )

@@ -16,6 +16,9 @@ REVERSING_TRAVEL_MM: Final = 30.0
 DEFAULT_DEPTH_MM: Final = 2.0
 PRESSES_AT_S: Final = 10.0
 PRESSING_MM_S: Final = 1.0
+EXACT_N: Final = 1e-9
+ROUNDS: Final = 100
+"Within this, and at most so often, a step of a hand that feels is solved."
 RECORDED = {"t_s": TIME, "position_mm": (-1e6, 1e6, "mm")}
 KNOWN = "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], or a FILE.csv with the columns t_s,position_mm"
 
@@ -86,6 +89,112 @@ class RecordedHand(Value):
         start_s, end_s = self.times_s[after - 1], self.times_s[after]
         start_mm, end_mm = self.positions_mm[after - 1], self.positions_mm[after]
         return start_mm + (end_mm - start_mm) * (time_s - start_s) / (end_s - start_s)
+
+
+@final
+class StrokingHand(Value):
+    """Rests until the device is homed, 10 s; then pushes to its reach, rests, withdraws, rests, and again."""
+
+    def __init__(self, push_mm_s: float = 20.0, reach_mm: float = 20.0, rest_s: float = 1.0) -> None:
+        self.push_mm_s: Final = push_mm_s
+        self.reach_mm: Final = reach_mm
+        self.rest_s: Final = rest_s
+
+    def position_mm(self, time_s: float) -> float:
+        half_s = self.reach_mm / self.push_mm_s + self.rest_s
+        phase_s = math.fmod(max(time_s - PRESSES_AT_S, 0.0), 2.0 * half_s)
+        pushed_mm, withdrawn_mm = self.push_mm_s * phase_s, max(self.push_mm_s * (phase_s - half_s), 0.0)
+        return max(min(pushed_mm, self.reach_mm) - withdrawn_mm, 0.0)
+
+
+@final
+class Impedance(Value):
+    """What a hand is to the handle: the mass that moves with it, and the spring and damper behind that mass."""
+
+    def __init__(self, mass_kg: float = 0.1, stiffness_N_mm: float = 0.4, damping_N_s_mm: float = 0.006) -> None:
+        self.mass_kg: Final = mass_kg
+        self.stiffness_N_mm: Final = stiffness_N_mm
+        self.damping_N_s_mm: Final = damping_N_s_mm
+
+
+@final
+class FeltHand:
+    """A hand that feels: spring and damper draw its mass x towards a motion x_i that it intends, friction f resists.
+
+        m dv/dt = k (x_i - x) + d (dx_i/dt - v) - f(v)
+
+    Each step is solved with the friction of this very step, for its mean speed (implicit midpoint): the energies close,
+    where a force that came late would drive what it should damp. Of several speeds that fit, where friction falls with
+    speed, it is one near the speed before: what sticks goes on to stick. Bristles act with their force at a
+    step's end, which damps their ringing, at 8 N/mm as 0.004 N s/mm would. From `lets_go_s` on the mass is alone.
+    """
+
+    def __init__(self, intended: Hand, impedance: Impedance, lets_go_s: float = math.inf) -> None:
+        self._intended = intended
+        self._impedance = impedance
+        self._lets_go_s = lets_go_s
+        self._time_s = 0.0
+        self._place_mm = intended.position_mm(0.0)
+        self.speed_mm_s = 0.0
+        "At the end of the last step."
+        self.force_N = 0.0
+        "By which spring and damper pushed the mass, in the mean of the last step."
+
+    def position_mm(self, time_s: float) -> float:
+        """Where it means to be; `moved_mm` says where it is."""
+        return self._intended.position_mm(time_s)
+
+    def moved_mm(self, time_s: float, resisting_N: Callable[[float], float]) -> float:
+        """Where it is at the end of a step, at that time: `resisting_N` is what resists a mean speed in it.
+
+        Raises ValueError for a time that has been: a hand that feels has a state, and moves one plant.
+        """
+        dt_s, speed_mm_s, impedance = time_s - self._time_s, self.speed_mm_s, self._impedance
+        if dt_s <= 0.0:
+            raise ValueError(f"time_s = {time_s}: allowed is after {self._time_s}, where the hand has been")
+        from_mm, to_mm = self._intended.position_mm(self._time_s), self._intended.position_mm(time_s)
+        held = 1.0 if time_s <= self._lets_go_s else 0.0
+        stiffness_N_mm, damping_N_s_mm = held * impedance.stiffness_N_mm, held * impedance.damping_N_s_mm
+        inertia_N_s_mm = 2e-3 * impedance.mass_kg / dt_s
+        # what pushes at the speed v is start_N - hold_N_s_mm * v
+        start_N = (
+            stiffness_N_mm * (0.5 * (from_mm + to_mm) - self._place_mm) + damping_N_s_mm * (to_mm - from_mm) / dt_s
+        )
+        hold_N_s_mm = 0.5 * dt_s * stiffness_N_mm + damping_N_s_mm
+
+        def over_N(mean_mm_s: float) -> float:
+            pushing_N = start_N - hold_N_s_mm * mean_mm_s
+            return inertia_N_s_mm * (mean_mm_s - speed_mm_s) + resisting_N(mean_mm_s) - pushing_N
+
+        mean_mm_s = _root(over_N, speed_mm_s, inertia_N_s_mm + hold_N_s_mm)
+        self.force_N = start_N - hold_N_s_mm * mean_mm_s
+        self.speed_mm_s = 2.0 * mean_mm_s - speed_mm_s
+        self._time_s, self._place_mm = time_s, self._place_mm + dt_s * mean_mm_s
+        return self._place_mm
+
+
+def _root(function: Callable[[float], float], start: float, slope: float) -> float:
+    """Where a function that rises far out is 0: bracketed from `start` on, by steps that grow (the first is that of a
+    straight line of this slope), then found by the Illinois method."""
+    near, at_near = start, function(start)
+    step = -at_near / slope
+    far = near + step
+    at_far = function(far)
+    while at_near * at_far > 0.0:
+        step *= 2.0
+        near, at_near, far = far, at_far, far + step
+        at_far = function(far)
+    for _ in range(ROUNDS):
+        if abs(at_far) <= EXACT_N:
+            break
+        middle = (near * at_far - far * at_near) / (at_far - at_near)
+        at_middle = function(middle)
+        if at_middle * at_far < 0.0:
+            near, at_near = far, at_far
+        else:
+            at_near *= 0.5
+        far, at_far = middle, at_middle
+    return far
 
 
 _SIZED: dict[str, tuple[Callable[..., Hand], float, float]] = {

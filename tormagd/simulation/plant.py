@@ -8,7 +8,7 @@ from typing import Final, Protocol, final
 from firmware_protocol.value import Value
 from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import Element
-from tormagd.simulation.hand import Hand
+from tormagd.simulation.hand import FeltHand, Hand, HandError
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.second_element import SecondElement
@@ -91,6 +91,8 @@ class Plant:
         self.right = Axis(parameters, screw.drag_right_N, assumed.start_right_mm, pull_N, substep_s)
         self.element: Element | PressedPad | SecondElement
         if parameters.pad is not None:
+            if isinstance(hand, FeltHand):
+                raise HandError("hand felt: allowed at a pad is a prescribed hand, as pressing is")
             self.element = PressedPad(parameters, gap_mm, ELEMENT_STEP_S)
         elif parameters.second is not None:
             self.element = SecondElement(parameters, gap_mm, ELEMENT_STEP_S)
@@ -182,14 +184,19 @@ class Plant:
         self._substeps = due
 
     def _advance_element(self, time_s: float) -> None:
-        handle_mm = self._hand.position_mm(time_s)
-        self.handle_mm_s = (handle_mm - self.handle_mm) / ELEMENT_STEP_S
-        self.handle_mm = handle_mm
-        element = self.element
+        hand, element, before_mm = self._hand, self.element, self.handle_mm
         if isinstance(element, PressedPad):
-            element.advance(time_s, self.gap_mm, handle_mm, self.handle_mm_s)
+            self.handle_mm = hand.position_mm(time_s)
+            self.handle_mm_s = (self.handle_mm - before_mm) / ELEMENT_STEP_S
+            element.advance(time_s, self.gap_mm, self.handle_mm, self.handle_mm_s)
         else:
-            element.advance(time_s, self.gap_mm, self.handle_mm_s)
+            element.prepare(time_s, self.gap_mm)
+            if isinstance(hand, FeltHand):
+                self.handle_mm = hand.moved_mm(time_s, element.resisting_N)
+            else:
+                self.handle_mm = hand.position_mm(time_s)
+            self.handle_mm_s = (self.handle_mm - before_mm) / ELEMENT_STEP_S
+            element.slide(self.handle_mm_s)
         self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:

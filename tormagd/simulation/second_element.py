@@ -84,23 +84,41 @@ class SecondElement:
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
         """One step that ends at that time, at that gap, with the handle at that mean speed."""
-        second, dt_s = self._second, self._dt_s
+        self.prepare(time_s, gap_mm)
+        self.slide(speed_mm_s)
+
+    def prepare(self, time_s: float, gap_mm: float) -> None:
+        """What of a step does not depend on the handle: plays, creep, warmth, the level at the speed of reference."""
+        second = self._second
         driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self._warmth.advance(time_s)
         self._creeping_N = self._crept_N(self._creeping_N + second.creeping_share * (driving_N - self._fresh_N))
         self._fresh_N = driving_N
         self.kinetic_N = max((1.0 - second.creeping_share) * driving_N + self._creeping_N, 0.0)
+
+    def resisting_N(self, speed_mm_s: float) -> float:
+        """The force at the end of the step that is prepared, were this the handle's mean speed; nothing changes."""
+        return self._slid(speed_mm_s)[0]
+
+    def slide(self, speed_mm_s: float) -> None:
+        """The rest of the step that is prepared, with the handle at that mean speed."""
+        self.force_N, self._age_s, self._stretched_mm = self._slid(speed_mm_s)
+
+    def _slid(self, speed_mm_s: float) -> tuple[float, float, list[float]]:
+        """At the step's end: the force, the age of the contact, how far its springs are stretched."""
+        second, dt_s = self._second, self._dt_s
         # exact for a constant speed: what is left of the age, and what the step adds to it
         renewed = abs(speed_mm_s) * dt_s / second.renewed_mm
         added_s = dt_s if renewed == 0.0 else -dt_s * math.expm1(-renewed) / renewed
-        self._age_s = self._age_s * math.exp(-renewed) + added_s
-        level_N = self.kinetic_N * rate_factor(speed_mm_s, self._age_s, second)
-        force_N = 0.0
+        age_s = self._age_s * math.exp(-renewed) + added_s
+        level_N = self.kinetic_N * rate_factor(speed_mm_s, age_s, second)
+        force_N, springs_mm = 0.0, []
         for index, stiffness_N_mm in enumerate(second.springs_N_mm):
             reach_mm = second.spring_shares[index] * level_N / stiffness_N_mm
             stretched_mm = self._stretched_mm[index] + speed_mm_s * dt_s
-            self._stretched_mm[index] = stretched_mm = min(max(stretched_mm, -reach_mm), reach_mm)
+            stretched_mm = min(max(stretched_mm, -reach_mm), reach_mm)
+            springs_mm.append(stretched_mm)
             force_N += stiffness_N_mm * stretched_mm
-        self.force_N = force_N
+        return force_N, age_s, springs_mm
 
     def _magnetised_mT(self, gap_mm: float) -> float:
         second = self._second

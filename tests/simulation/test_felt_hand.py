@@ -1,0 +1,134 @@
+"""The hand that feels, in virtual time: its energies, its rest, and what it does at each kind of brake."""
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+
+from tormagd.simulation.element import Element
+from tormagd.simulation.hand import FeltHand, HandError, Impedance, RecordedHand, SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.plant import Plant
+from tormagd.simulation.second_element import SecondElement
+
+STEP_S, END_S, GAP_MM = 1e-3, 4.0, 50.0
+STROKE = RecordedHand((0.2, 1.0, 2.2, 3.0), (0.0, 15.0, 15.0, 0.0))
+"Pushes, holds, withdraws."
+FINGER, WRIST, ARM = Impedance(0.005, 0.4, 0.005), Impedance(0.1, 0.4, 0.006), Impedance(1.0, 0.3, 0.02)
+BRAKES = ("sample_1", "sample_2", "second")
+at_each_brake = pytest.mark.parametrize("name", BRAKES)
+with_each = pytest.mark.parametrize("impedance", [FINGER, WRIST, ARM], ids=["finger", "wrist", "arm"])
+
+
+def at_gap(name: str) -> PlantParameters:
+    plant = load_plant(name)
+    start = msgspec.structs.replace(plant.assumed, start_left_mm=GAP_MM / 2.0, start_right_mm=GAP_MM / 2.0)
+    return msgspec.structs.replace(plant, assumed=start)
+
+
+def at_brake(name: str, hand: FeltHand, seconds: float = END_S) -> np.ndarray:
+    """A row a step: place, mm, the brake's force and the hand's, N."""
+    plant, rows = Plant(at_gap(name), hand), []
+    for _ in range(round(seconds / STEP_S)):
+        plant.advance(STEP_S)
+        rows.append((plant.handle_mm, plant.element.force_N, hand.force_N))
+    return np.array(rows)
+
+
+def freely(hand: FeltHand) -> np.ndarray:
+    """Its places where no brake is."""
+    return np.array([hand.moved_mm(step * STEP_S, lambda speed_mm_s: 0.0) for step in range(1, round(END_S / STEP_S))])
+
+
+def swung_mm(place_mm: np.ndarray) -> float:
+    """How far a handle went to and fro, beyond where it got to."""
+    return float(np.abs(np.diff(place_mm)).sum() - abs(place_mm[-1] - place_mm[0]))
+
+
+def energies_mJ(rows: np.ndarray, impedance: Impedance) -> np.ndarray:
+    """What the intended stroke put in, what friction and the damper took, and what is in the mass and the spring."""
+    (place_mm, resisting_N, hand_N), dt_s = rows.T, END_S / len(rows)
+    meant_mm = np.interp(dt_s * np.arange(len(place_mm) + 1), STROKE.times_s, STROKE.positions_mm)
+    place_mm = np.append(0.0, place_mm)
+    moved_mm, drawn_mm = np.diff(place_mm), np.diff(meant_mm)
+    apart_mm = meant_mm - place_mm
+    damper_N = impedance.damping_N_s_mm * (drawn_mm - moved_mm) / dt_s
+    speed_mm_s = moved_mm[-1] / dt_s
+    stored = 0.5 * impedance.stiffness_N_mm * apart_mm[-1] ** 2 + 0.5e-3 * impedance.mass_kg * speed_mm_s**2
+    return np.array([hand_N @ drawn_mm, resisting_N @ moved_mm, damper_N @ (drawn_mm - moved_mm), stored])
+
+
+def finely(name: str, impedance: Impedance, intended: RecordedHand, dt_s: float = STEP_S / 20.0) -> np.ndarray:
+    """The same equations by another, explicit method, in 20 times finer steps: rows as of `at_brake`."""
+    parameters = at_gap(name)
+    element = (SecondElement if parameters.second else Element)(parameters, GAP_MM, dt_s)
+    meant_mm = np.interp(dt_s * np.arange(round(END_S / dt_s) + 1), intended.times_s, intended.positions_mm).tolist()
+    place_mm = speed_mm_s = 0.0
+    rows = []
+    for step, (before_mm, after_mm) in enumerate(itertools.pairwise(meant_mm), 1):
+        apart_mm = 0.5 * (before_mm + after_mm) - place_mm - 0.5 * dt_s * speed_mm_s
+        hand_N = impedance.stiffness_N_mm * apart_mm
+        hand_N += impedance.damping_N_s_mm * ((after_mm - before_mm) / dt_s - speed_mm_s)
+        resisting_N = element.force_N
+        speed_mm_s += dt_s * 1e3 / impedance.mass_kg * (hand_N - resisting_N)
+        place_mm += dt_s * speed_mm_s
+        element.advance(step * dt_s, GAP_MM, speed_mm_s)
+        rows.append((place_mm, resisting_N, hand_N))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("impedance", [WRIST, ARM], ids=["wrist", "arm"])
+@at_each_brake
+def test_the_energies_close_and_are_those_of_a_finer_integration(name: str, impedance: Impedance) -> None:
+    found = energies_mJ(at_brake(name, FeltHand(STROKE, impedance)), impedance)
+    put_in, *spent = found
+    assert put_in == pytest.approx(sum(spent), rel=0.01)
+    assert found == pytest.approx(energies_mJ(finely(name, impedance, STROKE), impedance), abs=0.01 * put_in)
+    assert spent[0] > 0.5 * put_in
+
+
+@with_each
+@at_each_brake
+def test_a_brake_makes_no_oscillation_that_the_hand_alone_does_not(name: str, impedance: Impedance) -> None:
+    held = slice(1050, 2200)
+    braked_mm = at_brake(name, FeltHand(STROKE, impedance))[held, 0]
+    assert swung_mm(braked_mm) <= swung_mm(freely(FeltHand(STROKE, impedance))[held]) + 0.02
+    assert np.ptp(braked_mm[-200:]) < 2e-3
+
+
+@with_each
+@at_each_brake
+def test_a_hand_that_lets_go_comes_to_rest(name: str, impedance: Impedance) -> None:
+    hand = FeltHand(SteadyHand(), impedance, lets_go_s=1.0)
+    place_mm, _, hand_N = at_brake(name, hand, 3.0).T
+    assert hand_N[995] > 1.0
+    assert not np.any(hand_N[1000:])
+    assert np.ptp(place_mm[-200:]) < 0.01
+    # no further than its energy takes it against the brake, or the bristles throw it back
+    assert -0.5 < place_mm[-1] - place_mm[999] < 1.5 * 0.5e-3 * impedance.mass_kg * 42.0**2 / 2.0 + 0.5
+
+
+def test_what_sticks_breaks_away_as_in_finer_steps_however_light_the_hand() -> None:
+    creeping = RecordedHand((0.0, END_S), (0.0, 4.0 * END_S))
+    most_N = finely("sample_2", WRIST, creeping)[:, 1].max()
+    kinetic_N = np.median(at_brake("sample_2", FeltHand(SteadyHand(), WRIST))[-500:, 1])
+    assert most_N > 1.05 * kinetic_N
+    for impedance in (FINGER, WRIST):
+        assert at_brake("sample_2", FeltHand(creeping, impedance))[:, 1].max() == pytest.approx(most_N, rel=0.01)
+
+
+def test_a_stiff_hand_goes_where_it_means_to() -> None:
+    place_mm = at_brake("sample_1", FeltHand(STROKE, Impedance(0.1, 1000.0, 1.0)))[:, 0]
+    assert place_mm == pytest.approx(
+        np.array([STROKE.position_mm(STEP_S * (1 + row)) for row in range(4000)]), abs=0.05
+    )
+
+
+def test_it_moves_one_plant_and_no_pad() -> None:
+    hand = FeltHand(STROKE, WRIST)
+    at_brake("sample_1", hand, 0.1)
+    with pytest.raises(ValueError, match=r"time_s = 0\.001"):
+        at_brake("sample_1", hand, 0.1)
+    with pytest.raises(HandError, match=r"felt.*pressing"):
+        Plant(load_plant("pad_1"), FeltHand(STROKE, WRIST))
