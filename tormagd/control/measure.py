@@ -10,6 +10,7 @@ from tormagd.hardware.measurement import Measurement
 from tormagd.model.displacement import MOVING_MM_S, Turn
 
 RATE_FILTER_S: Final = 0.05
+QUICK_FILTER_S: Final = 0.01
 SLIDING_MM: Final = 0.3
 "Friction takes on the level of another rate over some such travel; without travel it does not change."
 FAST_MM_S: Final = 2.0 * MOVING_MM_S
@@ -129,11 +130,14 @@ class Measure:
         before = last.handle
         travel_mm = position_mm - last.handle_mm
         rate_mm_s = low_pass(before.turn.direction * before.rate_mm_s, travel_mm / dt_s, dt_s, RATE_FILTER_S)
+        quick_mm_s = low_pass(before.turn.direction * before.quick_mm_s, travel_mm / dt_s, dt_s, QUICK_FILTER_S)
         slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
         # friction's level is one of 300 and 42 mm/s, and another of 4: how much faster it has been does not count
         from_mm_s = min(before.sliding_mm_s, max(abs(rate_mm_s), FAST_MM_S))
         sliding_mm_s = from_mm_s + slid * (abs(rate_mm_s) - from_mm_s)
         if not self._turns:
-            return Handle(max(position_mm, 0.0), rate_mm_s, before.turn, sliding_mm_s)
+            return Handle(max(position_mm, 0.0), rate_mm_s, before.turn, sliding_mm_s, quick_mm_s)
         turn = before.turn.moved_to(position_mm)
-        return Handle(turn.displacement_mm(position_mm), turn.direction * rate_mm_s, turn, sliding_mm_s)
+        onward = turn.direction
+        displacement_mm = turn.displacement_mm(position_mm)
+        return Handle(displacement_mm, onward * rate_mm_s, turn, sliding_mm_s, onward * quick_mm_s)

@@ -111,13 +111,22 @@ class Handle(Value):
     displacement_mm   travel since `turn`, or how deep a finger is in a pad
     rate_mm_s         positive the way the handle went last, or inwards
     sliding_mm_s      >= 0, the rate at which friction slides: over the last travel, so that a stopped handle keeps it
+    quick_mm_s        the rate over less time, which shows a stop sooner; the same where it is not given
     """
 
-    def __init__(self, displacement_mm: float, rate_mm_s: float, turn: Turn, sliding_mm_s: float = MOVING_MM_S) -> None:
+    def __init__(
+        self,
+        displacement_mm: float,
+        rate_mm_s: float,
+        turn: Turn,
+        sliding_mm_s: float = MOVING_MM_S,
+        quick_mm_s: float | None = None,
+    ) -> None:
         self.displacement_mm: Final = displacement_mm
         self.rate_mm_s: Final = rate_mm_s
         self.turn: Final = turn
         self.sliding_mm_s: Final = sliding_mm_s
+        self.quick_mm_s: Final = rate_mm_s if quick_mm_s is None else quick_mm_s
 
 
 @final

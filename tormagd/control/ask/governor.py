@@ -28,8 +28,6 @@ from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 _LARGEST: Final[float] = LARGEST
 SLOPE_FILTER_S: Final = 0.003
 AHEAD_S: Final = 0.05
-SEEN_S: Final = 0.15
-"A handle is expected to go on as it does for so long: a wall slows it."
 "Setpoints are carried forward along their slope, or past the end of their preview, by no more than this."
 MIN_TIMES: Final = 9
 "So many of TIMES_S are looked at even where a preview ends before, and of a forecast."
@@ -199,11 +197,10 @@ class Governor:
             return [force_N] * len(PATH_S)
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
         wanted_N = [
-            within(wall.force_N(place_mm + rate_mm_s * min(lag_s + after_s, SEEN_S)) + added_N, bounds)
-            for after_s in TIMES_S
+            within(wall.force_N(place_mm + rate_mm_s * (lag_s + after_s)) + added_N, bounds) for after_s in TIMES_S
         ]
-        early_N = within(wall.friction_N + added_N, bounds) + EARLY_N
-        most_N = [early_N if place_mm + rate_mm_s * after_s < wall.place_mm else math.inf for after_s in PATH_S]
+        over_N = within(wall.friction_N + added_N, bounds) - wall.friction_N + EARLY_N
+        most_N = [wall.force_N(place_mm + rate_mm_s * after_s) + over_N for after_s in PATH_S]
         return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _foreseen(self, stamp_s: float, allowed_N: float, age_s: float) -> float:

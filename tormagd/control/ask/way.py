@@ -41,5 +41,5 @@ class Way:
             is_pulled = is_sensor_believed and measured.force_N > PULLS_N
             if is_pulled or turn.displacement_mm(measured.handle_mm) > SLID_MM:
                 is_pushing = not is_pushing
-        self.travel = Travel(self._push_sign * measured.handle_mm, onward * measured.handle.rate_mm_s, is_pushing)
+        self.travel = Travel(self._push_sign * measured.handle_mm, onward * measured.handle.quick_mm_s, is_pushing)
         return self.travel

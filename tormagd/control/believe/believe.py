@@ -28,6 +28,8 @@ MIN_DT_S: Final = 0.003
 MAX_DT_S: Final = 0.02
 "Readings teach at most this often; a gap in the readings counts as the second at most."
 CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
+STOPPING_MM_S: Final = 0.5 * MOVING_MM_S
+"A handle whose rate over the last 10 ms is less stands, whatever its slower rate still says."
 COMES_TO_REST: Final = 3.0
 "A handle that has slid no faster for some travel creeps; one that has slid so many times faster only comes to rest."
 MIN_EXPECTED_N: Final = 0.1
@@ -209,7 +211,12 @@ class Believe:
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
         is_mobilised = self._nominal.contact.is_known(measured)
-        is_slow = self._nominal.contact.slides and (rate_mm_s < MOVING_MM_S or self.handle.moved_gap_at_rest(model_N))
+        # a hand that meets a wall stops within 10 ms, and then its friction is what the hand gives
+        is_slow = self._nominal.contact.slides and (
+            rate_mm_s < MOVING_MM_S
+            or abs(measured.handle.quick_mm_s) < STOPPING_MM_S
+            or self.handle.moved_gap_at_rest(model_N)
+        )
         if is_mobilised and not is_slow:
             self._hear_at_speed(now_s, measured, model_N, dt_s)
         else:
