@@ -2,6 +2,7 @@
 
 import bisect
 import math
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol, final
@@ -95,7 +96,7 @@ class RecordedHand(Value):
 class StrokingHand(Value):
     """Rests until the device is homed, 10 s; then pushes to its reach, rests, withdraws, rests, and again."""
 
-    def __init__(self, push_mm_s: float = 20.0, reach_mm: float = 20.0, rest_s: float = 1.0) -> None:
+    def __init__(self, push_mm_s: float, reach_mm: float, rest_s: float) -> None:
         self.push_mm_s: Final = push_mm_s
         self.reach_mm: Final = reach_mm
         self.rest_s: Final = rest_s
@@ -111,7 +112,7 @@ class StrokingHand(Value):
 class Impedance(Value):
     """What a hand is to the handle: the mass that moves with it, and the spring and damper behind that mass."""
 
-    def __init__(self, mass_kg: float = 0.1, stiffness_N_mm: float = 0.4, damping_N_s_mm: float = 0.006) -> None:
+    def __init__(self, mass_kg: float, stiffness_N_mm: float, damping_N_s_mm: float) -> None:
         self.mass_kg: Final = mass_kg
         self.stiffness_N_mm: Final = stiffness_N_mm
         self.damping_N_s_mm: Final = damping_N_s_mm
@@ -171,6 +172,26 @@ class FeltHand:
         self.speed_mm_s = 2.0 * mean_mm_s - speed_mm_s
         self._time_s, self._place_mm = time_s, self._place_mm + dt_s * mean_mm_s
         return self._place_mm
+
+
+_PUBLISHED: Final = (
+    ((0.004, 0.007), (0.2, 0.8), (0.004, 0.007)),
+    ((0.05, 0.2), (0.1, 1.0), (0.002, 0.01)),
+    ((0.8, 2.0), (0.1, 0.6), (0.005, 0.03)),
+)
+"Finger, wrist, arm: mass, kg, stiffness, N/mm, and damping, N s/mm, from .. to."
+
+
+def drawn_impedance(seed: int) -> Impedance:
+    """A person's hand: a finger's, a wrist's and an arm's by turns, evenly in the logarithms of what was published.
+
+    All are of the order that these give: of a finger tip Hajian and Howe (J Biomech Eng 119, 1997); of a wrist that
+    holds a stylus Kuchenbecker, Park and Niemeyer (ASME IMECE, 2003); of a hand on the arm Hogan (IEEE ICRA, 1989),
+    Dolan, Friedman and Nagurka (IEEE Trans SMC 23, 1993), Tsuji, Morasso, Goto and Ito (Biol Cybern 72, 1995). The
+    handle's own mass is not in them.
+    """
+    draw = random.Random(f"hand {seed}")
+    return Impedance(*[low * (high / low) ** draw.random() for low, high in _PUBLISHED[seed % len(_PUBLISHED)]])
 
 
 def _root(function: Callable[[float], float], start: float, slope: float) -> float:
