@@ -209,7 +209,7 @@ def test_a_bad_recording_is_refused_with_its_line(tmp_path, text: str, said: str
         parse_hand(str(path))
 
 
-BAD_HANDS = ("", "fast", "steady=x", "steady=nan", "steady=1e9", "reversing=0", "missing.csv")
+BAD_HANDS = ("", "fast", "steady=x", "steady=nan", "steady=1e9", "reversing=0", "missing.csv", "felt=mass_kg")
 BAD_FAULTS = (
     *("", "reset@", "reset@x", "reset@1.2.3", "reset=5%"),
     *("drag_left", "drag_left=5", "drag_left=-101%", "clock", "clock=-100%"),
@@ -221,6 +221,8 @@ BAD_FAULTS = (
     [
         *((parse_hand, spec, "") for spec in BAD_HANDS),
         (parse_hand, "pressing=9", r"pressing=9.*0\.1 to 6"),
+        (parse_hand, "felt=rest_s=1,mass_kg=0", r"mass_kg=0.*0\.001 to 20"),
+        (parse_hand, "felt=weight=1", r"'weight'.*mass_kg, stiffness_N_mm"),
         *((parse_fault, spec, "") for spec in BAD_FAULTS),
         *((parse_fault, "gremlins", known) for known in KNOWN),
     ],

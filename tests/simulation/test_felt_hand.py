@@ -14,6 +14,7 @@ from tormagd.simulation.hand import (
     RecordedHand,
     SteadyHand,
     drawn_impedance,
+    parse_hand,
 )
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.plant import Plant
@@ -150,3 +151,14 @@ def test_drawn_hands_are_the_same_again_and_go_from_a_finger_to_an_arm() -> None
         each.damping_N_s_mm / (2.0 * (1e-3 * each.mass_kg * each.stiffness_N_mm) ** 0.5) for each in drawn
     ]
     assert 0.05 < min(damping_ratios) < max(damping_ratios) < 5.0
+
+
+def test_a_felt_hand_of_the_command_line_strokes_once_the_device_is_homed() -> None:
+    hand = parse_hand("felt=push_mm_s=10,reach_mm=5,mass_kg=0.2")
+    assert [hand.position_mm(t) for t in (0.0, 10.0, 10.25, 10.5, 11.5, 11.75, 12.0, 13.0, 13.25)] == [
+        *(0.0, 0.0, 2.5, 5.0, 5.0, 2.5, 0.0, 0.0, 2.5),
+    ]
+    place_mm = at_brake("sample_1", hand, 13.0)[:, 0]
+    # the brake's force is 3 N, the spring 0.4 N/mm: it stays behind, and then does not come all the way back
+    assert place_mm[:10_000] == pytest.approx(0.0, abs=1e-9)
+    assert place_mm.max() < 2.5

@@ -21,7 +21,10 @@ EXACT_N: Final = 1e-9
 ROUNDS: Final = 100
 "Within this, and at most so often, a step of a hand that feels is solved."
 RECORDED = {"t_s": TIME, "position_mm": (-1e6, 1e6, "mm")}
-KNOWN = "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], or a FILE.csv with the columns t_s,position_mm"
+KNOWN = (
+    "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], felt[=KEY=VALUE,...], "
+    "or a FILE.csv with the columns t_s,position_mm"
+)
 
 
 class HandError(ValueError):
@@ -224,6 +227,15 @@ _SIZED: dict[str, tuple[Callable[..., Hand], float, float]] = {
     "pressing": (PressingHand, 0.1, 6.0),
 }
 "By its name, a hand that has a size, and what that may be."
+_FELT: dict[str, tuple[float, float, float]] = {
+    "mass_kg": (0.1, 0.001, 20.0),
+    "stiffness_N_mm": (0.4, 0.0, 100.0),
+    "damping_N_s_mm": (0.006, 0.0, 10.0),
+    "push_mm_s": (20.0, 0.1, 300.0),
+    "reach_mm": (20.0, 0.1, 1000.0),
+    "rest_s": (1.0, 0.0, 1000.0),
+}
+"By its name, a size of a hand that feels: without a word, the least, the most."
 
 
 def parse_hand(spec: str) -> Hand:
@@ -232,9 +244,23 @@ def parse_hand(spec: str) -> Hand:
     if name in _SIZED:
         hand, low, high = _SIZED[name]
         return hand(_number(spec, value, low, high)) if value else hand()
+    if name == "felt":
+        return _felt(spec, value)
     if spec.endswith(".csv"):
         return read_recording(Path(spec))
     raise HandError(f"hand {spec!r}: allowed are {KNOWN}")
+
+
+def _felt(spec: str, text: str) -> FeltHand:
+    sizes = {key: usual for key, (usual, _, _) in _FELT.items()}
+    for word in filter(None, text.split(",")):
+        key, _, value = word.partition("=")
+        if key not in _FELT:
+            raise HandError(f"hand {spec!r}: {key!r} is none of {', '.join(_FELT)}")
+        _, low, high = _FELT[key]
+        sizes[key] = _number(f"felt={word}", value, low, high)
+    given = list(sizes.values())
+    return FeltHand(StrokingHand(*given[3:]), Impedance(*given[:3]))
 
 
 def _number(spec: str, text: str, low: float, high: float) -> float:
