@@ -1,0 +1,232 @@
+"""The patient, simulated: what a robot's tip meets, and the network between.
+
+A robot's tip follows the handle late, rubs in a vessel, and meets a wall. `python -m tormagd.simulation.patient` sends
+what it feels to the daemon, as any patient's unit. `Patient` and `Delay` live in the time that they are given, which
+never falls.
+"""
+
+import argparse
+import heapq
+import math
+import random
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Generic, NamedTuple, TypeVar
+
+from tormagd.interrupt import interrupted_by
+from tormagd.physics.friction import Friction
+from tormagd_client import Client, ClientError
+
+T = TypeVar("T")
+PERIOD_S: Final = 2e-3
+VALID_MS: Final = 100.0
+FORCE, WAY, LAW = MODES = ("force", "way", "law")
+"What a setpoint says: the tip's force; that of each way; or the law by which the force follows the handle."
+VESSEL: Final = Friction(presliding_stiffness_N_mm=2.0, viscous_N_s_mm=0.0, static_ratio=1.2, stribeck_speed_mm_s=2.0)
+"An assumption: it sticks, and slips at less."
+
+
+class Felt(NamedTuple):
+    """What the tip feels. `force_N` resists its way in; `friction_N` is that of the vessel, where it slides;
+    `contact_mm` is the handle's place at the wall where that was met last, None before."""
+
+    tip_mm: float
+    force_N: float
+    wall_N: float
+    friction_N: float
+    stiffness_N_mm: float
+    contact_mm: float | None
+
+
+class Patient:
+    """A tip that follows the handle with a lag of first order, in a vessel with an elastic wall, which may beat.
+
+    `wall_mm` counts from the handle's place at the first update, where the tip is then. Over `buckling_N` the catheter
+    buckles: the force grows no more, and the tip stays behind.
+    """
+
+    def __init__(
+        self,
+        *,
+        lag_s: float = 0.02,
+        friction_N: float = 0.1,
+        wall_mm: float = math.inf,
+        stiffness_N_mm: float = 0.5,
+        buckling_N: float = math.inf,
+        beat_mm: float = 0.0,
+        beat_hz: float = 1.2,
+    ) -> None:
+        if not (lag_s > 0.0 and 0.0 < stiffness_N_mm < math.inf and 0.0 <= friction_N < buckling_N):
+            raise ValueError(
+                f"lag_s = {lag_s}, stiffness_N_mm = {stiffness_N_mm}, friction_N = {friction_N}, buckling_N = "
+                f"{buckling_N}: allowed are a lag and a stiffness above 0, and a friction from 0 to under buckling_N"
+            )
+        self._lag_s, self._friction_N, self._stiffness_N_mm = lag_s, friction_N, stiffness_N_mm
+        self._wall_mm, self._beat_mm, self._beat_hz = wall_mm, beat_mm, beat_hz
+        self._buckling_N = buckling_N
+        self._time_s = math.nan
+        self._start_mm = self._robot_mm = self._tip_mm = 0.0
+        self._rubbing_N = self._deflection_mm = 0.0
+        self._contact_mm: float | None = None
+
+    def update(self, time_s: float, handle_mm: float) -> Felt:
+        """What is felt at that time, the handle having been there since the last update."""
+        if math.isnan(self._time_s):
+            self._time_s, self._start_mm, self._robot_mm, self._tip_mm = time_s, handle_mm, handle_mm, handle_mm
+        dt_s, self._time_s = time_s - self._time_s, time_s
+        self._robot_mm -= (handle_mm - self._robot_mm) * math.expm1(-dt_s / self._lag_s)
+        wall_mm = self._start_mm + self._wall_mm + self._beat_mm * math.sin(math.tau * self._beat_hz * time_s)
+        before_mm, furthest_mm = self._tip_mm, wall_mm + (self._buckling_N - self._friction_N) / self._stiffness_N_mm
+        self._tip_mm = tip_mm = min(self._robot_mm, furthest_mm)
+        if dt_s > 0.0:
+            self._rubbing_N, self._deflection_mm = VESSEL.advance(
+                self._deflection_mm, (tip_mm - before_mm) / dt_s, self._friction_N, dt_s
+            )
+        wall_N = self._stiffness_N_mm * max(tip_mm - wall_mm, 0.0)
+        if wall_N > 0.0:
+            self._contact_mm = wall_mm
+        force_N = min(wall_N + self._rubbing_N, self._buckling_N)
+        return Felt(tip_mm, force_N, wall_N, self._friction_N, self._stiffness_N_mm, self._contact_mm)
+
+
+def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
+    """The fields of a setpoint that says it in that way. A wall that was not met yet is in no law."""
+    if mode == FORCE:
+        return {"servo_cf": abs(felt.force_N)}
+    fields: dict[str, Any] = {"servo_cf": felt.wall_N + felt.friction_N}
+    if mode == WAY:
+        fields["withdraw_cf"] = felt.friction_N
+    elif felt.contact_mm is not None:
+        fields["contact"] = {
+            "handle_mm": felt.contact_mm,
+            "stiffness_N_mm": felt.stiffness_N_mm,
+            "friction_N": felt.friction_N,
+        }
+    return fields
+
+
+class Delay(Generic[T]):
+    """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage from .. to.
+
+    `loss` is the share of messages that is lost in the long run, `burst` how many in a row, in the mean. What is sent
+    later may arrive sooner, where there is jitter.
+    """
+
+    def __init__(
+        self,
+        delay_s: float = 0.0,
+        jitter_s: float = 0.0,
+        loss: float = 0.0,
+        burst: float = 1.0,
+        outage_s: tuple[float, float] = (math.inf, math.inf),
+        seed: int = 0,
+    ) -> None:
+        if not (delay_s >= 0.0 and jitter_s >= 0.0 and burst >= 1.0 and 0.0 <= loss <= 0.5):
+            raise ValueError(
+                f"delay_s = {delay_s}, jitter_s = {jitter_s}, loss = {loss}, burst = {burst}: allowed are times "
+                "from 0, a loss of 0 to 0.5 and bursts from 1"
+            )
+        self._delay_s, self._jitter_s, self._outage_s = delay_s, jitter_s, outage_s
+        self._begins, self._goes_on = loss / (burst * (1.0 - loss)), 1.0 - 1.0 / burst
+        self._draw = random.Random(f"delay {seed}")
+        self._is_losing = False
+        self._sent = 0
+        self._under_way: list[tuple[float, int, float, T]] = []
+
+    def send(self, time_s: float, value: T) -> None:
+        """Give the network a value at that time."""
+        chance, arrives_s = self._draw.random(), time_s + self._delay_s + self._jitter_s * self._draw.random()
+        self._is_losing = chance < (self._goes_on if self._is_losing else self._begins)
+        self._sent += 1
+        if not self._is_losing and not self._outage_s[0] <= time_s < self._outage_s[1]:
+            heapq.heappush(self._under_way, (arrives_s, self._sent, time_s, value))
+
+    def arrived(self, time_s: float) -> list[tuple[float, T]]:
+        """What has arrived since the last call, in the order of arrival: when it was sent, and the value."""
+        found = []
+        while self._under_way and self._under_way[0][0] <= time_s:
+            found.append(heapq.heappop(self._under_way)[2:])
+        return found
+
+
+def places_mm(client: Any) -> list[float]:
+    """The handle's places that have come; what says none is passed over."""
+    heard: list[Any] = client.telemetry()
+    return [message.handle_mm for message in heard if getattr(message, "handle_mm", None) is not None]
+
+
+def run(
+    client: Any,
+    patient: Patient,
+    mode: str,
+    there: Delay[float],
+    back: Delay[dict[str, Any]],
+    is_over: Callable[[float], bool],
+    clock_s: Callable[[], float] = time.monotonic,
+    wait: Callable[[float], None] = time.sleep,
+) -> int:
+    """Let the patient feel until it is over: handle there, setpoints back. Gives how many were published."""
+    began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
+    newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0
+    while not is_over(now_s := clock_s()):
+        for place_mm in places_mm(client):
+            there.send(now_s, place_mm)
+        newest = max([newest, *there.arrived(now_s)])
+        if newest[0] > -math.inf:
+            back.send(now_s, setpoint_of(patient.update(now_s, newest[1]), mode))
+        for sent_s, fields in back.arrived(now_s):
+            if sent_s > newest_s:  # what was overtaken is of no use
+                client.publish(fields.pop("servo_cf"), VALID_MS, began_ns + round(1e9 * sent_s), **fields)
+                newest_s, published = sent_s, published + 1
+        due_s = max(due_s + PERIOD_S, now_s)
+        wait(max(due_s - clock_s(), 0.0))
+    return published
+
+
+def parser() -> argparse.ArgumentParser:
+    """What the simulated patient understands."""
+    made = argparse.ArgumentParser(
+        prog="python -m tormagd.simulation.patient", description="A simulated patient, the source of setpoints."
+    )
+    made.add_argument("folder", help="where the daemon's sockets are")
+    made.add_argument("--mode", choices=MODES, default=FORCE, help="what a setpoint says")
+    made.add_argument("--delay-ms", type=float, default=0.0, metavar="MS", help="each way")
+    made.add_argument("--jitter-ms", type=float, default=0.0, metavar="MS", help="each way, on top of the delay")
+    made.add_argument("--loss", type=float, default=0.0, metavar="SHARE", help="each way, in bursts of 3")
+    made.add_argument("--wall-mm", type=float, default=10.0, metavar="MM", help="from where the handle is first seen")
+    made.add_argument("--stiffness-N-mm", type=float, default=0.5, metavar="N/MM", help="of the wall")
+    made.add_argument("--friction-N", type=float, default=0.1, metavar="N", help="of the vessel")
+    made.add_argument("--seconds", type=float, default=math.inf, metavar="S", help="default until it is interrupted")
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 0: setpoints were published, 1: none were, or the daemon was not reached, 2: usage."""
+    command = parser()
+    options = command.parse_args(arguments)
+    try:
+        patient = Patient(friction_N=options.friction_N, wall_mm=options.wall_mm, stiffness_N_mm=options.stiffness_N_mm)
+        network = 1e-3 * options.delay_ms, 1e-3 * options.jitter_ms, options.loss, 3.0
+        there: Delay[float] = Delay(*network, seed=1)
+        back: Delay[dict[str, Any]] = Delay(*network, seed=2)
+    except ValueError as error:
+        command.error(str(error))
+    ends_s = time.monotonic() + options.seconds
+    with (
+        interrupted_by(signal.SIGTERM, signal.SIGINT) as is_stopped,
+        Client.local(options.folder, 5.0, "patient") as client,
+    ):
+        try:
+            published = run(client, patient, options.mode, there, back, lambda now_s: is_stopped() or now_s >= ends_s)
+        except (ClientError, ValueError) as error:
+            print(f"{command.prog}: {error}", file=sys.stderr)
+            return 1
+    if not published:
+        print(f"{command.prog}: the daemon said no handle_mm, or not in time: nothing was published", file=sys.stderr)
+    return 0 if published else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
