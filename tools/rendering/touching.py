@@ -6,9 +6,7 @@ controller knows: the newest message, and the handle's place and speed. *Infinit
 """
 
 import math
-import random
-from collections import deque
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -19,26 +17,29 @@ from rendering.hands import Legs, WaitingHand
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Rates
 from tormagd.control.ask.governor import EARLY_N
-from tormagd.control.ask.path import TIMES_S, nearest_path_mm
+from tormagd.control.ask.path import FLATTEST_N_MM, TIMES_S, nearest_path_mm
 from tormagd.control.records import TimedSetpoint, Travel, Wall
 from tormagd.lab.arrays import Array
 from tormagd.lab.ideal_carriage import Brake, Drive, brake_of, drive_of
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import FeltHand, Impedance
+from tormagd.simulation.patient import Delay
 from tormagd.simulation.plant import Plant, Truth
 
 PERIOD_S = 1e-3
 SETPOINT_TICKS = 2
+BURST = 25.0
+"Setpoints that are lost in a row, in the mean: 50 ms."
 MOST_N = 2.0
 "What hand and wall come to rest at."
 FREE_MM = 20.0
 "From where the hand begins to push to the wall."
-LEARNING: Legs = [(3.0, 15.0), (1.0, 0.0)]
+LEARNING: Legs = [(2.0, 15.0), (0.8, 0.0)]
 LEARNT_S = sum(lasts_s for lasts_s, _ in LEARNING)
-LEARNING_N, LEARNS_FOR_S = 1.2, 2.5
+LEARNING_N, LEARNS_FOR_S = 1.2, 1.6
 "The device is asked for this while the hand slides, so that it is known."
-RESTS_S = 1.0
+RESTS_S = 0.8
 ONSET_N, COUNTED_N = 0.2, 0.3
 "Over the waiting level: where a wall is felt, and what it has to reach in order to count."
 HELD_N = 0.1
@@ -63,74 +64,48 @@ class Case(NamedTuple):
 
 class Touch(NamedTuple):
     """A row for each tick from when the hand begins to push: time, s, the handle's place behind the wall's, mm, and
-    speed, mm/s; the kinetic force and that on the handle, N; whether the hand has turned."""
+    speed, mm/s; the kinetic force, the one on the handle and the hand's, N."""
 
     time_s: Array
     depth_mm: Array
     speed_mm_s: Array
     kinetic_N: Array
     force_N: Array
+    hand_N: Array
     faults: tuple[str, ...]
     limits: tuple[str, ...]
 
 
-class Line:
-    """One direction of the network: what is sent arrives after `delay_s` and some jitter, in the order of arrival."""
-
-    def __init__(self, delay_s: float, jitter_s: float, loss: float, seed: str) -> None:
-        self._delay_s, self._jitter_s, self._loss = delay_s, jitter_s, loss
-        self._random = random.Random(seed)
-        self._lost_until_s = -math.inf
-        self._flying: deque[tuple[float, Any]] = deque()
-
-    def send(self, now_s: float, thing: Any) -> None:
-        """Bursts of 50 ms are lost, so often that the share comes out."""
-        if self._random.random() < self._loss * PERIOD_S * SETPOINT_TICKS / 0.05:
-            self._lost_until_s = now_s + 0.05
-        if now_s >= self._lost_until_s:
-            self._flying.append((now_s + self._delay_s + self._jitter_s * self._random.random(), thing))
-
-    def arrived(self, now_s: float) -> list[Any]:
-        """What has arrived by now."""
-        there = [thing for at_s, thing in self._flying if at_s <= now_s + 1e-9]
-        if there:
-            self._flying = deque(each for each in self._flying if each[0] > now_s + 1e-9)
-        return there
-
-
-class Patient:
-    """Feels the wall with a tip that is where the handle was, and sends a setpoint for that."""
+class Link:
+    """A patient behind the network, and the newest setpoint that has come from there."""
 
     def __init__(self, case: Case, wall: Wall, withdraw_N: float) -> None:
         one_way_s, jitter_s = 5e-4 * case.round_trip_ms, 1e-3 * case.jitter_ms
-        self._there = Line(one_way_s, jitter_s, case.loss, "there")
-        self._back = Line(one_way_s, jitter_s, case.loss, "back")
-        self._wall, self._tip_mm, self._ticks = wall, -math.inf, 0
-        self._is_law, self._withdraw_N = case.mode.startswith("law"), withdraw_N
-        self._is_way = not case.mode.startswith("force")
-        self.newest: TimedSetpoint | None = None
+        self._there: Delay[float] = Delay(one_way_s, jitter_s, case.loss, BURST, seed=1)
+        self._back: Delay[TimedSetpoint] = Delay(one_way_s, jitter_s, case.loss, BURST, seed=2)
+        self._wall, self._withdraw_N, self._mode = wall, withdraw_N, case.mode
+        self._tip: tuple[float, float] | None = None
+        self._newest: TimedSetpoint | None = None
+        self._ticks = 0
 
     def update(self, now_s: float, handle_mm: float) -> TimedSetpoint | None:
-        """The newest setpoint that has arrived at the console."""
-        self._there.send(now_s, handle_mm)
-        for tip_mm in self._there.arrived(now_s):
-            self._tip_mm = tip_mm
+        """The tip is where the handle was; what came in between is of no use."""
         self._ticks += 1
         if self._ticks % SETPOINT_TICKS == 0:
-            self._back.send(now_s, self._setpoint(now_s))
-        for setpoint in self._back.arrived(now_s):
-            if self.newest is None or setpoint.stamp_s > self.newest.stamp_s:
-                self.newest = setpoint
-        return self.newest
+            self._there.send(now_s, handle_mm)
+        for told in self._there.arrived(now_s):
+            self._tip = max(told, self._tip or told)
+        if self._tip is not None and self._ticks % SETPOINT_TICKS == 0:
+            self._back.send(now_s, self._setpoint(now_s, self._tip[1]))
+        for _, setpoint in self._back.arrived(now_s):
+            if self._newest is None or setpoint.stamp_s > self._newest.stamp_s:
+                self._newest = setpoint
+        return self._newest
 
-    def _setpoint(self, now_s: float) -> TimedSetpoint:
-        return TimedSetpoint(
-            self._wall.force_N(self._tip_mm),
-            now_s,
-            4.0 * VALID_S,
-            withdraw_N=self._withdraw_N if self._is_way else None,
-            wall=self._wall if self._is_law else None,
-        )
+    def _setpoint(self, now_s: float, tip_mm: float) -> TimedSetpoint:
+        withdraw_N = None if self._mode.startswith("force") else self._withdraw_N
+        wall = self._wall if self._mode.startswith("law") else None
+        return TimedSetpoint(self._wall.force_N(tip_mm), now_s, VALID_S, withdraw_N=withdraw_N, wall=wall)
 
 
 def core_of(case: Case) -> Core:
@@ -153,7 +128,7 @@ class Scenario:
         damping_N_s_mm = 2e-3 * math.sqrt(MASS_KG * 1e3 * case.hand_N_mm)
         self.felt = FeltHand(self._hand, Impedance(MASS_KG, case.hand_N_mm, damping_N_s_mm))
         self.wall = Wall(sum(lasts_s * speed_mm_s for lasts_s, speed_mm_s in LEARNING) + FREE_MM, case.wall_N_mm)
-        self._patient = Patient(case, self.wall, core.scene.force.least_N)
+        self._patient = Link(case, self.wall, core.scene.force.least_N)
         self._start_s = 0.0
         self._rows: list[tuple[float, ...]] = []
         self._limits: set[str] = set()
@@ -181,19 +156,23 @@ class Scenario:
         time_s = truth.time_s - self._start_s - LEARNT_S
         if time_s >= 0.0:
             depth_mm = truth.handle_mm - self.wall.place_mm
-            self._rows.append((time_s, depth_mm, truth.handle_mm_s, truth.kinetic_N, truth.force_N))
+            forces_N = truth.kinetic_N, truth.force_N, self.felt.force_N
+            self._rows.append((time_s, depth_mm, truth.handle_mm_s, *forces_N))
             self._limits.update(map(str, limits))
 
     def touch(self, faults: tuple[str, ...] = ()) -> Touch:
         """All that showed."""
-        return Touch(*np.array(self._rows).reshape(-1, 5).T, faults, tuple(sorted(self._limits)))
+        time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N = np.array(self._rows).reshape(-1, 6).T
+        limits = tuple(sorted(self._limits))
+        return Touch(time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N, faults, limits)
 
 
 def rendered(case: Case) -> Touch:
     """Plays one case by the controller. Raises RuntimeError where the device is not enabled."""
     scenario = Scenario(case, core_of(case))
     loop = armed(scenario.core, device_of(case.device), scenario.felt)
-    truth, faults = loop.simulated.truth, ()
+    truth = loop.simulated.truth
+    faults: tuple[str, ...] = ()
     for _ in scenario.begin(loop.now_s):
         sample = loop.tick(scenario.setpoint(loop.now_s, truth))
         truth, faults = sample.truth, tuple(map(str, sample.safety.faults))
@@ -208,7 +187,8 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
     parameters = device_of(case.device)
     scenario = Scenario(case, core_of(case))
     plant = Plant(parameters, scenario.felt)
-    bound = Bound(scenario.core, brake_of(parameters), drive_of(parameters) if has_motors else None)
+    drive = drive_of(parameters) if has_motors else None
+    bound = Bound(scenario.core, brake_of(parameters), drive, case.push_mm_s)
     bound.move(plant, scenario.core.scene.insert.gap_open_mm)
     plant.advance(PERIOD_S)
     for _ in scenario.begin(plant.time_s):
@@ -221,10 +201,12 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
 class Bound:
     """A gap that the device's own motors move, to where its true force is the one wanted."""
 
-    def __init__(self, core: Core, brake: Brake, drive: Drive | None) -> None:
+    def __init__(self, core: Core, brake: Brake, drive: Drive | None, push_mm_s: float) -> None:
         self._core, self._drive = core, drive
         force = core.scene.force
-        self._waiting_N, self._most_N = force.waiting_N, force.most_N
+        # what waits is what the hand feels at its speed; all else here is the level it slides at
+        faster_N = brake.sliding_N(force.waiting_N, push_mm_s) - force.waiting_N
+        self._waiting_N, self._most_N = force.waiting_N - faster_N, force.most_N
         self._gap_mm = np.arange(brake.gap_mm[0], brake.gap_mm[-1], GRID_MM)
         moment_Tm = np.interp(self._gap_mm, brake.gap_mm, brake.moment_Tm)
         self._fresh_N = np.interp(moment_Tm, brake.strength_Tm, brake.fresh_N)
@@ -246,27 +228,25 @@ class Bound:
             axis.position_m += 1e-3 * by_mm
             axis.angle_rad += by_mm / lead_mm_rad
 
-    def _gap_for(self, force_N: float, strength: float) -> float:
-        bounded_N = min(max(force_N, self._waiting_N), self._most_N)
-        return float(np.interp(-bounded_N / strength, -self._fresh_N, self._gap_mm))
+    def _gaps_for(self, forces_N: Array, strength: float) -> Array:
+        bounded_N = np.clip(forces_N, self._waiting_N, self._most_N)
+        return np.interp(-bounded_N / strength, -self._fresh_N, self._gap_mm)
 
     def _wanted_mm(self, setpoint: TimedSetpoint | None, truth: Truth, strength: float) -> float:
-        if setpoint is None:
-            return self._gap_for(0.0, strength)
         travel = Travel(truth.handle_mm, truth.handle_mm_s, self._is_pushing)
-        wall = setpoint.wall
+        wall = None if setpoint is None else setpoint.wall
         if wall is None or not self._is_pushing or self._drive is None:
-            return self._gap_for(setpoint.asked_N(travel), strength)
-        places_mm = [truth.handle_mm + truth.handle_mm_s * after_s for after_s in TIMES_S]
-        wanted_mm = [self._gap_for(wall.force_N(place_mm), strength) for place_mm in places_mm]
+            asked_N = 0.0 if setpoint is None else setpoint.asked_N(travel)
+            return float(self._gaps_for(np.array(asked_N), strength))
+        depths_mm = truth.handle_mm - wall.place_mm + truth.handle_mm_s * np.array(TIMES_S)
+        wanted_mm = self._gaps_for(wall.friction_N + wall.stiffness_N_mm * np.maximum(depths_mm, 0.0), strength)
         slopes = np.interp(wanted_mm, self._gap_mm[1:], np.diff(self._fresh_N) / GRID_MM)
-        weights = [
-            max(slope * slope, 1e-6) * lasts_s for slope, lasts_s in zip(slopes, np.gradient(TIMES_S), strict=True)
-        ]
+        weights = np.maximum(slopes * slopes, FLATTEST_N_MM**2) * np.gradient(TIMES_S)
         speed_mm_s = max(abs(self._speed_mm_s), self._core.gap_speed_mm_s)
-        path_mm = nearest_path_mm(truth.gap_mm, PERIOD_S, TIMES_S, wanted_mm, weights, speed_mm_s, 1)[0]
-        most_N = wall.force_N(truth.handle_mm) + max(self._waiting_N, self._fresh_N[-1] * strength) + EARLY_N
-        return max(path_mm, self._gap_for(most_N, strength))
+        path = nearest_path_mm(truth.gap_mm, PERIOD_S, TIMES_S, wanted_mm.tolist(), weights.tolist(), speed_mm_s, 1)
+        waiting_N = max(self._waiting_N, float(self._fresh_N[-1]) * strength)
+        most_N = wall.force_N(truth.handle_mm) - wall.friction_N + waiting_N + EARLY_N
+        return max(path[0], float(self._gaps_for(np.array(most_N), strength)))
 
     def _moved(self, gap_mm: float, wanted_mm: float) -> float:
         drive = self._drive

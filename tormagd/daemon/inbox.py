@@ -223,7 +223,7 @@ class SetpointInbox:
             self.hold.number,
             now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s),
             setpoint.withdraw_cf,
-            wall and Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
+            None if wall is None else Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
         )
 
     def _make_room(self, name: str, now_s: float) -> None:

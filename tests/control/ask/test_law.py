@@ -64,6 +64,8 @@ def test_from_one_wall_to_the_next_the_force_goes_along_a_ramp(following: Follow
     steps_N = []
     for wall in [Wall(10.0, 0.05, 0.6)] * 100 + [None] * 100:
         ask = following.ask(at, force_N=1.6, wall=wall)
+        assert ask.asked_N is not None
+        assert before.asked_N is not None
         steps_N.append(ask.asked_N - before.asked_N)
         before = ask
     assert max(map(abs, steps_N)) <= SCENE.release_N_s * PERIOD_S + 1e-9

@@ -1,0 +1,60 @@
+"""What a hand feels of a wall, in virtual time: near the bound that stands beside it."""
+
+import math
+
+import pytest
+from contact import LATER_MS, WORSE, WORSE_N, judged, kept, shown
+from rendering.device_draws import device
+from rendering.following import VALID_S, armed
+from rendering.touching import Case, core_of
+
+from tormagd.control.records import TimedSetpoint
+from tormagd.simulation.hand import FeltHand, Impedance
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[str, dict]:
+    """A firm wall, touched in three ways over 100 ms."""
+    modes = ("force", "way", "law_standby")
+    return {mode: judged(Case("draw 100", 0.3, 0.25, 30.0, 100.0, mode)) for mode in modes}
+
+
+def test_a_wall_is_felt_when_carriages_of_this_speed_make_it(rows) -> None:
+    for row in rows.values():
+        assert row["onset_lag_ms"] <= row["onset_bound_ms"] + LATER_MS
+        assert row["rms_N"] <= WORSE * row["rms_bound_N"] + WORSE_N
+        assert (row["faults"], row["swings"]) == ([], 0)
+
+
+def test_a_law_with_a_standby_is_felt_in_half_the_time_and_not_before(rows) -> None:
+    assert rows["law_standby"]["felt_1_2_N_ms"] < 0.45 * rows["force"]["felt_1_2_N_ms"]
+    assert rows["law_standby"]["tip_depth_mm"] < 0.8 * rows["force"]["tip_depth_mm"]
+    assert max(row["early_N"] for row in rows.values()) < 0.13
+    assert rows["law_standby"]["free_drag_N"] == pytest.approx(rows["law_standby"]["standby_N"], abs=0.06)
+
+
+def test_a_hand_that_draws_back_is_let_go(rows) -> None:
+    assert rows["way"]["withdrawal_held_ms"] < 0.75 * rows["force"]["withdrawal_held_ms"]
+    assert rows["way"]["withdrawal_held_ms"] <= rows["way"]["withdrawal_bound_ms"] + 100.0
+
+
+def test_the_table_has_a_row_for_each_way(rows) -> None:
+    table = shown({"kept": kept(list(rows.values()))})
+    assert [line.split()[1] for line in table.splitlines()[2:]] == list(rows)
+
+
+class Trembling:
+    """A hand that slides, and then trembles 8 times a second around a place 5 mm further on."""
+
+    def position_mm(self, time_s: float) -> float:
+        onset_s = max(time_s - 12.0, 0.0)
+        return 15.0 * min(time_s, 12.0) + 5.0 * min(onset_s, 1.0) + 0.5 * math.sin(math.tau * 8.0 * onset_s)
+
+
+def test_a_tremor_changes_no_way() -> None:
+    core = core_of(Case("sample_1", 0.3, 0.25, 30.0, 0.0, "way"))
+    loop = armed(core, device("sample_1"), FeltHand(Trembling(), Impedance(0.15, 0.3, 0.01)))
+    run = loop.run(15.5 - loop.now_s, lambda now_s: TimedSetpoint(1.5, now_s, VALID_S, withdraw_N=0.5))
+    kinetic_N = [sample.truth.kinetic_N for sample in run if sample.time_s > 13.5]
+    assert max(kinetic_N) - min(kinetic_N) < 0.1
+    assert min(kinetic_N) > 1.3

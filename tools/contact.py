@@ -1,0 +1,273 @@
+"""What a hand feels that pushes into a wall and draws back: run and bound, in virtual time.
+
+    contact.py [--quick] [--draws N] [--json] [--picture FILE.png]
+
+Onset: from when the wall's force at the handle's place reaches the waiting level W and 0.2 N to when the kinetic force
+does. W is what carriages without inertia leave of the open gap, the scene's least force and its standby. RMS: kinetic
+force less the wall's, at least W, from the wall's place until the hand turns; less W after that. Held: how long the
+handle is held back by more than W and 0.1 N while the hand draws it back. Devices are simulated: sample 1 was tuned on,
+the others judge. `--draws` are random walls, pushes and hands behind a network with jitter of 30 ms and 5 % loss in
+bursts. The band of the picture is the just noticeable difference of force, 10 % (Jones 1989); that of stiffness is 22 %
+(Jones and Hunter 1990).
+"""
+
+import argparse
+import json
+import math
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from rendering.device_draws import SAMPLES, SECOND
+from rendering.touching import COUNTED_N, FREE_MM, HELD_N, MASS_KG, ONSET_N, Case, Touch, core_of, ideal, rendered
+from tqdm import tqdm
+
+from tormagd.lab.arrays import Json, Mask, rms
+from tormagd.lab.pages import subplots, table
+
+DEVICES = (*SAMPLES, "draw 100", "draw 103", SECOND)
+QUICK_DEVICES = ("sample_2", SECOND)
+HANDS_N_MM, QUICK_HANDS_N_MM = (0.1, 0.3, 1.0), (0.3,)
+TOUCHES = ((0.05, 60.0), (0.25, 10.0), (0.25, 30.0), (1.0, 30.0))
+"Walls, N/mm, and pushes, mm/s."
+ROUND_TRIPS_MS = (0.0, 100.0, 400.0)
+MODES = ("force", "force_standby", "way", "way_standby", "law", "law_standby")
+JITTER_MS, LOSS = 30.0, 0.05
+EARLY_TICKS = 20
+"Before the wall, what is exceeded for no longer does not count."
+LATER_MS, WORSE, WORSE_N = 40.0, 1.1, 0.015
+"What has to hold of 95 %: onset and RMS against the bound's."
+SWINGS_MM_S = 5.0
+FORCE_JND = 0.10
+
+
+def cases(is_quick: bool) -> list[Case]:
+    """The matrix."""
+    devices, hands = (QUICK_DEVICES, QUICK_HANDS_N_MM) if is_quick else (DEVICES, HANDS_N_MM)
+    return [
+        Case(device, hand, *touched, round_trip_ms, mode)
+        for device, hand, touched, round_trip_ms, mode in product(devices, hands, TOUCHES, ROUND_TRIPS_MS, MODES)
+    ]
+
+
+def drawn(count: int) -> list[Case]:
+    """Random touches behind a bad network."""
+    random = np.random.default_rng(2037)
+    return [
+        Case(
+            str(random.choice(DEVICES)),
+            float(np.exp(random.uniform(math.log(0.1), 0.0))),
+            float(np.exp(random.uniform(math.log(0.05), 0.0))),
+            float(random.uniform(10.0, 60.0)),
+            float(random.uniform(0.0, 400.0)),
+            str(random.choice(MODES)),
+            JITTER_MS,
+            LOSS,
+        )
+        for _ in range(count)
+    ]
+
+
+def judged(case: Case) -> Json:
+    """The row of one case: run, bound, and what a gap without inertia would leave."""
+    run, bound, infinite = rendered(case), ideal(case), ideal(case, has_motors=False)
+    free = infinite.depth_mm < -0.5 * FREE_MM
+    waiting_N = float(infinite.kinetic_N[free & (infinite.time_s < infinite.time_s[-1] / 2.0)].mean())
+    is_counted = case.wall_N_mm * infinite.depth_mm.max() >= waiting_N + COUNTED_N
+    force = core_of(case).scene.force
+
+    def lag_ms(touch: Touch) -> float | None:
+        return onset_lag_ms(touch, case.wall_N_mm, waiting_N) if is_counted else None
+
+    return {
+        **{key: value for key, value in case._asdict().items() if key != "hand_N_mm"},
+        "hand": case.hand_N_mm,
+        "waiting_N": waiting_N,
+        "onset_lag_ms": lag_ms(run),
+        "onset_bound_ms": lag_ms(bound),
+        "rms_N": rms_N(run, case.wall_N_mm, waiting_N),
+        "rms_bound_N": rms_N(bound, case.wall_N_mm, waiting_N),
+        "felt_1_2_N_ms": reached_ms(run, case.wall_N_mm, 1.2),
+        "felt_stiffness_ratio": felt_stiffness_ratio(run, case.wall_N_mm),
+        "free_drag_N": float(
+            run.force_N[(run.depth_mm < -2.0) & (run.depth_mm > -0.5 * FREE_MM) & pushing(run)].mean()
+        ),
+        "standby_N": None if not force.standby_N else force.standby_N,
+        "withdrawal_held_ms": held_ms(run, waiting_N),
+        "withdrawal_bound_ms": held_ms(bound, waiting_N),
+        "tip_depth_mm": float(run.depth_mm.max()),
+        "tip_depth_bound_mm": float(bound.depth_mm.max()),
+        "tip_depth_infinite_mm": float(infinite.depth_mm.max()),
+        "early_N": early_N(run, waiting_N),
+        "swings": swings(run),
+        "energy_error": energy_error(run),
+        "most_N_exceeded": max(float(run.kinetic_N.max()) - force.most_N, 0.0),
+        "faults": list(run.faults),
+        "limits": list(run.limits),
+    }
+
+
+def free_drag_N(touch: Touch) -> float:
+    """What a handle feels on its way to the wall."""
+    return float(touch.force_N[(touch.depth_mm < -2.0) & (touch.depth_mm > -0.5 * FREE_MM) & pushing(touch)].mean())
+
+
+def pushing(touch: Touch) -> Mask:
+    """The rows before the hand turns."""
+    found: Mask = touch.time_s < touch.time_s[-1] / 2.0
+    return found
+
+
+def reached_ms(touch: Touch, wall_N_mm: float, force_N: float) -> float | None:
+    """From when the wall's force at the handle's place reaches it to when the kinetic force does; None where either
+    never does."""
+    there, felt = wall_N_mm * touch.depth_mm >= force_N, touch.kinetic_N >= force_N
+    if not (there.any() and felt.any()):
+        return None
+    return 1e3 * float(touch.time_s[felt.argmax()] - touch.time_s[there.argmax()])
+
+
+def onset_lag_ms(touch: Touch, wall_N_mm: float, waiting_N: float) -> float | None:
+    """The same of what shows a wall."""
+    return reached_ms(touch, wall_N_mm, waiting_N + ONSET_N)
+
+
+def rms_N(touch: Touch, wall_N_mm: float, waiting_N: float) -> float:
+    """Of the kinetic force against what should have been felt."""
+    begins = int((touch.depth_mm >= 0.0).argmax())
+    wanted_N = np.where(pushing(touch), np.maximum(wall_N_mm * touch.depth_mm, waiting_N), waiting_N)
+    return rms((touch.kinetic_N - wanted_N)[begins:])
+
+
+def felt_stiffness_ratio(touch: Touch, wall_N_mm: float) -> float | None:
+    """The slope of what is felt over the handle's place behind the wall, over the wall's."""
+    inside = (touch.depth_mm > 0.0) & (touch.speed_mm_s > 1.0) & pushing(touch)
+    if inside.sum() < 10:
+        return None
+    return float(np.polyfit(touch.depth_mm[inside], touch.force_N[inside], 1)[0] / wall_N_mm)
+
+
+def held_ms(touch: Touch, waiting_N: float) -> float:
+    """How long the handle is held back while the hand draws it back."""
+    return float((-touch.force_N[~pushing(touch)] > waiting_N + HELD_N).sum())
+
+
+def early_N(touch: Touch, waiting_N: float) -> float:
+    """Over W before the wall, for more than EARLY_TICKS."""
+    before = touch.kinetic_N[: int((touch.depth_mm >= 0.0).argmax())]
+    return float(np.sort(before)[-EARLY_TICKS - 1] - waiting_N)
+
+
+def swings(touch: Touch) -> int:
+    """How often the handle turns, but for the hand's own turn: of a brake that holds it, twice on its bristles."""
+    moving = touch.speed_mm_s[np.abs(touch.speed_mm_s) > SWINGS_MM_S]
+    return max(int((np.diff(np.sign(moving)) != 0.0).sum()) - 1, 0)
+
+
+def energy_error(touch: Touch) -> float:
+    """What of the hand's work is neither in the handle's motion nor taken by the brake, as a share of all that it
+    does."""
+    travel_mm = np.diff(touch.depth_mm)
+    given = float(((touch.hand_N - touch.force_N)[1:] * travel_mm).sum())
+    first_mm_s, last_mm_s = touch.speed_mm_s[[0, -1]]
+    moving = 0.5e-3 * MASS_KG * float(last_mm_s**2 - first_mm_s**2)
+    return abs(given - moving) / float(np.abs(touch.hand_N[1:] * travel_mm).sum())
+
+
+def kept(rows: list[Json]) -> Json:
+    """By mode, the shares of what has to hold, and the worst."""
+    found: Json = {}
+    for mode in dict.fromkeys(row["mode"] for row in rows):
+        of_mode = [row for row in rows if row["mode"] == mode]
+        late = [
+            row["onset_lag_ms"] - row["onset_bound_ms"]
+            for row in of_mode
+            if row["onset_lag_ms"] is not None and row["onset_bound_ms"] is not None
+        ]
+        worse = [row["rms_N"] - WORSE * row["rms_bound_N"] - WORSE_N for row in of_mode]
+        held = [row["withdrawal_held_ms"] - row["withdrawal_bound_ms"] for row in of_mode]
+        early = [row["early_N"] for row in of_mode]
+        found[mode] = {
+            "cases": len(of_mode),
+            "counted": len(late),
+            "late_ms": [float(np.quantile(late or [math.nan], share)) for share in (0.5, 0.95, 1.0)],
+            "rms_kept": float(np.mean([each <= 0.0 for each in worse])),
+            "rms_over_N": float(np.quantile(worse, 0.95)),
+            "held_ms": [float(np.quantile(held, share)) for share in (0.5, 0.95)],
+            "early_N": [float(np.quantile(early, share)) for share in (0.5, 0.95, 1.0)],
+            "over_most_N": max(row["most_N_exceeded"] for row in of_mode),
+            "swings": max(row["swings"] for row in of_mode),
+            "faults": sum(bool(row["faults"]) for row in of_mode),
+        }
+    return found
+
+
+def shown(result: Json) -> str:
+    """The table: run against bound, by mode."""
+    rows = [
+        [
+            mode,
+            f"{row['counted']} of {row['cases']}",
+            *(f"{late:.0f}" for late in row["late_ms"]),
+            f"{row['rms_kept']:.0%}",
+            *(f"{held:.0f}" for held in row["held_ms"]),
+            *(f"{1e3 * early:.0f}" for early in row["early_N"][1:]),
+            f"{row['over_most_N']:.2f}",
+            str(row["swings"]),
+            str(row["faults"]),
+        ]
+        for mode, row in result["kept"].items()
+    ]
+    head = ["mode", "counted", "onset later than bound, ms: p50", "p95", "worst", "RMS kept"]
+    head += ["held longer, ms: p50", "p95", "early, mN: p95", "worst", "over most, N", "swings", "faults"]
+    return table(head, rows)
+
+
+def draw(picture: Path) -> None:
+    """What was there and what was felt, of one wall in four ways."""
+    figure, axes = subplots((11.0, 7.0), 2, 2, sharex=True, sharey=True)
+    for axis, mode in zip(axes.flat, ("force", "way", "law", "law_standby"), strict=True):
+        case = Case("sample_2", 0.3, 0.25, 30.0, 100.0, mode)
+        run, bound = rendered(case), ideal(case)
+        wall_N = case.wall_N_mm * np.maximum(run.depth_mm, 0.0)
+        axis.fill_between(
+            run.time_s, (1.0 - FORCE_JND) * wall_N, (1.0 + FORCE_JND) * wall_N, alpha=0.3, label="the wall, +- 10 %"
+        )
+        axis.plot(bound.time_s, bound.kinetic_N, "--", label="carriages of this speed")
+        axis.plot(run.time_s, run.kinetic_N, label="felt while it slides")
+        axis.plot(run.time_s, run.force_N, ":", label="on the handle")
+        axis.set_title(f"{mode}: wall 0.25 N/mm, 30 mm/s, round trip 100 ms")
+        axis.set_ylabel("N")
+    axes[0, 0].legend()
+    for axis in axes[1]:
+        axis.set_xlabel("s")
+    figure.savefig(picture)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit code 0: all that has to hold does; else 1."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="two devices, one hand")
+    parser.add_argument("--draws", type=int, default=0, metavar="N", help="random touches instead of the matrix")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png")
+    options = parser.parse_args(arguments)
+    played = drawn(options.draws) if options.draws else cases(options.quick)
+    with ProcessPoolExecutor(os.process_cpu_count() if hasattr(os, "process_cpu_count") else os.cpu_count()) as pool:
+        rows = list(tqdm(pool.map(judged, played), total=len(played), disable=options.json))
+    result = {"cases": rows, "kept": kept(rows), "energy_error": max(row["energy_error"] for row in rows)}
+    if options.picture:
+        draw(options.picture)
+    print(json.dumps(result) if options.json else shown(result))
+    is_kept = all(
+        row["late_ms"][1] <= LATER_MS and row["rms_kept"] >= 0.95 and not row["faults"]
+        for row in result["kept"].values()
+    )
+    return 0 if is_kept else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
