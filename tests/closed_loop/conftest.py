@@ -7,7 +7,8 @@ import pytest
 from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.records import Plan, TimedSetpoint
+from tormagd.control.records import TimedSetpoint
+from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, SteadyHand
@@ -61,11 +62,6 @@ def arm(make: Maker) -> Maker:
 def armed(arm: Maker) -> ClosedLoop:
     """A loop that is armed: homing is the same every time."""
     return arm()
-
-
-def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
-    """A plan for a gap instead of a force."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from tormagd.config import Config
 from tormagd.control.core import Stepper
 from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
 from tormagd.control.move.reference import Reference
-from tormagd.control.records import Plan
+from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.safety.operating_state import OperatingState
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
@@ -27,11 +27,6 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 CONFIG = Config()
 SCENE = load_scene("coronary")
 OPEN_MM = 95.0
-
-
-def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
-    """A plan for a gap instead of a force."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
 
 
 def on_the_way(loop: ClosedLoop, gap_mm: float, ticks: int) -> list[Sample]:

@@ -1,11 +1,11 @@
 """The brake is not closed by mistake: three layers that each hold alone, and a sensor that is judged (synthetic)."""
 
 import random
-from collections.abc import Callable
 
 import msgspec
 import numpy as np
 import pytest
+from fault_matrix.rig import Lie, LyingSensor
 
 from tormagd.assembly.build import Core
 from tormagd.closed_loop import Sample
@@ -17,39 +17,7 @@ from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
-from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, ReversingHand
-
-
-class LyingSensor:
-    """Before a device's own force sensor from `from_s` (its time) on; `lie` makes a false reading of a true one."""
-
-    def __init__(self, device: VirtualDevice, lie: Callable[[float], float], from_s: float = 0.0) -> None:
-        self._own, self._lie, self._from_s, self._time_s = device.messages.plant.force_sensor, lie, from_s, 0.0
-        device.messages.plant.force_sensor = self
-
-    def advance(self, time_s: float, force_N: float) -> None:
-        """See `simulation.plant.ForceSensor`."""
-        self._time_s = time_s
-        self._own.advance(time_s, force_N)
-
-    @property
-    def reading_N(self) -> float:
-        """What is shown, rounded as the wire does."""
-        own = self._own.reading_N
-        return own if self._time_s < self._from_s else min(max(self._lie(own), -20.0), 20.0)
-
-
-def frozen() -> Callable[[float], float]:
-    """A sensor that goes on showing its first reading."""
-    first: list[float] = []
-
-    def lie(reading_N: float) -> float:
-        first[:] = first or [reading_N]
-        return first[0]
-
-    return lie
-
 
 CONFIG = Config(scene="coronary")
 ASKED_N, MOST_N = 1.5, 2.0
@@ -71,15 +39,15 @@ def named_s(samples: list[Sample]) -> float:
 
 # -- the sensor ----------------------------------------------------------------------------------------------------
 
-LIES: dict[str, Callable[[], Callable[[float], float]]] = {
-    "+0.3 N": lambda: lambda reading_N: reading_N + 0.3,
-    "-0.3 N": lambda: lambda reading_N: reading_N - 0.3,
-    "-0.5 N": lambda: lambda reading_N: reading_N - 0.5,
-    "+1 N": lambda: lambda reading_N: reading_N + 1.0,
-    "-1 N": lambda: lambda reading_N: reading_N - 1.0,
-    "frozen": frozen,
-    "tenfold": lambda: lambda reading_N: 10.0 * reading_N,
-    "inverted": lambda: lambda reading_N: -reading_N,
+LIES: dict[str, Lie] = {
+    "+0.3 N": lambda _, reading_N: reading_N + 0.3,
+    "-0.3 N": lambda _, reading_N: reading_N - 0.3,
+    "-0.5 N": lambda _, reading_N: reading_N - 0.5,
+    "+1 N": lambda _, reading_N: reading_N + 1.0,
+    "-1 N": lambda _, reading_N: reading_N - 1.0,
+    "frozen": lambda first_N, _: first_N,
+    "tenfold": lambda _, reading_N: 10.0 * reading_N,
+    "inverted": lambda _, reading_N: -reading_N,
 }
 
 
@@ -87,7 +55,7 @@ LIES: dict[str, Callable[[], Callable[[float], float]]] = {
 def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(arm, render, lie: str) -> None:
     loop = arm()
     render(loop, ASKED_N, 2.0)
-    LyingSensor(loop.device, LIES[lie](), loop.now_s)
+    LyingSensor(loop.simulated.plant, LIES[lie])
     samples = render(loop, ASKED_N, 1.5)
     assert named_s(samples) < 0.5
     assert worst_N(samples) < ASKED_N + 0.25
@@ -99,7 +67,7 @@ def lying(make):
 
     def build(lie: str, **options: object):
         loop = make(**options)
-        LyingSensor(loop.device, LIES[lie]())
+        LyingSensor(loop.simulated.plant, LIES[lie])
         loop.arm()
         return loop
 
@@ -145,7 +113,9 @@ def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(arm, render) -> 
     loop = arm("sample_3", ReversingHand(2.0))
     render(loop, ASKED_N, 2.0)
     start_s = loop.device.truth.time_s
-    LyingSensor(loop.device, lambda reading_N: reading_N + 0.2 / 60.0 * (loop.device.truth.time_s - start_s))
+    LyingSensor(
+        loop.simulated.plant, lambda _, reading_N: reading_N + 0.2 / 60.0 * (loop.device.truth.time_s - start_s)
+    )
     samples = render(loop, ASKED_N, 24.0)
     assert loop.planner.believe.zero.zero_N == pytest.approx(0.08, abs=0.04)
     sliding = [abs(each.truth.force_N) for each in samples[-4_000:] if slides(each)]
@@ -164,7 +134,7 @@ def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_of
     before = loop.planner.believe.strength.fit
     # as after ten minutes of turning the one way
     loop.planner.believe.zero.variance_N2 = 1.01 * UNKNOWN_SD_N**2
-    LyingSensor(loop.device, lambda reading_N: reading_N + 0.1)
+    LyingSensor(loop.simulated.plant, lambda _, reading_N: reading_N + 0.1)
     samples = render(loop, ASKED_N, 3.0)
     assert (samples[-1].plan.limits, loop.planner.believe.strength.fit) == ((Limit.OFFSET_UNKNOWN,), before)
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
@@ -173,7 +143,7 @@ def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_of
 def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, render) -> None:
     loop = arm()
     render(loop, ASKED_N, 2.0)
-    LyingSensor(loop.device, LIES["-1 N"](), loop.now_s)
+    LyingSensor(loop.simulated.plant, LIES["-1 N"])
     samples = render(loop, ASKED_N, 3.0)
     assert samples[-1].safety.faults == (Fault.SENSOR,)
     healthy_s = 1e-3 * sum(not sample.safety.faults for sample in samples)

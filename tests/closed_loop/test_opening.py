@@ -6,13 +6,14 @@ from functools import partial
 
 import msgspec
 import pytest
+from benchmarks.step import drive as held
 from fault_matrix.bad_lines import BadSerialLine, losing
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.assembly.build import Core
-from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
+from tormagd.closed_loop import ClosedLoop, VirtualBus
 from tormagd.config import Config
-from tormagd.control.records import Plan
+from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.safety.codes import Fault
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.device import MessageDevice, VirtualDevice
@@ -50,15 +51,6 @@ def closed(core: Core) -> Opens:
         return loop
 
     return build
-
-
-def gap_plan(gap_mm: float, now_s: float = 0.0) -> Plan:
-    """A plan for a gap instead of a force."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
-
-
-def held(loop: ClosedLoop, gap_mm: float, seconds: float) -> list[Sample]:
-    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(1e3 * seconds))]
 
 
 def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0) -> float:

@@ -22,13 +22,24 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from fault_matrix.bad_lines import MakeWay, Way, damaging, delaying, doubling, losing, reordering, whole
+from extremes.stages import leaves
+from fault_matrix.bad_lines import (
+    MakeWay,
+    Way,
+    damaging,
+    delaying,
+    doubling,
+    frame_of,
+    losing,
+    reordering,
+    unit_of,
+    whole,
+)
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Device
-from tormagd.exact import plain
 from tormagd.hardware.backend import Backend, BackendError, choose
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
@@ -36,7 +47,7 @@ from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState
 from tormagd.simulation.can_device import DEVICE, CanDevice
-from tormagd.simulation.can_frame import MAX_IDENTIFIER, CanFrame, from_socket, to_socket
+from tormagd.simulation.can_frame import CanFrame, from_socket, to_socket
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import parse_hand
 from tormagd.simulation.parameters import load_plant
@@ -200,10 +211,10 @@ class PacketEnd:
         self.device = CanDevice(device.messages)
 
     def units(self, now_s: float) -> list[bytes]:
-        return [_unit(frame) for sender, frame in self.device.transmit(now_s) if sender == DEVICE]
+        return [unit_of(frame) for sender, frame in self.device.transmit(now_s) if sender == DEVICE]
 
     def take(self, now_s: float, unit: bytes) -> None:
-        self.device.receive(now_s, _frame(unit))
+        self.device.receive(now_s, frame_of(unit))
 
 
 class TormagsimEnd(PacketEnd):
@@ -218,10 +229,10 @@ class TormagsimEnd(PacketEnd):
         self._host: socket.socket | None = None
 
     def hear(self) -> bytes:
-        return _unit(from_socket(self._connected().recv(64)))
+        return unit_of(from_socket(self._connected().recv(64)))
 
     def say(self, unit: bytes, backend: Backend) -> None:
-        self._connected().send(to_socket(_frame(unit)))
+        self._connected().send(to_socket(frame_of(unit)))
 
     def close(self) -> None:
         self._listener.close()
@@ -245,14 +256,14 @@ class BusEnd(PacketEnd):
 
     def hear(self) -> bytes:
         while (message := self.bus.recv(PATIENCE_S)) is not None:
-            unit = _unit(CanFrame(message.arbitration_id, bytes(message.data)))
+            unit = unit_of(CanFrame(message.arbitration_id, bytes(message.data)))
             if unit not in self._echoes:
                 return unit
             self._echoes.remove(unit)
         raise AssertionError("the backend sent nothing")
 
     def say(self, unit: bytes, backend: Backend) -> None:
-        frame = _frame(unit)
+        frame = frame_of(unit)
         self._echoes = [*self._echoes[-64:], unit]
         self.bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False), timeout=0)
         assert select.select([descriptor(backend)], [], [], PATIENCE_S)[0], "the backend gets nothing"
@@ -299,15 +310,6 @@ EVERY_TRANSPORT = [pytest.param(name, marks=MARKS.get(name, ())) for name in TRA
 def _waiting(fd: int) -> int:
     """Bytes that can be read from a terminal: a kernel thread brings them across, and takes its time."""
     return int(struct.unpack("i", fcntl.ioctl(fd, termios.FIONREAD, bytes(4)))[0])
-
-
-def _unit(frame: CanFrame) -> bytes:
-    return struct.pack(">H", frame.identifier) + frame.data
-
-
-def _frame(unit: bytes) -> CanFrame:
-    """Whatever was flipped, a controller hands out 11 bits of identifier and up to 8 bytes."""
-    return CanFrame(struct.unpack(">H", unit[:2])[0] & MAX_IDENTIFIER, unit[2:])
 
 
 # -- the line ------------------------------------------------------------------------------------------------------
@@ -424,15 +426,6 @@ def lines(tmp_path: Path) -> Iterator[Callable[..., Line]]:
         yield make
 
 
-def numbers(data: object) -> Iterator[float]:
-    """Every float in plain data."""
-    if isinstance(data, float):
-        yield data
-    elif isinstance(data, dict | list):
-        for inner in data.values() if isinstance(data, dict) else data:
-            yield from numbers(inner)
-
-
 def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
     """While somebody wants FORCE_N: no duty over its limit, nothing that is not a number, and no carriage where it
     cannot be."""
@@ -440,7 +433,7 @@ def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
         assert max(abs(sample.output.left_duty), abs(sample.output.right_duty)) <= CONFIG.position.duty_limit
         assert CLOSED_MM < sample.truth.gap_mm < OPEN_MM
         if number % 20 == 0:
-            found = list(numbers(plain([sample, loop.stepper])))
+            found = [number for _, number in leaves([sample, loop.stepper])]
             assert len(found) > LEAST_NUMBERS
             assert not any(map(math.isnan, found))
         yield sample

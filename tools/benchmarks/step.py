@@ -17,8 +17,8 @@ from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
 from tormagd.control.core import Stepper
 from tormagd.control.move.motor import margins, zero_order_hold
-from tormagd.control.records import Plan
 from tormagd.lab.arrays import Array
+from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.lab.tune_position import corner_margins
 from tormagd.scenes.scene import EVERY_TERM, load_scene
 from tormagd.simulation.device import VirtualDevice
@@ -83,7 +83,7 @@ def settled_loop(config: Config, parameters: PlantParameters, left_out: tuple[st
     device = VirtualDevice(parameters, RecordedHand((0.0,), (0.0,)), seed=1)
     scene = msgspec.structs.replace(load_scene("coronary"), terms=EVERY_TERM.without(*left_out))
     loop = ClosedLoop(config, Stepper(config, scene), None, device)
-    loop.arm(hold(95.0, 0.0))
+    loop.arm(gap_plan(95.0))
     drive(loop, START_MM, 3.0)
     return loop
 
@@ -213,14 +213,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     return run(options.plant)
 
 
-def hold(gap_mm: float, now_s: float) -> Plan:
-    """A plan that asks for a gap and nothing else."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
-
-
 def drive(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
     """Asks for one gap for a while."""
-    return [loop.tick(plan=hold(gap_mm, loop.now_s)) for _ in range(round(duration_s / TICK_S))]
+    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(duration_s / TICK_S))]
 
 
 def _rise(time_s: Array, share: Array) -> float:

@@ -21,11 +21,12 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.step import START_MM, STEP_MM, hold
+from benchmarks.step import START_MM, STEP_MM
 from firmware_protocol.build import SWITCH, settle
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
+from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -48,7 +49,7 @@ def whole_core(loop: ClosedLoop) -> None:
 def position_loop(loop: ClosedLoop) -> None:
     """One tick without plans, asked for a step of the gap every 0.1 s."""
     gap_mm = START_MM + STEP_MM * (int(loop.now_s * 10.0) % 2)
-    loop.tick(plan=hold(gap_mm, loop.now_s))
+    loop.tick(plan=gap_plan(gap_mm, loop.now_s))
 
 
 LOOPS = {"whole_core": whole_core, "position_loop": position_loop}

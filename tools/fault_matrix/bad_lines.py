@@ -129,24 +129,26 @@ class BadBus(_Spoilt[CanDevice]):
         self._owed = 0.0
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
-        for unit in self._down(now_s, [_unit(frame)]):
-            self._device.receive(now_s, _frame(unit))
+        for unit in self._down(now_s, [unit_of(frame)]):
+            self._device.receive(now_s, frame_of(unit))
 
     def transmit(self, now_s: float) -> list[Delivery]:
         for unit in self._down(now_s, []):
-            self._device.receive(now_s, _frame(unit))
+            self._device.receive(now_s, frame_of(unit))
         delivered = self._device.transmit(now_s)
         self._owed += self.foreign_frames_ms  # called once a millisecond
         while self._owed >= 1.0:
             self._owed -= 1.0
             self._device.receive(now_s, FOREIGN, FOREIGN_HOST)
-        ours = [_unit(delivery.frame) for delivery in delivered if delivery.sender == 0]
-        return [Delivery(0, _frame(unit)) for unit in self._up(now_s, ours)]
+        ours = [unit_of(delivery.frame) for delivery in delivered if delivery.sender == 0]
+        return [Delivery(0, frame_of(unit)) for unit in self._up(now_s, ours)]
 
 
-def _unit(frame: CanFrame) -> bytes:
+def unit_of(frame: CanFrame) -> bytes:
+    """A frame as bytes."""
     return frame.data + frame.identifier.to_bytes(2, "big")
 
 
-def _frame(unit: bytes) -> CanFrame:
+def frame_of(unit: bytes) -> CanFrame:
+    """The frame of a unit: whatever was flipped, a controller hands out 11 bits of identifier."""
     return CanFrame(int.from_bytes(unit[-2:], "big") & 0x7FF, unit[:-2])

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 
 import msgpack
@@ -21,7 +21,7 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
-from tormagd.simulation.plant import Sensor
+from tormagd.simulation.plant import Plant
 
 FORCE_N = 1.8
 SWING_N = 0.1
@@ -104,7 +104,7 @@ class Rig:
             self.line.foreign_frames_ms = injection.fill_frames_ms
         plant = self.loop.simulated.plant
         if injection.sensor is not None:
-            plant.force_sensor = BadSensor(plant.force_sensor, injection.sensor)
+            LyingSensor(plant, LIES[injection.sensor])
         if injection.host in ("stop", "disable"):
             self.loop.command(injection.host)
         self.is_dead, self._stalled_ms = injection.host == "silent", injection.stall_ms
@@ -117,7 +117,7 @@ class Rig:
         if isinstance(self.line, BadBus):
             self.line.foreign_frames_ms = 0.0
         plant = self.loop.simulated.plant
-        if isinstance(plant.force_sensor, BadSensor):
+        if isinstance(plant.force_sensor, LyingSensor):
             plant.force_sensor = plant.force_sensor.mended
         self.loop.simulated.mend()
         self.is_dead, self._hogged_ms = False, None
@@ -135,28 +135,35 @@ def asked_N(now_s: float) -> float:
     return FORCE_N + SWING_N * math.sin(math.tau * now_s)
 
 
-class BadSensor:
-    """A force sensor that is broken from now on, one way or another."""
+Lie = Callable[[float, float], float]
+"What is shown, of the first reading and of the true one now."
 
-    def __init__(self, sensor: Sensor, how: str) -> None:
-        self.mended, self._how, self._last_N = sensor, how, sensor.reading_N
+
+class LyingSensor:
+    """A force sensor in place of a plant's own, which lies from now on."""
+
+    def __init__(self, plant: Plant, lie: Lie) -> None:
+        self.mended, self._lie, self._first_N = plant.force_sensor, lie, plant.force_sensor.reading_N
+        plant.force_sensor = self
 
     @property
     def reading_N(self) -> float:
-        """What is shown now; the handle turns forwards, and so readings are positive."""
-        true_N = self.mended.reading_N
-        shown = {
-            "stuck": self._last_N,
-            "high": true_N + OFFSET_N,
-            "low": true_N - OFFSET_N,
-            "saturated": 20.0,
-            "dead": 0.0,
-        }
-        return shown[self._how]
+        """What is shown now, as far as a sensor reaches."""
+        return min(max(self._lie(self._first_N, self.mended.reading_N), -20.0), 20.0)
 
     def advance(self, time_s: float, force_N: float) -> None:
         """As the sensor itself."""
         self.mended.advance(time_s, force_N)
+
+
+LIES: dict[str, Lie] = {
+    "stuck": lambda first_N, _: first_N,
+    "high": lambda _, true_N: true_N + OFFSET_N,
+    "low": lambda _, true_N: true_N - OFFSET_N,
+    "saturated": lambda *_: math.inf,
+    "dead": lambda *_: 0.0,
+}
+"Of a broken sensor; the handle turns forwards, and so readings are positive."
 
 
 class Publisher:

@@ -128,7 +128,7 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
     device = VirtualDevice(bench(with_insert(load_plant(plant), course.insert), scene), hand, seed=course.seed)
     config = load_config(None)
     loop = ClosedLoop(config, Stepper(config, scene), None, device)
-    loop.arm(gap_plan(scene.insert.gap_open_mm, 0.0))
+    loop.arm(gap_plan(scene.insert.gap_open_mm))
     while loop.now_s < BEGIN_S:
         loop.tick(plan=gap_plan(scene.insert.gap_open_mm, loop.now_s))
     ticks = []
@@ -243,9 +243,9 @@ def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
     return msgspec.structs.replace(plant, assumed=stops)
 
 
-def gap_plan(gap_mm: float, now_s: float) -> Plan:
+def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
     """A plan that asks for a gap and nothing else."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
 
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:
