@@ -114,7 +114,7 @@ def test_traffic_is_valid_and_damage_damages(receiver: str) -> None:
         function, payload = fuzz.drawn(draw, receiver)
         assert encode(decoded(function, payload)) == payload
         frame = encode_frame(function, 1, payload)
-        assert all(fuzz.damaged(kind, draw, frame, frame + b"\1") != frame for kind in fuzz.WIRE_DAMAGE[:3])
+        assert all(fuzz.damaged(kind, draw, frame, frame + b"\1") != frame for kind in list(fuzz.WIRE_DAMAGE)[:3])
 
 
 # -- in real time --------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import random
 import struct
 import subprocess
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise, zip_longest
 from typing import Any
 
@@ -61,20 +61,6 @@ HEARD_BY = {"device": (Drive, Retract, Clear, Home, Hello), "host": (State, Sens
 "The first is the one that a CRC-8 protects, the last has a 32-bit number, by which a clean frame is known again."
 RANGED = {"device": Drive, "host": Status}
 UNKNOWN = sorted(set(range(128)) - set(FUNCTION.values()))
-WIRE_DAMAGE = (
-    "1 to 3 bits flipped",
-    "burst of up to 16 bits",
-    "bytes overwritten",
-    "bytes cut out",
-    "bytes inserted",
-    "a zero more or less at the end",
-    "delimiters inserted",
-    "delimiter lost",
-    "two frames spliced",
-    "frame repeated",
-    "noise",
-)
-"What a line does to sealed frames. None of these should give a frame that was not sent."
 PAYLOAD_DAMAGE = {
     "CRC-8: 1 or 2 bits flipped": 0.0,
     "CRC-8: burst of up to 8 bits": 0.0,
@@ -279,34 +265,36 @@ def _known(number: int, body: Payload) -> bytes:
     return bytes((body[0], number % 256)) + body[1]
 
 
+WIRE_DAMAGE: dict[str, Callable[[random.Random, bytes, bytes, int, int], bytes]] = {
+    "1 to 3 bits flipped": lambda rng, frame, *_: _flipped(frame, rng.sample(range(8 * len(frame)), rng.randint(1, 3))),
+    "burst of up to 16 bits": lambda rng, frame, *_: _flipped(frame, _burst(rng, len(frame), 16)),
+    "bytes overwritten": lambda rng, frame, _, start, end: (
+        frame[:start] + rng.randbytes(end + 1 - start) + frame[end + 1 :]
+    ),
+    "bytes cut out": lambda _rng, frame, _, start, end: frame[:start] + frame[end + 1 :],
+    "bytes inserted": lambda rng, frame, _, start, _end: (
+        frame[:start] + rng.randbytes(rng.randint(1, 4)) + frame[start:]
+    ),
+    # COBS's 1 before the delimiter taken away where it stands, and put where it does not
+    "a zero more or less at the end": lambda _, frame, *__: (
+        frame[:-2] + b"\0" if frame[-2] == 1 else frame[:-1] + b"\1\0"
+    ),
+    "delimiters inserted": lambda rng, frame, _, start, _end: frame[:start] + bytes(rng.randint(1, 3)) + frame[start:],
+    "delimiter lost": lambda _, frame, *__: frame[:-1],
+    "two frames spliced": lambda rng, frame, other, *_: (
+        frame[: rng.randrange(1, len(frame))] + other[rng.randrange(1, len(other)) :]
+    ),
+    "frame repeated": lambda rng, frame, *_: frame * rng.randint(2, 3),
+    "noise": lambda rng, *_: rng.randbytes(rng.randint(1, 40)),
+}
+"""What a line does to sealed frames, of a frame, what went before it, and two of its places. None of these should give
+a frame that was not sent."""
+
+
 def damaged(kind: str, rng: random.Random, frame: bytes, other: bytes) -> bytes:
     """A sealed frame that a line has damaged; `other` went before it. Raises KeyError for an unknown kind."""
     start, end = sorted((rng.randrange(len(frame)), rng.randrange(len(frame))))
-    match kind:
-        case "1 to 3 bits flipped":
-            return _flipped(frame, rng.sample(range(8 * len(frame)), rng.randint(1, 3)))
-        case "burst of up to 16 bits":
-            return _flipped(frame, _burst(rng, len(frame), 16))
-        case "bytes overwritten":
-            return frame[:start] + rng.randbytes(end + 1 - start) + frame[end + 1 :]
-        case "bytes cut out":
-            return frame[:start] + frame[end + 1 :]
-        case "bytes inserted":
-            return frame[:start] + rng.randbytes(rng.randint(1, 4)) + frame[start:]
-        case "a zero more or less at the end":
-            # COBS's 1 before the delimiter taken away where it stands, and put where it does not
-            return frame[:-2] + b"\0" if frame[-2] == 1 else frame[:-1] + b"\1\0"
-        case "delimiters inserted":
-            return frame[:start] + bytes(rng.randint(1, 3)) + frame[start:]
-        case "delimiter lost":
-            return frame[:-1]
-        case "two frames spliced":
-            return frame[: rng.randrange(1, len(frame))] + other[rng.randrange(1, len(other)) :]
-        case "frame repeated":
-            return frame * rng.randint(2, 3)
-        case "noise":
-            return rng.randbytes(rng.randint(1, 40))
-    raise KeyError(kind)
+    return WIRE_DAMAGE[kind](rng, frame, other, start, end)
 
 
 def spoilt(kind: str, rng: random.Random, receiver: str, longest: int) -> Payload:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import zmq
@@ -36,14 +36,6 @@ Figures = dict[str, Any]
 "What a case comes to: JSON, with the list `failures` of what did not hold."
 
 
-class Latched(NamedTuple):
-    """A fault that no case has asked for, and the time in which it came, CLOCK_MONOTONIC."""
-
-    fault: str
-    start_s: float
-    end_s: float
-
-
 class Stand:
     """Daemon, device and an operator's client. All of it ends with `stack`."""
 
@@ -51,7 +43,8 @@ class Stand:
         """Raises TimeoutError. Telemetry demands keys, which lie in `keys`; the other endpoints are open."""
         self._stack = stack
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
-        self.latched: list[Latched] = []
+        self.latched: list[tuple[str, float, float]] = []
+        "Faults that no case has asked for, and from when to when each came, CLOCK_MONOTONIC."
         stack.enter_context(carried(DEVICE_PRIORITY))
         self.plug_in(transport)
         self.keys = self.folder / "keys"
@@ -130,7 +123,7 @@ class Stand:
     def see_faults(self, since_s: float) -> bool:
         """Keeps the faults that have latched since; whether there are any."""
         faults = self.status()["faults"]
-        self.latched += [Latched(fault, since_s, time.monotonic()) for fault in faults]
+        self.latched += [(fault, since_s, time.monotonic()) for fault in faults]
         return bool(faults)
 
     @contextlib.contextmanager

@@ -38,7 +38,6 @@ class Cell(NamedTuple):
 
     bus: str
     fault: str
-    injected: str
     host_faults: tuple[str, ...]
     device_faults: tuple[str, ...]
     limits: tuple[str, ...]
@@ -132,7 +131,6 @@ class Watch:
         stated_ms, reacted_ms = self._stated_ms(injection), self._reacted_ms(injection)
         return Cell(
             bus,
-            injection.name,
             injection.name,
             tuple(self._host),
             tuple(self._device),
