@@ -414,7 +414,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab bound`."""
     parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
-    parser.add_argument("--held", action="store_true", help="each force holds until the next (linear in between)")
 
 
 def run(options: argparse.Namespace) -> Found:
@@ -423,7 +422,7 @@ def run(options: argparse.Namespace) -> Found:
     table = read_forces(options.force)
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
     try:
-        return Found(bound(plant, time_s, force_N, is_held=options.held).figures())
+        return Found(bound(plant, time_s, force_N).figures())
     except RuntimeError as error:
         raise LabError(str(error)) from error
 

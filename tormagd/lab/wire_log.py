@@ -15,6 +15,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import can
 import serial
@@ -32,7 +33,6 @@ from tormagd.lab.main import Found
 from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
-from tormagd.simulation.plant import Truth
 from tormagd.simulation.pty_door import READ_BYTES, Pty
 
 NODE = 1
@@ -80,37 +80,26 @@ class WireLog:
             self._log.on_message_received(message)
             self.frames += 1
 
+    def read(self, now_s: float, raw: Any) -> None:
+        """Of a connection's traffic: what was read."""
+        self.add(now_s, raw, is_rx=True)
 
-class TappedDevice:
-    """A simulated device whose line is logged: a `SerialDevice`."""
+    def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
+        """And what was written."""
+        self.add(now_s, b"".join(raw), is_rx=False)
 
-    def __init__(self, device: VirtualDevice, log: WireLog) -> None:
-        self._device, self._log = device, log
-        self.messages = device.messages
-
-    @property
-    def truth(self) -> Truth:
-        """As the device's own."""
-        return self._device.truth
-
-    def receive(self, now_s: float, data: bytes) -> None:
-        """As the device's own."""
-        self._log.add(now_s, data, is_rx=False)
-        self._device.receive(now_s, data)
-
-    def transmit(self, now_s: float) -> bytes:
-        """As the device's own."""
-        data = self._device.transmit(now_s)
-        self._log.add(now_s, data, is_rx=True)
-        return data
+    def connected(self, memory: Any) -> None:
+        """That a conversation begins or ends is no frame."""
 
 
 def virtual_session(seconds: float, log: WireLog) -> None:
     """Connects, homes, enables and follows a swinging force for that long, in virtual time."""
     config = load_config(None)
     core = build_core(config)
-    device = TappedDevice(VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1), log)
-    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
+    loop = ClosedLoop(
+        config, core.stepper(), core.planner(), VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
+    )
+    loop.connection.traffic = log
     loop.arm()
 
     def asked(now_s: float) -> TimedSetpoint:

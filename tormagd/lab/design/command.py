@@ -1,11 +1,10 @@
 """Finds the brake's geometry for a task: outer radius, thickness and open gap (Eq. 40-42), from several starts.
 
-Runs on this machine's cores or, with --dask, on a cluster. With --state a stopped sweep goes on where it was.
+Runs on this machine's cores or, with --dask, on a cluster.
 """
 
 import argparse
 import os
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -16,15 +15,13 @@ from tormagd.lab.design.optimisation import Design, Problem, Run, coverage_as_ma
 from tormagd.lab.design.phase_portrait import Region
 from tormagd.lab.design.sweep import sweep
 from tormagd.lab.main import Found
-from tormagd.lab.thesis.values import USE_CASES
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab optimise-design`."""
-    task = parser.add_mutually_exclusive_group(required=True)
-    task.add_argument("--use-case", type=int, choices=USE_CASES, help="one of the thesis's, with its five starts")
-    task.add_argument(
+    parser.add_argument(
         "--region",
+        required=True,
         type=float,
         nargs=4,
         metavar=("LEAST_N", "LEAST_RATE", "MOST_N", "MOST_RATE"),
@@ -36,16 +33,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--gap-speed", type=float, default=Position().gap_speed_mm_s, help="mm/s (what the controller was measured at)"
     )
     parser.add_argument("--off", type=float, default=1.0, help="how far off a dimension may be made, percent (1)")
-    parser.add_argument("--starts", type=int, default=5, help="random starts of a region")
+    parser.add_argument("--starts", type=int, default=5, help="random ones")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--state", type=Path, help="JSON file that keeps finished runs")
     executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[lab]")
 
 
 def run(options: argparse.Namespace) -> Found:
     """The optima, best first. Raises DomainError, OSError."""
     with executors.chosen(options) as executor:
-        outcomes = sweep(_runs(options), executor, options.state)
+        outcomes = sweep(_runs(options), executor)
     by_cost = options.measure == "corners"
     rows = [
         msgspec.to_builtins(each) | {"coverage_as_made": coverage_as_made(run.problem, each.design, 0.01 * options.off)}
@@ -56,12 +52,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _runs(options: argparse.Namespace) -> list[Run]:
-    region = Region(*options.region) if options.region else USE_CASES[options.use_case].region
-    problem = Problem(region, options.measure, options.gap_speed)
-    if options.region:
-        low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
-        drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))
-        starts = [Design(*(float(value) for value in row)) for row in drawn]
-    else:
-        starts = [line.start for line in USE_CASES[options.use_case].starts]
-    return [Run(problem, start, options.solver, options.seed) for start in starts]
+    problem = Problem(Region(*options.region), options.measure, options.gap_speed)
+    low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
+    drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))
+    return [Run(problem, Design(*start), options.solver, options.seed) for start in drawn.tolist()]

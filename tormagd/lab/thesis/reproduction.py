@@ -49,7 +49,6 @@ PULSE_S, PULSE_HZ = 20.0, 500
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab reproduce-thesis`."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="write reproduction.md and its pictures there")
-    parser.add_argument("--state", type=Path, help="state file of the optimisation: finished runs are not run again")
     parser.add_argument("--gap-speed", type=float, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=1)
@@ -66,7 +65,7 @@ def run(options: argparse.Namespace) -> Found:
         learned = pool.submit(chapter_4, options.quick)
         steps = [pool.submit(step_test, insert(name), options.seed) for name in STEP_INSERTS]
         runs = table_3_2_runs(options.gap_speed, options.seed, starts=1 if options.quick else None)
-        outcomes = sweep(runs.values(), pool, options.state)
+        outcomes = sweep(runs.values(), pool)
         tests = [step.result() for step in steps]
         told = learned.result()
     result = {
