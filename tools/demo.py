@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from machines.host import Host
 from rendering.following import Case, Rehearsals, Tracking, rehearse
 from rendering.show import (
     LEAST_N,
@@ -288,22 +287,18 @@ def print_timing(shown: Shown) -> None:
         f"control    {shown.kept:.1%} of the periods kept, late p50 {late['p50']:.0f} p99 {late['p99']:.0f} us, "
         f"driven after p50 {spent['p50']:.0f} p99 {spent['p99']:.0f} us"
     )
-    print(f"host       {host_line(shown.host, shown.worst_stall_ms)}")
+    host = shown.host
+    waited = "".join(f", the {name} waited {share:.1%}" for name, share in host.waited.items() if share >= 0.01)
+    print(
+        f"host       steal {host.steal:.1%}, worst stall {shown.worst_stall_ms:.0f} ms (bare timer "
+        f"{host.bare_worst_ms:.0f} ms, {host.bare_kept:.1%} kept){waited}"
+    )
     spent = inference["exec_us"]
     print(f"inference  {inference['hz']:7.1f} Hz  plan p50 {spent['p50']:.0f} p99 {spent['p99']:.0f} us")
     link = shown.status["link"]
     print(f"link       {link['frames']} frames, {lost_frames(link)} lost, repeated or corrupt")
     held = ", ".join(f"{name} {share:.1%}" for name, share in sorted(shown.limits.items())) or "none"
     print(f"limits     {held}   (share of the time shown)")
-
-
-def host_line(host: Host, worst_stall_ms: float) -> str:
-    """What the host took, beside what the daemon had to bear."""
-    waited = "".join(f", the {name} waited {share:.1%}" for name, share in host.waited.items() if share >= 0.01)
-    return (
-        f"steal {host.steal:.1%}, worst stall {worst_stall_ms:.0f} ms (bare timer {host.bare_worst_ms:.0f} ms, "
-        f"{host.bare_kept:.1%} kept){waited}"
-    )
 
 
 def numbers(result: Tracking) -> str:

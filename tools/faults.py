@@ -48,18 +48,12 @@ def main() -> int:
         if options.bus in (None, bus) and options.only in injection.name
     ]
     steps = tqdm(todo, desc="faults", unit="fault", disable=not sys.stderr.isatty())
-    cells = [try_out(injection, options.plant, bus) for injection, bus in steps]
+    cells = [recover(injection, *inject(injection, options.plant, bus)) for injection, bus in steps]
     if options.json:
         print(json.dumps({"plant": options.plant, "cells": [cell._asdict() for cell in cells]}))
     else:
         print(*table({name: getattr(cell, name) for name in SHOWN} for cell in cells), sep="\n")
     return 0 if all(cell.named and cell.safe and cell.in_time and cell.recovered for cell in cells) else 1
-
-
-def try_out(injection: Injection, plant: str, bus: str) -> Cell:
-    """Runs one fault, and what leads out of it."""
-    rig, cell = inject(injection, plant, bus)
-    return recover(rig, injection, cell)
 
 
 def inject(injection: Injection, plant: str, bus: str = SERIAL, watched_s: float = WATCHED_S) -> tuple[Rig, Cell]:

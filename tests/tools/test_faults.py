@@ -133,8 +133,7 @@ def test_what_leads_out_of_a_fault_does_so_when_its_cause_has_gone(
     name: str, tried: str, recovery: tuple[str, ...]
 ) -> None:
     (injection,) = (item for item in MATRIX if item.name == name)
-    rig, cell = faults.inject(injection, "sample_1", watched_s=SAMPLED_S)
-    cell = recover(rig, injection, cell)
+    cell = recover(injection, *faults.inject(injection, "sample_1", watched_s=SAMPLED_S))
     assert (cell.tried, cell.recovery, cell.recovered) == (tried, recovery, True)
 
 
@@ -143,7 +142,7 @@ def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.Mo
     (injection,) = (item for item in MATRIX if item.name == "device too hot")
     rig, cell = faults.inject(injection, "sample_1", watched_s=JUDGED_S)
     monkeypatch.setattr(rig, "mend", lambda: None)
-    assert not recover(rig, injection, cell).recovered
+    assert not recover(injection, rig, cell).recovered
 
 
 def test_names_are_codes_and_faults_stand_once() -> None:

@@ -18,6 +18,7 @@ import torch
 from tqdm import tqdm
 
 from benchmarks import inverse_report as report
+from benchmarks.inverse_report import USUAL_HIDDEN
 from benchmarks.inverse_workload import (
     CIP_PERCENT,
     FIELDS_MT,
@@ -41,7 +42,6 @@ from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
 from tormagd.simulation.parameters import load_plant
 
 PLANT = "sample_1"
-USUAL_HIDDEN = 50
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9}
 NEWTON = "newton"
 BASELINES = ("thesis-linear", "linear-argmin", "vectorised-argmin")
@@ -272,7 +272,13 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     speedup = {name: usual[name]["p50_us"] / p50_us for name in BASELINES}
     result = {
         "workload": f"synthetic torque element ({PLANT}, no memory), {effort.course} points of a smooth course",
-        "environment": environment(),
+        "environment": {  # what the times depend on besides
+            "processors": os.cpu_count(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "torch": torch.__version__,
+            "load average": round(os.getloadavg()[0], 1),
+        },
         "variants": rows,
         "refused": refused,
         "chosen": chosen,
@@ -282,14 +288,3 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     if options.write:
         report.write(result)
     return result
-
-
-def environment() -> dict[str, Any]:
-    """What the times depend on besides."""
-    return {
-        "processors": os.cpu_count(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "torch": torch.__version__,
-        "load average": round(os.getloadavg()[0], 1),
-    }

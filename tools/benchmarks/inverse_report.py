@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from tormagd.lab.pages import figures_of, stamp, table
+from tormagd.lab.pages import figures_of, stamp, subplots, table
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "inverse_trade.md"
@@ -97,8 +96,7 @@ def page(result: dict[str, Any]) -> str:
 
 def plot(result: dict[str, Any], figures: list[str]) -> None:
     """Two panels over p50: the solver's error at one network, and the plant's error for every network."""
-    figure = Figure(figsize=(11, 5), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = subplots((11, 5), 1, 2)
     rows = result["variants"]
     _scatter(left, [row for row in rows if row["hidden"] == USUAL_HIDDEN], "solver_mae_mT")
     _scatter(right, rows, "plant_mae_mT")

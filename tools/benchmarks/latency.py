@@ -49,15 +49,6 @@ Stages = dict[str, Array]
 WHOLE, HOP = "setpoint to wire", "bare ZeroMQ hop"
 
 
-def run(count: int, realtime: RealTime) -> Stages:
-    """`count` setpoints through the daemon, then as many through the bare hop."""
-    stand = Stand(realtime, setpoint_hz=0)
-    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stand, Path(name)) as (config, _):
-        prepare(RealTime(fifo_priority=max(realtime.fifo_priority - BELOW, 0), keep_awake=realtime.keep_awake))
-        ticks = first_ticks(*exchange(config, count))
-    return stages(ticks) | {HOP: bare_hop(count)}
-
-
 def stages(ticks: list[tuple[Any, ...]]) -> Stages:
     """The whole way and its parts, of what `first_ticks` found."""
     stamp_ns, written_ns, beat_us = (np.array(column) for column in zip(*ticks, strict=True))
@@ -168,6 +159,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The object for these options."""
-    realtime = realtime_settings(options)
-    return summary(run(options.count, realtime), options.count, realtime)
+    """The object for these options: of so many setpoints through the daemon, then of as many through the bare hop."""
+    realtime, count = realtime_settings(options), options.count
+    stand = Stand(realtime, setpoint_hz=0)
+    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stand, Path(name)) as (config, _):
+        prepare(RealTime(fifo_priority=max(realtime.fifo_priority - BELOW, 0), keep_awake=realtime.keep_awake))
+        ticks = first_ticks(*exchange(config, count))
+    return summary(stages(ticks) | {HOP: bare_hop(count)}, count, realtime)

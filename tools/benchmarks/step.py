@@ -61,14 +61,14 @@ def run(plant_name: str = "sample_1") -> dict[str, Any]:
     over_stroke = overshoot_over_stroke(loop)
     factor = loop.now_s / (time.thread_time() - started_s)
     gc.enable()
-    fastest_s = [time_optimal(parameters, START_MM, length_mm).rise_s for length_mm in (STEP_MM, -STEP_MM)]
+    fastest_s = [time_optimal(parameters, START_MM, length_mm)[0] for length_mm in (STEP_MM, -STEP_MM)]
     nominal = margins(config.motor, config.position, TICK_S)
     return {
         "plant": plant_name,
         **{name: max(getattr(found, name) for found in steps) for name in Step._fields},
         "overshoot_over_stroke": over_stroke,
         "rise_over_time_optimal": max(found.rise_s / s for found, s in zip(steps, fastest_s, strict=True)),
-        "stroke_ratio": stroke_s / time_optimal(parameters, STROKE_MM[0], STROKE_MM[1] - STROKE_MM[0]).total_s,
+        "stroke_ratio": stroke_s / time_optimal(parameters, STROKE_MM[0], STROKE_MM[1] - STROKE_MM[0])[1],
         "gain_margin_dB": nominal.gain_margin_dB,
         "phase_margin_deg": nominal.phase_margin_deg,
         "corners": corner_margins(config),
@@ -158,15 +158,9 @@ def nrmse(measured: Array, modelled: Array) -> float:
     return float(np.linalg.norm(measured - modelled) / np.linalg.norm(measured - measured.mean()))
 
 
-class Optimum(NamedTuple):
-    """The fastest the plant can do: rise from 10 to 90 %, and from rest to rest."""
-
-    rise_s: float
-    total_s: float
-
-
-def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: float) -> Optimum:
-    """Bang-bang on the plant: the latest switch that still comes to rest at the target, by bisection."""
+def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: float) -> tuple[float, float]:
+    """The fastest the plant can do, s: the rise from 10 to 90 %, and from rest to rest. Bang-bang: the latest switch
+    that still comes to rest at the target, by bisection."""
     low, high = 0.0, 4.0
     for _ in range(30):
         middle = (low + high) / 2.0
@@ -177,7 +171,7 @@ def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: floa
             high = middle
     gap, total_s = bang_bang(parameters, start_mm, distance_mm, low)
     time_s = np.arange(1, len(gap) + 1, dtype=np.float64) * TICK_S / 10.0
-    return Optimum(_rise(time_s, (gap - start_mm) / distance_mm), total_s)
+    return _rise(time_s, (gap - start_mm) / distance_mm), total_s
 
 
 def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, switch_s: float) -> tuple[Array, float]:

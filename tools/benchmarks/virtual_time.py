@@ -111,15 +111,13 @@ def take_turns(builds: Mapping[str, Callable[[str, int], float]], ticks: int) ->
     """`ticks` of each loop and build, in stretches; who begins changes from one to the next."""
     found: Stretches = {name: {loop: [] for loop in LOOPS} for name in builds}
     order = list(builds)
-    for loop in LOOPS:
-        for name in order:
-            builds[name](loop, STRETCH_TICKS)  # not counted: caches and branches are learned
-    for _ in range(max(1, ticks // STRETCH_TICKS)):
+    for _ in range(1 + max(1, ticks // STRETCH_TICKS)):
         for loop in LOOPS:
             for name in order:
                 found[name][loop].append(builds[name](loop, STRETCH_TICKS))
         order.append(order.pop(0))
-    return found
+    # the first is not counted: caches and branches are learned
+    return {name: {loop: taken_us[1:] for loop, taken_us in loops.items()} for name, loops in found.items()}
 
 
 def summary(found: Stretches, period_us: float) -> dict[str, Any]:

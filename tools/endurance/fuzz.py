@@ -61,17 +61,6 @@ HEARD_BY = {"device": (Drive, Retract, Clear, Home, Hello), "host": (State, Sens
 "The first is the one that a CRC-8 protects, the last has a 32-bit number, by which a clean frame is known again."
 RANGED = {"device": Drive, "host": Status}
 UNKNOWN = sorted(set(range(128)) - set(FUNCTION.values()))
-PAYLOAD_DAMAGE = {
-    "CRC-8: 1 or 2 bits flipped": 0.0,
-    "CRC-8: burst of up to 8 bits": 0.0,
-    "CRC-8: of another message": CRC8_ODDS,
-    "CRC-8: random payload": CRC8_ODDS,
-    "wrong length": 0.0,
-    "out of range or enumeration": 0.0,
-    "unknown function": 0.0,
-}
-"What is wrong in a payload that the carrier brought whole, and the odds that the codec takes it for a message."
-
 Payload = tuple[int, bytes]
 "Function and payload."
 
@@ -211,9 +200,10 @@ def failures(fuzz: Fuzz) -> list[str]:
     found = []
     for kind, tally in fuzz.tallies.items():
         damage = kind.partition(": ")[2]
-        odds = {"false_accepts": PAYLOAD_DAMAGE.get(damage, CRC16_ODDS), "wrong_frames": 0.0}
-        if damage in WIRE_DAMAGE:
-            odds["wrong_frames"] = CRC16_ODDS
+        odds = {
+            "false_accepts": PAYLOAD_DAMAGE[damage][0] if damage in PAYLOAD_DAMAGE else CRC16_ODDS,
+            "wrong_frames": CRC16_ODDS if damage in WIRE_DAMAGE else 0.0,
+        }
         for what, chance in odds.items():
             allowed = int(stats.binom.isf(CHANCE, tally["judged"], chance)) if chance else 0
             if tally[what] > allowed:
@@ -297,30 +287,55 @@ def damaged(kind: str, rng: random.Random, frame: bytes, other: bytes) -> bytes:
     return WIRE_DAMAGE[kind](rng, frame, other, start, end)
 
 
+Spoils = Callable[[random.Random, str, int, int, bytes], Payload]
+"Makes a wrong payload for a receiver, of at most so many bytes, of a valid function and payload."
+PAYLOAD_DAMAGE: dict[str, tuple[float, Spoils]] = {
+    "CRC-8: 1 or 2 bits flipped": (
+        0.0,
+        lambda rng, _receiver, _longest, function, payload: (
+            function,
+            _flipped(payload, rng.sample(range(8 * len(payload)), rng.randint(1, 2))),
+        ),
+    ),
+    "CRC-8: burst of up to 8 bits": (
+        0.0,
+        lambda rng, _receiver, _longest, function, payload: (function, _flipped(payload, _burst(rng, len(payload), 8))),
+    ),
+    # all in range, and another counter than that of the message whose CRC-8 it is
+    "CRC-8: of another message": (
+        CRC8_ODDS,
+        lambda rng, receiver, _longest, function, payload: (
+            function,
+            drawn(rng, receiver, HEARD_BY[receiver][0])[1][:-2]
+            + bytes(((payload[-2] + rng.randint(1, 255)) % 256, payload[-1])),
+        ),
+    ),
+    "CRC-8: random payload": (
+        CRC8_ODDS,
+        lambda rng, _receiver, _longest, function, payload: (function, rng.randbytes(len(payload))),
+    ),
+    "wrong length": (
+        0.0,
+        lambda rng, _receiver, longest, function, payload: (
+            function,
+            (payload + rng.randbytes(longest))[
+                : rng.choice([*range(len(payload)), *range(len(payload) + 1, longest + 1)])
+            ],
+        ),
+    ),
+    "out of range or enumeration": (
+        0.0,
+        lambda rng, receiver, _longest, _function, _payload: _out_of_range(rng, _layout(RANGED[receiver])),
+    ),
+    "unknown function": (0.0, lambda rng, _receiver, _longest, _function, payload: (rng.choice(UNKNOWN), payload)),
+}
+"What is wrong in a payload that the carrier brought whole, and the odds that the codec takes it for a message."
+
+
 def spoilt(kind: str, rng: random.Random, receiver: str, longest: int) -> Payload:
     """A payload of at most `longest` bytes that the codec has to refuse. Raises KeyError for an unknown kind."""
-    protected = HEARD_BY[receiver][0]
-    function, payload = drawn(rng, receiver, protected if kind.startswith("CRC-8") else None)
-    match kind:
-        case "CRC-8: 1 or 2 bits flipped":
-            return function, _flipped(payload, rng.sample(range(8 * len(payload)), rng.randint(1, 2)))
-        case "CRC-8: burst of up to 8 bits":
-            return function, _flipped(payload, _burst(rng, len(payload), 8))
-        case "CRC-8: of another message":
-            # all in range, and another counter than that of the message whose CRC-8 it is
-            _, other = drawn(rng, receiver, protected)
-            counter = (payload[-2] + rng.randint(1, 255)) % 256
-            return function, other[:-2] + bytes((counter, payload[-1]))
-        case "CRC-8: random payload":
-            return function, rng.randbytes(len(payload))
-        case "wrong length":
-            length = rng.choice([length for length in range(longest + 1) if length != len(payload)])
-            return function, (payload + rng.randbytes(longest))[:length]
-        case "out of range or enumeration":
-            return _out_of_range(rng, _layout(RANGED[receiver]))
-        case "unknown function":
-            return rng.choice(UNKNOWN), payload
-    raise KeyError(kind)
+    valid = drawn(rng, receiver, HEARD_BY[receiver][0] if kind.startswith("CRC-8") else None)
+    return PAYLOAD_DAMAGE[kind][1](rng, receiver, longest, *valid)
 
 
 def _out_of_range(rng: random.Random, layout: Layout) -> Payload:

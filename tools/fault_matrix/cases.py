@@ -3,7 +3,7 @@
 from functools import partial
 from typing import NamedTuple
 
-from fault_matrix.bad_lines import MakeWay, damaging, delaying, doubling, losing, reordering
+from fault_matrix.bad_lines import MakeWay, damaging, delaying, doubling, losing, reordering, whole
 
 OPENS = "opens"
 "The gap is open and the force below 1 N."
@@ -37,7 +37,7 @@ class Injection(NamedTuple):
     device: str | None = None
     host: str | None = None
     stall_ms: int = 0
-    way: MakeWay | None = None
+    way: MakeWay = whole
     fill_frames_ms: float = 0.0
     sensor: str | None = None
     publisher: str | None = None
@@ -53,6 +53,7 @@ class Injection(NamedTuple):
         return bool(self.stall_ms) or self.host in ("stop", "disable") or self.device in PASSING
 
 
+NOTHING = Injection("", ())
 PASSING = ("reset", "frozen", "encoder_jump", "encoder_jump_left")
 
 MATRIX = (

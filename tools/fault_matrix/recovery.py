@@ -23,7 +23,7 @@ JUDGED_S = 1.0
 "The end of it, in which the force is to be what is asked and nothing to be told any more."
 
 
-def recover(rig: Rig, injection: Injection, cell: Cell) -> Cell:
+def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
     """The row with what came of the recovery, of a rig in which the fault may still last."""
     tried, is_held_back = "", True
     if not injection.passes and not rig.is_dead:

@@ -7,8 +7,8 @@ from functools import cache
 
 import msgpack
 
-from fault_matrix.bad_lines import BadBus, BadSerialLine, whole
-from fault_matrix.cases import SERIAL, Injection
+from fault_matrix.bad_lines import BadBus, BadSerialLine
+from fault_matrix.cases import NOTHING, SERIAL, Injection
 from tormagd.assembly.build import Core, build_core
 from tormagd.assembly.conditions import is_homed
 from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
@@ -98,8 +98,7 @@ class Rig:
 
     def spoil(self, injection: Injection) -> None:
         """Line, force sensor, host and publisher go bad now."""
-        if injection.way is not None:
-            self.line.spoil(injection.way)
+        self.line.spoil(injection.way)
         if isinstance(self.line, BadBus):
             self.line.foreign_frames_ms = injection.fill_frames_ms
         plant = self.loop.simulated.plant
@@ -113,15 +112,11 @@ class Rig:
 
     def mend(self) -> None:
         """All that is wrong is put right now; what came of it stays."""
-        self.line.spoil(whole)
-        if isinstance(self.line, BadBus):
-            self.line.foreign_frames_ms = 0.0
         plant = self.loop.simulated.plant
         if isinstance(plant.force_sensor, LyingSensor):
             plant.force_sensor = plant.force_sensor.mended
         self.loop.simulated.mend()
-        self.is_dead, self._hogged_ms = False, None
-        self.publisher.mend()
+        self.spoil(NOTHING)
 
 
 @cache
@@ -177,18 +172,13 @@ class Publisher:
         """The newest one at that time; None before the first."""
         if not self.is_silent:
             stamp_s = now_s - now_s % 0.002
-            self._newest = TimedSetpoint(asked_N(stamp_s), stamp_s, 0.1)
-            if self.is_other:
-                self._newest = TimedSetpoint(OTHER_N, stamp_s, 0.1, holder=1)
+            force_N = OTHER_N if self.is_other else asked_N(stamp_s)
+            self._newest = TimedSetpoint(force_N, stamp_s, 0.1, holder=int(self.is_other))
         return self._newest
 
     def spoil(self, injection: Injection) -> None:
         """It falls silent, or another one takes over, where the injection says so."""
         self.is_silent, self.is_other = injection.host == "stale", injection.host == "other"
-
-    def mend(self) -> None:
-        """It publishes as before."""
-        self.is_silent = self.is_other = False
 
 
 class DaemonsBorder:
@@ -211,14 +201,10 @@ class DaemonsBorder:
         return self._inbox.newest
 
     def spoil(self, injection: Injection) -> None:
-        """From now on something is wrong."""
-        self._wrong = injection.publisher or ""
+        """From now on something is wrong, or nothing."""
+        self.is_silent, self._wrong, self._kept = False, injection.publisher or "", None
         if self._wrong == "restarted":
             self._session, self._seq = 2, 0
-
-    def mend(self) -> None:
-        """And from now on nothing."""
-        self.is_silent, self._wrong, self._kept = False, "", None
 
     def _messages(self, now_s: float, realtime_ns: int) -> list[bytes]:
         wrong = self._wrong
@@ -228,11 +214,8 @@ class DaemonsBorder:
         data = self._message("robot", force_N, stamp_ns)
         self._earlier.append(data)
         if wrong == "disordered":
-            kept, self._kept = self._kept, None
-            if kept is not None:
-                return [data, kept]
-            self._kept = data
-            return []
+            kept, self._kept = self._kept, data if self._kept is None else None
+            return [] if kept is None else [data, kept]
         if wrong == "replayed":
             return [data, self._earlier[0]]
         if wrong == "second":
