@@ -240,22 +240,6 @@ def test_the_command_prints_the_three_figures(capsys, tmp_path) -> None:
     assert re.search(r"^no_delay_rms_N +0\.1713$", capsys.readouterr().out, re.MULTILINE)
 
 
-@pytest.mark.parametrize(
-    ("text", "arguments", "said"),
-    [
-        ("t_s,force_N\n0,1\n1,nan\n2,1\n", [], "row 3, force_N = 'nan'"),
-        ("t_s,force_N\n0,1\n1,1\n1,1\n", [], "row 4, t_s = 1"),
-        ("t_s,force_N\n0,1\n1,1\n1e4,1\n", [], "t_s = 0.0 .. 10000.0"),
-        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--plant", "sample_9"], "sample_9"),
-    ],
-)
-def test_what_cannot_be_used_is_named(capsys, tmp_path, text, arguments, said) -> None:
-    path = tmp_path / "force.csv"
-    path.write_text(text)
-    assert main(["bound", str(path), *arguments]) == 2
-    assert said in capsys.readouterr().err
-
-
 # -- ideal carriages, a second actuator in the same core: what a loop misses with them is the plan's -------------------
 
 

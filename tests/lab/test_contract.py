@@ -63,23 +63,71 @@ def test_the_commands_are_listed(arguments, exit_code, capsys):
     assert "'train'" in told.err or not exit_code
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (("characterise", "compression", "absent.csv"), "absent.csv: cannot be read: No such file"),
-        (("optimise-design", "--region", "1", "1", "1", "1"), "most_N = 1"),
-        (("tune-position", "--config", "absent.toml"), "absent.toml"),
-        (("bench-sweep", "--plant", "absent", "--out", "x.csv"), "absent"),
-        (("identify-motor", "absent.csv"), "absent.csv: cannot be read"),
-    ],
+FORCES, MOTOR, ROWS = (
+    "t_s,force_N\n0,1\n",
+    "t_s,input_V,position_mm\n",
+    "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N\n",
 )
-def test_what_cannot_be_used_is_one_line_and_exit_2(arguments, reason, capsys, tmp_path, monkeypatch):
+GOOD = ROWS + "".join(f"{0.02 * k},{k},{100 + k * k % 7},40,{1 + 0.1 * k}\n" for k in range(40))
+TRAIN = ("train-model", "--element", "torque", "--insert", "MRE-50-40", "--hidden", "5", "--epochs", "5")
+REFUSED: list[tuple[tuple[str, ...], str, str]] = [
+    (("characterise", "compression", "absent"), "", "absent: cannot be read: No such file"),
+    (("optimise-design", "--region", "1", "1", "1", "1"), "", "most_N = 1"),
+    (("tune-position", "--config", "absent.toml"), "", "absent.toml"),
+    (("bench-sweep", "--plant", "absent", "--out", "x.csv"), "", "absent"),
+    (("wire-log", "virtual", "session.mp3"), "", ".mp3"),
+    (("tactile-experiment", "--out", "none"), "", "not a directory"),
+    (("fleet", "/nowhere"), "", "/nowhere: no such folder or file"),
+    (("fleet", "nothing://there"), "", "Protocol not known: nothing"),
+    (("fleet", "."), "", "no .mcap in it; `tormagctl record` makes them"),
+    *(
+        (("bound", "given", *more), FORCES + text, reason)
+        for text, more, reason in (
+            ("1,nan\n2,1\n", (), "row 3, force_N = 'nan'"),
+            ("1,1\n1,1\n", (), "row 4, t_s = 1"),
+            ("1,1\n1e4,1\n", (), "t_s = 0.0 .. 10000.0"),
+            ("1,1\n2,1\n", ("--plant", "sample_9"), "sample_9"),
+        )
+    ),
+    (("identify-motor", "absent"), "", "absent: cannot be read"),
+    (("identify-motor", "given"), "t_s,input_V\n0,1\n", "position_mm"),
+    *(
+        (("identify-motor", "given"), MOTOR + text, reason)
+        for text, reason in (
+            ("0,1,x\n", "row 2"),
+            ("".join(f"{k * 1e-3},0,nan\n" for k in range(200)), "finite"),
+            ("".join(f"{k * k * 1e-3},0,0\n" for k in range(200)), "steps by"),
+            ("".join(f"{k * 0.1},0,0\n" for k in range(200)), "Hz"),
+            ("".join(f"{k * 1e-3:.3f},0,5\n" for k in range(5000)), "moves too little"),
+            ("0,1,2\n", "rows"),
+        )
+    ),
+    *(
+        ((*TRAIN, data, "--out", "m.safetensors", *more), text, reason)
+        for data, text, more, reason in (
+            ("given", ROWS + "0,0,nan,40,1\n", (), "row 2, field_mT: 'nan'"),
+            ("absent", "", (), "cannot be read"),
+            ("given", GOOD, ("--out", "absent/m.safetensors"), "cannot write"),
+            ("given", GOOD, ("--hidden", "0"), "hidden = 0"),
+            ("given", GOOD, ("--epochs", "0"), "epochs = 0"),
+            ("given", GOOD, ("--insert", "two words"), "insert"),
+            ("given", GOOD, ("--validation-share", "1"), "validation_share"),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "given", "reason"), REFUSED)
+def test_what_cannot_be_used_is_one_line_and_exit_2(arguments, given, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    if given:
+        (tmp_path / "given").write_text(given)
     assert main(arguments) == 2
     told = capsys.readouterr()
     assert told.err.startswith(f"tormag-lab {arguments[0]}: ")
     assert reason in told.err
     assert (told.out, told.err.count("\n")) == ("", 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["given"] * bool(given)
 
 
 def test_a_console_without_torch_has_the_light_commands():

@@ -120,19 +120,6 @@ def test_a_bucket_is_read_like_a_folder(folder):
         assert read_all(in_bucket, thread) == read_all({name: here[name] for name in in_bucket}, thread)
 
 
-@pytest.mark.parametrize(
-    ("url", "reason"),
-    [
-        ("/nowhere", "/nowhere: no such folder or file"),
-        ("nothing://there", "Protocol not known: nothing"),
-        ("{empty}", "no .mcap in it; `tormagctl record` makes them"),
-    ],
-)
-def test_what_cannot_be_looked_at_is_told(url, reason, tmp_path, capsys):
-    assert main(["fleet", url.format(empty=tmp_path)]) == 2
-    assert reason in capsys.readouterr().err
-
-
 def test_a_worker_that_dies_is_told_with_its_file(folder):
     with ThreadPoolExecutor(1) as here:
         _, left_out = read_all({"a.mcap": 3}, here)  # type: ignore[dict-item]

@@ -212,22 +212,3 @@ def test_intervals_cover_what_hangs_together():
         inside += abs(fitted.values[0] - 1.0) <= fitted.half_widths[0]
     assert 180 <= inside <= 199
     assert 0.3 * fitted.half_widths[0] > 1.96 / 4000**0.5
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("t_s,input_V\n0,1\n", "position_mm"),
-        ("t_s,input_V,position_mm\n0,1,x\n", "row 2"),
-        ("t_s,input_V,position_mm\n" + "".join(f"{k * 1e-3},0,nan\n" for k in range(200)), "finite"),
-        ("t_s,input_V,position_mm\n" + "".join(f"{k * k * 1e-3},0,0\n" for k in range(200)), "steps by"),
-        ("t_s,input_V,position_mm\n" + "".join(f"{k * 0.1},0,0\n" for k in range(200)), "Hz"),
-        ("t_s,input_V,position_mm\n" + "".join(f"{k * 1e-3:.3f},0,5\n" for k in range(5000)), "moves too little"),
-        ("t_s,input_V,position_mm\n0,1,2\n", "rows"),
-    ],
-)
-def test_a_log_that_cannot_be_used_says_why(tmp_path, capsys, text, told):
-    log = tmp_path / "log.csv"
-    log.write_text(text)
-    assert main(["identify-motor", str(log)]) == 2
-    assert told in capsys.readouterr().err

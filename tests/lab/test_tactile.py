@@ -11,7 +11,6 @@ import pytest
 
 from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.lab.main import main
 from tormagd.lab.tactile import branches, experiment, models, report, shipped
 from tormagd.lab.tactile.models import QUICK
 from tormagd.lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
@@ -190,11 +189,6 @@ def test_field_errors_count_only_where_the_force_depends_on_the_field():
     assert along.scores(reference)["elsewhere_force_mae_N"] == 0.0
     # near no displacement nothing does
     assert not along.scored[0]
-
-
-def test_another_place_than_a_folder_is_refused(tmp_path, capsys):
-    assert main(["tactile-experiment", "--out", str(tmp_path / "none")]) == 2
-    assert "not a directory" in capsys.readouterr().err
 
 
 # -- the pad's tools ---------------------------------------------------------------------------------------------------

@@ -416,21 +416,3 @@ def test_what_was_taken_out_of_the_data_is_in_the_file(
         out = tmp_path / f"{name}.safetensors"
         assert main(command(data, out, "--epochs", "2", *more)) == 0
         assert load_model(out, element="torque").metadata.memory == expected
-
-
-def test_what_cannot_work_is_told_with_exit_2(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "m.safetensors"
-    broken = tmp_path / "broken.csv"
-    broken.write_text("displacement_mm,rate_mm_s,field_mT,cip_percent,force_N\n0,0,nan,40,1\n")
-    for arguments, message in (
-        (command(broken, out), "row 2, field_mT: 'nan'"),
-        (command(tmp_path / "absent.csv", out), "cannot be read"),
-        (command(data, tmp_path / "absent" / "m.safetensors", "--epochs", "1"), "cannot write"),
-        (command(data, out, "--hidden", "0"), "hidden = 0"),
-        (command(data, out, "--epochs", "0"), "epochs = 0"),
-        (command(data, out, "--insert", "two words"), "insert"),
-        (command(data, out, "--validation-share", "1"), "validation_share"),
-    ):
-        assert main(arguments) == 2
-        assert message in capsys.readouterr().err
-    assert not out.exists()

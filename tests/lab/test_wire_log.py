@@ -101,11 +101,6 @@ def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:
     assert (frame.timestamp, frame.arbitration_id, bytes(frame.data)) == (1.5, 0x021, drive)
 
 
-def test_a_file_type_that_is_not_known_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["wire-log", "virtual", str(tmp_path / "session.mp3")]) == 2
-    assert ".mp3" in capsys.readouterr().err
-
-
 class Tap:
     """A tap on a line whose two ends the test holds: `device` is the device's, `host` the daemon's."""
 
