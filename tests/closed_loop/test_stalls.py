@@ -10,7 +10,6 @@ from tormagd.control.move.carriages import Carriages
 from tormagd.control.records import TimedSetpoint
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState
-from tormagd.simulation.device import VirtualDevice
 
 FORCE_N = 1.4
 ALLOWED_N = 0.1
@@ -47,20 +46,15 @@ def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
 
 
 class Stopped:
-    """A device whose process can be stopped: what comes waits for it, and its own time stands still."""
+    """A device whose process is stopped: what comes waits for it, and its own time stands still."""
 
-    def __init__(self, device: VirtualDevice) -> None:
-        self._device = device
-        self._behind_s = 0.0
+    def __init__(self, loop: ClosedLoop, stop_ms: int) -> None:
+        """It is stopped now, for so long."""
+        self._device, self._behind_s, self.until_s = loop.device, stop_ms * 1e-3, loop.now_s + stop_ms * 1e-3
         self._waiting: list[bytes] = []
-        self.until_s = 0.0
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._device, name)
-
-    def stop(self, now_s: float, stop_ms: int) -> None:
-        self.until_s = now_s + stop_ms * 1e-3
-        self._behind_s += stop_ms * 1e-3
 
     def transmit(self, now_s: float) -> bytes:
         if now_s < self.until_s:
@@ -138,9 +132,7 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
 
 @pytest.mark.parametrize("stop_ms", SHORT_MS)
 def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(holding: ClosedLoop, stop_ms: int) -> None:
-    device = Stopped(holding.device)
-    holding.device = device  # type: ignore[assignment]
-    device.stop(holding.now_s, stop_ms)
+    holding.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
     samples = run(holding, FORCE_N, 0.6)
     assert samples[-1].safety.faults == ()
     assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 5)
@@ -150,9 +142,7 @@ def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(hold
 
 @pytest.mark.parametrize("stop_ms", LONG_MS)
 def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLoop, stop_ms: int) -> None:
-    device = Stopped(holding.device)
-    holding.device = device  # type: ignore[assignment]
-    device.stop(holding.now_s, stop_ms)
+    holding.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
     samples = run(holding, FORCE_N, 2.0)
     assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
     assert Fault.HOST_STALL not in samples[-1].safety.faults

@@ -127,40 +127,62 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
             "device.command_timeout_ms = 50",
         ),
         ("[limits]\nskew_warning_mm = 1.5", "limits.skew_warning_mm = 1.5", "1.5", "limits.skew_fault_mm = 1"),
+        # who is let in: this machine alone, without keys
+        *(
+            (f'[endpoints]\n{name} = "{address}"', f"endpoints.{name} = {address!r}", "", "CURVE")
+            for name in ("setpoint", "telemetry", "control", "recording")
+            for address in (
+                "tcp://*:5555",
+                "tcp://0.0.0.0:5555",
+                "tcp://192.168.1.4:5555",
+                "tcp://eth0:5555",
+                "tcp://localhost.example.org:1",
+                "tcp://[::]:5555",
+                "udp://127.0.0.1:5555",
+                "pgm://127.0.0.1;239.0.0.1:5555",
+                "127.0.0.1:5555",
+                "",
+                "tcp://127.example.org:5555",
+                "tcp://127.0.0.1.example.org:5555",
+                "tcp://127.0.0.1:99999",
+                "tcp://127.0.0.1:65536",
+                "tcp://127.0.0.1:0",
+                "tcp://127.0.0.1:",
+                "tcp://127.300.0.1:5555",
+                "tcp://localhost:５５５５",
+                "tcp://[::1]:5555",
+                "inproc://setpoint",
+            )
+        ),
+        *(
+            (
+                f'[endpoints]\ncontrol = "ipc://{path}"',
+                "endpoints.control = 'ipc://",
+                "",
+                "after ipc:// the path of a socket",
+            )
+            for path in ("", "@", "*", "/tmp/run/", "/", "/tmp/\\u0000", "/tmp/" + 103 * "x")
+        ),
+        *(
+            (
+                f'[endpoints]\nsetpoint = "{first}"\ncontrol = "{second}"',
+                f"endpoints.control = {second!r}",
+                "",
+                "endpoints.setpoint",
+            )
+            for first, second in (
+                ("ipc:///tmp/a", "ipc:///tmp/a"),
+                ("ipc:///tmp/a", "ipc:///tmp//a"),
+                ("ipc:///tmp/a", "ipc:///tmp/b/../a"),
+                ("ipc:///proc/self/cwd/a", "ipc://a"),
+                ("ipc://@a", "ipc://@a"),
+                ("tcp://127.0.0.1:5555", "tcp://localhost:05555"),
+            )
+        ),
     ],
 )
 def test_a_refusal_names_key_value_and_what_is_allowed(write, text: str, key: str, value: str, allowed: str) -> None:
     refusal(write(text), key.removesuffix("$"), value, allowed)
-
-
-@pytest.mark.parametrize("name", ["setpoint", "telemetry", "control", "recording"])
-@pytest.mark.parametrize(
-    "address",
-    [
-        "tcp://*:5555",
-        "tcp://0.0.0.0:5555",
-        "tcp://192.168.1.4:5555",
-        "tcp://eth0:5555",
-        "tcp://localhost.example.org:1",
-        "tcp://[::]:5555",
-        "udp://127.0.0.1:5555",
-        "pgm://127.0.0.1;239.0.0.1:5555",
-        "127.0.0.1:5555",
-        "",
-        "tcp://127.example.org:5555",
-        "tcp://127.0.0.1.example.org:5555",
-        "tcp://127.0.0.1:99999",
-        "tcp://127.0.0.1:65536",
-        "tcp://127.0.0.1:0",
-        "tcp://127.0.0.1:",
-        "tcp://127.300.0.1:5555",
-        "tcp://localhost:５５５５",
-        "tcp://[::1]:5555",
-        "inproc://setpoint",
-    ],
-)
-def test_only_this_machine_is_open(write, name: str, address: str) -> None:
-    refusal(write(f'[endpoints]\n{name} = "{address}"'), f"endpoints.{name} = {address!r}", "CURVE")
 
 
 @pytest.mark.parametrize(
@@ -176,28 +198,6 @@ def test_only_this_machine_is_open(write, name: str, address: str) -> None:
 )
 def test_loopback_is_open(write, address: str) -> None:
     assert load_config(write(f'[endpoints]\nsetpoint = "{address}"')).endpoints.setpoint == address
-
-
-@pytest.mark.parametrize("path", ["", "@", "*", "/tmp/run/", "/", "/tmp/\\u0000", "/tmp/" + 103 * "x"])
-def test_an_address_that_nobody_can_connect_to_is_refused(write, path: str) -> None:
-    said = ("endpoints.control = 'ipc://", "allowed is after ipc:// the path of a socket")
-    refusal(write(f'[endpoints]\ncontrol = "ipc://{path}"'), *said)
-
-
-@pytest.mark.parametrize(
-    ("first", "second"),
-    [
-        ("ipc:///tmp/a", "ipc:///tmp/a"),
-        ("ipc:///tmp/a", "ipc:///tmp//a"),
-        ("ipc:///tmp/a", "ipc:///tmp/b/../a"),
-        ("ipc:///proc/self/cwd/a", "ipc://a"),
-        ("ipc://@a", "ipc://@a"),
-        ("tcp://127.0.0.1:5555", "tcp://localhost:05555"),
-    ],
-)
-def test_two_endpoints_cannot_share_an_address(write, first: str, second: str) -> None:
-    said = (f"endpoints.control = {second!r}", "endpoints.setpoint")
-    refusal(write(f'[endpoints]\nsetpoint = "{first}"\ncontrol = "{second}"'), *said)
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, write) -> None:
@@ -237,9 +237,16 @@ def _toml(value: object) -> str:
     )
 
 
-def test_check_prints_the_resolved_configuration(write, capsys) -> None:
+def test_check_prints_the_resolved_configuration_and_names_a_broken_plugin(write, capsys, monkeypatch) -> None:
+    known = ("serial", "tormagd.hardware.serial_backend:DRIVER"), ("broken", "no_such_module_anywhere:open")
+    points = [metadata.EntryPoint(*each, ENTRY_POINTS) for each in known]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == ENTRY_POINTS else [])
     assert main(["--config", str(write('scene = "pulse"\n')), "--check"]) == 0
     resolved = json.loads(capsys.readouterr().out)
+    assert (resolved["backends"]["serial"], "no_such_module_anywhere" in resolved["backends"]["broken"]) == (
+        "loads",
+        True,
+    )
     assert msgspec.convert(resolved["config"], Config).scene == "pulse"
     assert (resolved["config"]["device"]["options"], resolved["scene"]["name"]) == ({"baud": 1_000_000}, "pulse")
     assert 0.0 < resolved["derived"]["least_N"] < resolved["derived"]["most_N"]
@@ -321,17 +328,3 @@ def test_the_sample_files_are_accepted(example: Path) -> None:
     config = load_config(example)
     assert config.scene == "coronary"
     choose(config.device, config.rates)
-
-
-def test_a_check_names_a_broken_plugin_and_goes_on(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    points = [
-        metadata.EntryPoint("serial", "tormagd.hardware.serial_backend:DRIVER", ENTRY_POINTS),
-        metadata.EntryPoint("broken", "no_such_module_anywhere:open", ENTRY_POINTS),
-    ]
-    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == ENTRY_POINTS else [])
-    assert main(["--check"]) == 0
-    backends = json.loads(capsys.readouterr().out)["backends"]
-    assert backends["serial"] == "loads"
-    assert "no_such_module_anywhere" in backends["broken"]

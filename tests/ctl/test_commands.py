@@ -414,24 +414,28 @@ def text(status_with: Any) -> Any:
     return lambda **changes: firmware_text(msgspec.convert(link | changes, LinkReport), Colour(sys.stdout))
 
 
-def test_everything_that_is_known_is_said(text: Any) -> None:
-    said = (
-        "RUNNING on /dev/tormag (serial)",
-        "1.0, device 7",
-        "4b3a5911 (the daemon's too), protocol 1",
-        "1 since the daemon started, the last: no message for 80 ms",
-        "55096 frames",
-        "2 lost",
-        "402 us (p50)",
-        "+30.1 ppm",
-    )
-    assert [words for words in said if words not in text()] == []
+EVERYTHING = (
+    "RUNNING on /dev/tormag (serial)",
+    "1.0, device 7",
+    "4b3a5911 (the daemon's too), protocol 1",
+    "1 since the daemon started, the last: no message for 80 ms",
+    "55096 frames",
+    "2 lost",
+    "402 us (p50)",
+    "+30.1 ppm",
+)
+REFUSED = {"state": "REFUSED", "firmware_schema": "1f00c0de", "cause": "the schemas differ", "remedy": "install one"}
 
 
-def test_two_schemas_are_both_named(text: Any) -> None:
-    shown = text(state="REFUSED", firmware_schema="1f00c0de", cause="the schemas differ", remedy="install one")
-    said = ("1f00c0de (the daemon's is 4b3a5911)", "the schemas differ", "next: install one")
-    assert [words for words in said if words not in shown] == []
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, EVERYTHING),
+        (REFUSED, ("1f00c0de (the daemon's is 4b3a5911)", "the schemas differ", "next: install one")),
+    ],
+)
+def test_everything_that_is_known_is_said(text: Any, changes: dict[str, str], said: tuple[str, ...]) -> None:
+    assert [words for words in said if words not in text(**changes)] == []
 
 
 def test_nothing_known_is_no_error(text: Any) -> None:

@@ -458,17 +458,13 @@ def test_one_that_will_not_is_a_plain_warning(
     assert all(word in record.message for word in (USB, "16 ms", "tormagctl doctor"))
 
 
-def test_a_port_without_a_timer_is_not_asked(line: Line, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with serial.Serial(line.device.port) as port:
-        make_prompt(port, tmp_path)
-    assert caplog.records == []
-
-
-def test_a_pty_that_is_said_to_have_a_timer_refuses(
-    line: Line, tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("has_timer", [False, True])
+def test_a_pty_refuses_and_is_not_asked_unless_it_is_said_to_have_a_timer(
+    line: Line, tmp_path: Path, caplog: pytest.LogCaptureFixture, has_timer: bool
 ) -> None:
     """The driver's real refusal, as pyserial hands it on."""
-    timer_of(line.device.port, tmp_path)
+    if has_timer:
+        timer_of(line.device.port, tmp_path)
     with serial.Serial(line.device.port) as port:
         make_prompt(port, tmp_path)
-    assert "Failed to update" in caplog.text
+    assert (len(caplog.records), "Failed to update" in caplog.text) == (has_timer, has_timer)

@@ -189,30 +189,34 @@ def forces(rows: int, excess_N: float, at: int, lasts: int) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(("lasts", "over_N"), [(200, 0.3), (40, 0.0)])
-def test_an_excess_counts_where_it_lasts(lasts: int, over_N: float) -> None:
-    assert judged(1.0, forces(6_000, 0.3, 4_000, lasts)).over_N == pytest.approx(over_N, abs=1e-9)
-
-
-def test_before_a_carriage_could_have_arrived_nothing_counts() -> None:
-    assert judged(1.0, forces(6_000, 0.3, 100, 400)).over_N == pytest.approx(0.0, abs=1e-9)
-
-
-def test_the_greatest_force_counts_whenever_it_was() -> None:
-    assert judged(1.0, forces(6_000, 1.7, 100, 5)).peak_N == pytest.approx(2.7)
-
-
-def test_below_what_the_open_gap_brakes_there_is_nothing_to_fall_short_of() -> None:
-    found = judged(0.2, np.full(6_000, 0.55))
-    assert (found.under_N, found.settled) == (-np.inf, ())
-    assert judged(1.0, np.full(6_000, 0.8)).under_N == pytest.approx(0.2)
+@pytest.mark.parametrize(
+    ("asked_N", "along_N", "figure", "expected_N"),
+    [
+        (1.0, forces(6_000, 0.3, 4_000, 200), "over_N", 0.3),
+        (1.0, forces(6_000, 0.3, 4_000, 40), "over_N", 0.0),
+        (1.0, forces(6_000, 0.3, 100, 400), "over_N", 0.0),
+        (1.0, forces(6_000, 1.7, 100, 5), "peak_N", 2.7),
+        (1.0, np.full(6_000, 0.8), "under_N", 0.2),
+        (0.2, np.full(6_000, 0.55), "under_N", -np.inf),
+    ],
+    ids=[
+        "an excess",
+        "one that does not last",
+        "before a carriage could have arrived",
+        "the greatest whenever it was",
+        "a lack",
+        "below what the open gap brakes",
+    ],
+)
+def test_what_counts_of_a_run(asked_N: float, along_N: np.ndarray, figure: str, expected_N: float) -> None:
+    assert getattr(judged(asked_N, along_N), figure) == pytest.approx(expected_N, abs=1e-9)
 
 
 @pytest.mark.parametrize("speed_mm_s", [42.0, -42.0])
 def test_both_ways_are_sliding(speed_mm_s: float) -> None:
     found = judged(1.0, np.full(6_000, 1.1), speed_mm_s)
-    assert [round(error, 6) for _, _, error in found.settled] == [0.1] * len(found.settled)
-    assert found.settled
+    assert {round(error, 6) for _, _, error in found.settled} == {0.1}
+    assert judged(0.2, np.full(6_000, 0.55), speed_mm_s).settled == ()
 
 
 def test_a_missed_bound_is_named() -> None:
