@@ -8,7 +8,7 @@ import pytest
 from fault_matrix.rig import Lie, LyingSensor
 
 from tormagd.assembly.build import Core
-from tormagd.closed_loop import Sample
+from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import Governor
@@ -52,11 +52,10 @@ LIES: dict[str, Lie] = {
 
 
 @pytest.mark.parametrize("lie", ["+0.3 N", "-0.3 N", "+1 N", "-1 N", "frozen", "tenfold", "inverted"])
-def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(arm, render, lie: str) -> None:
-    loop = arm()
-    render(loop, ASKED_N, 2.0)
-    LyingSensor(loop.simulated.plant, LIES[lie])
-    samples = render(loop, ASKED_N, 1.5)
+def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(arm, render, lie: str, armed: ClosedLoop) -> None:
+    render(armed, ASKED_N, 2.0)
+    LyingSensor(armed.simulated.plant, LIES[lie])
+    samples = render(armed, ASKED_N, 1.5)
     assert named_s(samples) < 0.5
     assert worst_N(samples) < ASKED_N + 0.25
 
@@ -128,23 +127,23 @@ def slides(sample: Sample) -> bool:
     return estimate is not None and estimate.handle.rate_mm_s > 20.0 and estimate.handle.displacement_mm >= 2.0
 
 
-def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(arm, render) -> None:
-    loop = arm()
-    render(loop, ASKED_N, 2.0)
-    before = loop.planner.believe.strength.fit
+def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(
+    arm, render, armed: ClosedLoop
+) -> None:
+    render(armed, ASKED_N, 2.0)
+    before = armed.planner.believe.strength.fit
     # as after ten minutes of turning the one way
-    loop.planner.believe.zero.variance_N2 = 1.01 * UNKNOWN_SD_N**2
-    LyingSensor(loop.simulated.plant, lambda _, reading_N: reading_N + 0.1)
-    samples = render(loop, ASKED_N, 3.0)
-    assert (samples[-1].plan.limits, loop.planner.believe.strength.fit) == ((Limit.OFFSET_UNKNOWN,), before)
+    armed.planner.believe.zero.variance_N2 = 1.01 * UNKNOWN_SD_N**2
+    LyingSensor(armed.simulated.plant, lambda _, reading_N: reading_N + 0.1)
+    samples = render(armed, ASKED_N, 3.0)
+    assert (samples[-1].plan.limits, armed.planner.believe.strength.fit) == ((Limit.OFFSET_UNKNOWN,), before)
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 
-def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, render) -> None:
-    loop = arm()
-    render(loop, ASKED_N, 2.0)
-    LyingSensor(loop.simulated.plant, LIES["-1 N"])
-    samples = render(loop, ASKED_N, 3.0)
+def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, render, armed: ClosedLoop) -> None:
+    render(armed, ASKED_N, 2.0)
+    LyingSensor(armed.simulated.plant, LIES["-1 N"])
+    samples = render(armed, ASKED_N, 3.0)
     assert samples[-1].safety.faults == (Fault.SENSOR,)
     healthy_s = 1e-3 * sum(not sample.safety.faults for sample in samples)
     assert healthy_s == pytest.approx(2.06, abs=0.1)

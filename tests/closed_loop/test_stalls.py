@@ -153,14 +153,13 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
 
 
 @pytest.mark.parametrize("force_N", [0.2, 0.5])
-def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(arm, force_N: float) -> None:
+def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(arm, force_N: float, armed: ClosedLoop) -> None:
     """The switches close 0.2 mm before where they did at homing: the carriages coast on, but not all the way."""
-    loop = arm()
-    run(loop, 1.2, 0.8)
-    loop.device.messages._home_m -= 2e-4
-    move = loop.stepper.move
+    run(armed, 1.2, 0.8)
+    armed.device.messages._home_m -= 2e-4
+    move = armed.stepper.move
     assert isinstance(move, Carriages)
-    seen = [(sample, move.left.integral, move.right.integral) for sample in ticks(loop, force_N, 3.0)]
+    seen = [(sample, move.left.integral, move.right.integral) for sample in ticks(armed, force_N, 3.0)]
     samples, left, right = zip(*seen, strict=True)
     assert samples[-1].safety.faults == ()
     assert Limit.F_MIN in samples[-1].plan.limits
@@ -168,6 +167,6 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(arm, force
     assert Limit.SATURATED not in limits_of(samples[1_500:])
     assert max(*left[1_500:], *right[1_500:]) < 0.1
     # and it comes off again as ever
-    forces_N = [sample.truth.force_N for sample in run(loop, 1.2, 1.5)]
+    forces_N = [sample.truth.force_N for sample in run(armed, 1.2, 1.5)]
     assert max(forces_N) < 1.2 + ALLOWED_N
     assert forces_N[-1] == pytest.approx(1.2, abs=0.06)

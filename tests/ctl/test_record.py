@@ -13,6 +13,11 @@ from tormagd.ctl.main import main
 from tormagd.recording.reader import read_recording
 
 
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "a.mcap"
+
+
 def test_record_then_plot(fake_daemon, tmp_path, ctl):
     file, picture = tmp_path / "a.mcap", tmp_path / "a.png"
     result = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "0.3").ended(0).result
@@ -27,8 +32,7 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_plot_of_a_cut_recording_says_so(fake_daemon, tmp_path, ctl):
-    file = tmp_path / "a.mcap"
+def test_the_plot_of_a_cut_recording_says_so(fake_daemon, tmp_path, ctl, file):
     assert main(["--endpoint", fake_daemon.control, "record", str(file), "--duration", "0.3"]) == 0
     file.write_bytes(file.read_bytes()[:-40])
     assert "a.mcap was cut short" in ctl("plot", str(file), "-o", str(tmp_path / "a.png")).ended(0).out
@@ -40,8 +44,7 @@ def test_a_daemon_that_does_not_say_what_it_runs_is_not_recorded(fake_daemon, tm
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_silent_end_is_a_gap_and_a_daemon_that_has_gone(fake_daemon, tmp_path, ctl):
-    file = tmp_path / "a.mcap"
+def test_a_silent_end_is_a_gap_and_a_daemon_that_has_gone(fake_daemon, tmp_path, ctl, file):
     threading.Timer(0.3, lambda: setattr(fake_daemon, "is_silent", True)).start()
     found = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "2").ended(3).result
     assert (found["gaps"], found["longest_gap_ms"]) == (1, pytest.approx(found["silent_ms"]))
@@ -58,8 +61,7 @@ def test_lost_ticks_are_counted_and_are_no_success(fake_daemon, tmp_path, ctl):
     assert ctl(*fake_daemon.at, "--json", *arguments).ended(1).result["ticks_lost"] in range(3, 3_000, 3)
 
 
-def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, ctl):
-    file = tmp_path / "a.mcap"
+def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, ctl, file):
     file.write_text("precious")
     assert "exists" in ctl(*fake_daemon.at, "--json", "record", str(file)).ended(2).error["message"]
     assert file.read_text() == "precious"
@@ -100,9 +102,8 @@ def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, ctl):
     ids=["without a warning", "nearly full"],
 )
 def test_a_full_disk_ends_a_recording_that_can_still_be_read(
-    fake_daemon, tmp_path, limit_bytes, program, said, is_told
+    fake_daemon, tmp_path, limit_bytes, program, said, is_told, file
 ):
-    file = tmp_path / "a.mcap"
     program = f"from tormagd.recording import writer; {program}import sys, tormagd.ctl.main as it; sys.exit(it.main())"
     command = [sys.executable, "-c", program, "--endpoint", fake_daemon.control, "--wait", "20", "--json"]
     ended = subprocess.run(
@@ -125,8 +126,7 @@ def test_a_full_disk_ends_a_recording_that_can_still_be_read(
     assert is_told or recording.ticks.t_ns.size > 0
 
 
-def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, tmp_path):
-    file = tmp_path / "a.mcap"
+def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, tmp_path, file):
     command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "20", "--json"]
     recorder = subprocess.Popen([*command, "record", str(file)], stdout=subprocess.PIPE, text=True)
     try:

@@ -35,6 +35,11 @@ def after_s(setpoint: Setpoint, first: Setpoint) -> float:
     return (setpoint.stamp_ns - first.stamp_ns) * 1e-9
 
 
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "task.csv"
+
+
 def test_every_setpoint_arrives_from_the_first_on(fake_daemon, ctl):
     result = send(fake_daemon, ctl, "ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
     wait_for(fake_daemon, result["sent"])
@@ -77,8 +82,7 @@ def test_a_preview_is_what_will_be_sent(fake_daemon, ctl):
     )
 
 
-def test_a_file_is_sent_with_its_handle_motion(fake_daemon, ctl, tmp_path):
-    file = tmp_path / "task.csv"
+def test_a_file_is_sent_with_its_handle_motion(fake_daemon, ctl, tmp_path, file):
     file.write_text("t_s,force_N,displacement_mm,rate_mm_s\n10,1,0,5\n10.1,2,2,5\n")
     result = send(fake_daemon, ctl, str(file), "--rate", "100")
     wait_for(fake_daemon, result["sent"])
@@ -87,8 +91,7 @@ def test_a_file_is_sent_with_its_handle_motion(fake_daemon, ctl, tmp_path):
     assert (last.servo_cf, last.displacement_mm, last.rate_mm_s) == pytest.approx((2.0, 2.0, 5.0))
 
 
-def test_duration_cuts_a_file_short(fake_daemon, ctl, tmp_path):
-    file = tmp_path / "task.csv"
+def test_duration_cuts_a_file_short(fake_daemon, ctl, tmp_path, file):
     file.write_text("t_s,force_N\n0,1\n100,2\n")
     result = send(fake_daemon, ctl, str(file), "--rate", "100", "--duration", "0.05")
     assert result["sent"] + result["skipped"] == 6
@@ -123,8 +126,7 @@ def test_duration_cuts_a_file_short(fake_daemon, ctl, tmp_path):
         (b"\x00\x01\x02", "task.csv"),
     ],
 )
-def test_a_faulty_file_is_refused_by_row_column_and_value(tmp_path, ctl, content, named):
-    file = tmp_path / "task.csv"
+def test_a_faulty_file_is_refused_by_row_column_and_value(tmp_path, ctl, content, named, file):
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     assert named in ctl("--json", "send", str(file)).ended(2).error["message"]
 
@@ -140,8 +142,7 @@ def test_any_bytes_are_a_waveform_or_refused(tmp_path_factory, data):
     assert 0.0 <= waveform.at(waveform.duration_s / 2).force_N <= 1_000.0
 
 
-def test_byte_order_mark_windows_lines_and_blank_lines_are_read(tmp_path):
-    file = tmp_path / "task.csv"
+def test_byte_order_mark_windows_lines_and_blank_lines_are_read(tmp_path, file):
     file.write_bytes("\ufefft_s,force_N\r\n0,1\r\n\r\n2,3\r\n".encode())
     waveform = read_csv(file)
     assert (waveform.duration_s, waveform.at(1.0).force_N, waveform.at(1.0).displacement_mm) == (2.0, 2.0, None)
@@ -312,8 +313,7 @@ def test_setpoints_that_nobody_took_are_no_success(fake_daemon, sent):
 @pytest.mark.parametrize(
     "arguments", [("step", "--to-N", "5.5"), ("step", "--from-N", "0.4", "--to-N", "6"), ("FILE",)]
 )
-def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, ctl, tmp_path, arguments):
-    file = tmp_path / "task.csv"
+def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, ctl, tmp_path, arguments, file):
     file.write_text("t_s,force_N\n0,1\n1,7\n")
     told = [str(file) if each == "FILE" else each for each in arguments]
     error = ctl(*fake_daemon.at, "--json", "send", *told).ended(1).error

@@ -59,6 +59,17 @@ def running(nonce: int = 0) -> DeviceLink:
     return link
 
 
+@pytest.fixture
+def link() -> DeviceLink:
+    return running()
+
+
+@pytest.fixture
+def unmet() -> DeviceLink:
+    """One that has heard nothing."""
+    return DeviceLink(0.0)
+
+
 def told(link: DeviceLink, now_s: float, *messages: Message) -> None:
     for message in messages:
         link.receive(now_s, message)
@@ -78,41 +89,39 @@ def due(link: DeviceLink, from_s: float, until_s: float, heard: bool = True) -> 
 # -- who it is -----------------------------------------------------------------------------------------------------
 
 
-def test_hello_is_said_until_somebody_answers_and_then_now_and_again() -> None:
-    link = DeviceLink(0.0)
+def test_hello_is_said_until_somebody_answers_and_then_now_and_again(unmet: DeviceLink) -> None:
     hello = Hello(SCHEMA_HASH, PROTOCOL_VERSION, FIRST_NONCE)
-    asking = due(link, 0.0, 0.32)
+    asking = due(unmet, 0.0, 0.32)
     assert [message for _, message in asking] == [hello] * len(asking)
     assert [at_s for at_s, _ in asking] == pytest.approx([k * REPEAT_S for k in range(7)], abs=8e-3)
-    assert link.state is LinkState.IDENTIFYING
-    link.receive(0.32, US)
-    assert link.state is LinkState.RUNNING
-    later = due(link, 0.32, 0.45 + 3.0 * HELLO_S)
+    assert unmet.state is LinkState.IDENTIFYING
+    unmet.receive(0.32, US)
+    assert unmet.state is LinkState.RUNNING
+    later = due(unmet, 0.32, 0.45 + 3.0 * HELLO_S)
     assert [message for _, message in later] == [hello] * 4
     assert later[2][0] - later[1][0] == pytest.approx(HELLO_S, abs=2e-3)
 
 
-def test_another_schema_is_refused_with_both_hashes_and_the_firmwares_version() -> None:
-    link = DeviceLink(0.0)
-    link.receive(0.0, Identity(0x1F00C0DE, 3, 9, 1))
-    assert link.state is LinkState.REFUSED
-    assert all(word in link.cause for word in ("1f00c0de", f"{SCHEMA_HASH:08x}", "3.9"))
-    link.request(0.0, DeviceRequest.HOME)
-    assert all(isinstance(message, Hello) for _, message in due(link, 0.0, 2.0))
-    link = running()
+def test_another_schema_is_refused_with_both_hashes_and_the_firmwares_version(
+    unmet: DeviceLink, link: DeviceLink
+) -> None:
+    unmet.receive(0.0, Identity(0x1F00C0DE, 3, 9, 1))
+    assert unmet.state is LinkState.REFUSED
+    assert all(word in unmet.cause for word in ("1f00c0de", f"{SCHEMA_HASH:08x}", "3.9"))
+    unmet.request(0.0, DeviceRequest.HOME)
+    assert all(isinstance(message, Hello) for _, message in due(unmet, 0.0, 2.0))
     link.receive(1.0, US.replaced(schema_hash=SCHEMA_HASH ^ 1))
     assert link.state is LinkState.REFUSED, "also where it took another one's place"
 
 
-def test_a_device_that_turns_up_late_is_no_loss_and_asked_at_its_first_word() -> None:
-    link = DeviceLink(0.0)
-    due(link, 0.0, UNANSWERED_S, heard=False)
-    assert link.state is LinkState.IDENTIFYING
-    late = due(link, UNANSWERED_S, 10.3, heard=False)
-    assert (link.state, len(late)) == (LinkState.UNANSWERED, pytest.approx(9.0 / HELLO_S, abs=1))
-    link.receive(10.3, status())
-    assert link.state is LinkState.IDENTIFYING
-    assert [type(message) for message in link.due(10.3)] == [Hello]
+def test_a_device_that_turns_up_late_is_no_loss_and_asked_at_its_first_word(unmet: DeviceLink) -> None:
+    due(unmet, 0.0, UNANSWERED_S, heard=False)
+    assert unmet.state is LinkState.IDENTIFYING
+    late = due(unmet, UNANSWERED_S, 10.3, heard=False)
+    assert (unmet.state, len(late)) == (LinkState.UNANSWERED, pytest.approx(9.0 / HELLO_S, abs=1))
+    unmet.receive(10.3, status())
+    assert unmet.state is LinkState.IDENTIFYING
+    assert [type(message) for message in unmet.due(10.3)] == [Hello]
 
 
 def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
@@ -152,8 +161,7 @@ def test_another_device_at_the_same_line_is_not_taken_for_the_first() -> None:
 
 
 @pytest.mark.parametrize("behind", [0, 1, OVERTAKEN - 1])
-def test_a_state_that_is_no_news_measures_nothing(behind: int) -> None:
-    link = running()
+def test_a_state_that_is_no_news_measures_nothing(behind: int, link: DeviceLink) -> None:
     link.receive(0.1, State(-1.0, -1.0, 0.1, 40))
     before = link.measurement
     link.receive(0.2, State(-9.0, -9.0, 0.05, 40 - behind))
@@ -163,16 +171,14 @@ def test_a_state_that_is_no_news_measures_nothing(behind: int) -> None:
     assert link.measurement.left_mm == pytest.approx(-1.5)
 
 
-def test_a_repetition_is_none_the_less_one_before_the_device_is_known() -> None:
-    link = DeviceLink(0.0)
-    told(link, 0.0, US, State(0.0, 0.0, 0.0, 5), Sense(0.0, 0.0, 0.0, 0.0), status(), State(0.0, 0.0, 0.0, 5))
-    assert (link.measurement, link.repeated) == (None, 1)
-    link.receive(0.001, State(0.0, 0.0, 0.0, 6))
-    assert link.measurement is not None
+def test_a_repetition_is_none_the_less_one_before_the_device_is_known(unmet: DeviceLink) -> None:
+    told(unmet, 0.0, US, State(0.0, 0.0, 0.0, 5), Sense(0.0, 0.0, 0.0, 0.0), status(), State(0.0, 0.0, 0.0, 5))
+    assert (unmet.measurement, unmet.repeated) == (None, 1)
+    unmet.receive(0.001, State(0.0, 0.0, 0.0, 6))
+    assert unmet.measurement is not None
 
 
-def test_drive_counters_go_round() -> None:
-    link = running()
+def test_drive_counters_go_round(link: DeviceLink) -> None:
     counters = [link.drive(0.1, -0.2, DriveMode.RUN).counter for _ in range(600)]
     assert all((after - before) % 256 == 1 for before, after in pairwise(counters))
     assert link.drive(0.1, -0.2, DriveMode.RUN) == Drive(0.1, -0.2, DriveMode.RUN, (counters[-1] + 1) % 256)
@@ -185,8 +191,9 @@ def test_drive_counters_go_round() -> None:
     ("request_", "kind"),
     [(DeviceRequest.HOME, Home), (DeviceRequest.RETRACT, Retract), (DeviceRequest.CLEAR, Clear)],
 )
-def test_a_command_is_repeated_until_its_own_number_comes_back(request_: DeviceRequest, kind: type[Message]) -> None:
-    link = running()
+def test_a_command_is_repeated_until_its_own_number_comes_back(
+    request_: DeviceRequest, kind: type[Message], link: DeviceLink
+) -> None:
     link.request(1.0, request_)
     sent = due(link, 1.0, 1.23)
     assert {type(message) for _, message in sent} == {kind}
@@ -199,9 +206,8 @@ def test_a_command_is_repeated_until_its_own_number_comes_back(request_: DeviceR
     assert kind not in {type(message) for _, message in due(link, 1.3, 2.5)}
 
 
-def test_no_hello_comes_between_a_command_and_its_acknowledgement() -> None:
+def test_no_hello_comes_between_a_command_and_its_acknowledgement(link: DeviceLink) -> None:
     """The device takes a Hello's number for the last accepted one: that must not look like an acknowledgement."""
-    link = running()
     link.request(0.5, DeviceRequest.HOME)
     waiting = due(link, 0.5, 0.5 + GIVE_UP_S)
     assert all(isinstance(message, Home) for _, message in waiting)
@@ -214,17 +220,15 @@ def test_no_hello_comes_between_a_command_and_its_acknowledgement() -> None:
 
 
 @pytest.mark.parametrize("request_", [DeviceRequest.HOME, DeviceRequest.CLEAR])
-def test_a_command_that_the_device_does_not_take_is_given_up(request_: DeviceRequest) -> None:
-    link = running()
+def test_a_command_that_the_device_does_not_take_is_given_up(request_: DeviceRequest, link: DeviceLink) -> None:
     link.request(0.0, request_)
     assert len(due(link, 0.0, GIVE_UP_S)) == pytest.approx(GIVE_UP_S / REPEAT_S, abs=1)
     assert {type(message) for _, message in due(link, GIVE_UP_S + 2e-3, 4.0)} == {Hello}
     assert link.pending is DeviceRequest.NONE
 
 
-def test_opening_is_asked_for_until_the_device_opens_or_has_latched() -> None:
+def test_opening_is_asked_for_until_the_device_opens_or_has_latched(link: DeviceLink) -> None:
     """A latched device has its drives off and refuses: it has opened before, or cannot."""
-    link = running()
     link.request(0.0, DeviceRequest.RETRACT)
     assert {type(message) for _, message in due(link, 0.0, 5.0)} == {Retract}
     link.receive(5.0, status(mode=DeviceMode.RETRACTING))
@@ -234,9 +238,8 @@ def test_opening_is_asked_for_until_the_device_opens_or_has_latched() -> None:
     assert {type(message) for _, message in due(link, 5.02, 7.0)} == {Hello}
 
 
-def test_every_request_has_a_new_number_and_none_is_zero_or_a_hellos() -> None:
+def test_every_request_has_a_new_number_and_none_is_zero_or_a_hellos(link: DeviceLink) -> None:
     """A device takes no number twice: one that Hello has told it would be a command that it has carried out already."""
-    link = running()
     last = 0
     for turn in range(600):
         link.request(turn * 0.1, DeviceRequest.HOME)
@@ -247,8 +250,7 @@ def test_every_request_has_a_new_number_and_none_is_zero_or_a_hellos() -> None:
         link.receive(turn * 0.1, status(nonce))
 
 
-def test_a_newer_request_replaces_an_unfinished_one() -> None:
-    link = running()
+def test_a_newer_request_replaces_an_unfinished_one(link: DeviceLink) -> None:
     link.request(0.01, DeviceRequest.HOME)
     (home,) = link.due(0.01)
     link.request(0.02, DeviceRequest.RETRACT)
@@ -261,29 +263,29 @@ def test_a_newer_request_replaces_an_unfinished_one() -> None:
 
 @pytest.mark.parametrize("left_by_another_host", [0, 1, 2, 254, 255])
 @pytest.mark.parametrize("is_early", [False, True], ids=["after the first Status", "before it"])
-def test_a_number_that_another_host_used_last_is_no_acknowledgement(left_by_another_host: int, is_early: bool) -> None:
-    link = DeviceLink(0.0)
+def test_a_number_that_another_host_used_last_is_no_acknowledgement(
+    left_by_another_host: int, is_early: bool, unmet: DeviceLink
+) -> None:
     if is_early:
-        link.request(0.0, DeviceRequest.RETRACT)
-        assert not any(isinstance(message, Retract) for message in link.due(0.0))
-    told(link, 0.0, US, status(left_by_another_host))
+        unmet.request(0.0, DeviceRequest.RETRACT)
+        assert not any(isinstance(message, Retract) for message in unmet.due(0.0))
+    told(unmet, 0.0, US, status(left_by_another_host))
     if not is_early:
-        link.request(0.0, DeviceRequest.RETRACT)
-    link.receive(0.01, status(left_by_another_host))
-    (retract,) = [message for _, message in due(link, 0.01, 0.05) if isinstance(message, Retract)]
+        unmet.request(0.0, DeviceRequest.RETRACT)
+    unmet.receive(0.01, status(left_by_another_host))
+    (retract,) = [message for _, message in due(unmet, 0.01, 0.05) if isinstance(message, Retract)]
     assert retract.nonce not in (0, left_by_another_host)
 
 
-def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_origin() -> None:
+def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_origin(unmet: DeviceLink) -> None:
     """The Status that says so comes between two States; with the last one's position a carriage were out of stroke."""
-    link = DeviceLink(0.0)
     homing = status(mode=DeviceMode.HOMING, switches=Switches(0))
-    told(link, 0.0, US, homing, Sense(0.0, 0.0, 0.0, 0.0), State(7.5, 8.5, 0.0, 0))
-    link.receive(0.001, status(switches=Switches.LEFT_OPEN | Switches.RIGHT_OPEN | Switches.HOMED))
-    before = link.measurement
+    told(unmet, 0.0, US, homing, Sense(0.0, 0.0, 0.0, 0.0), State(7.5, 8.5, 0.0, 0))
+    unmet.receive(0.001, status(switches=Switches.LEFT_OPEN | Switches.RIGHT_OPEN | Switches.HOMED))
+    before = unmet.measurement
     assert (before.is_homed, before.is_busy, before.left_mm) == (False, True, 7.5)
-    link.receive(0.001, State(0.1, 0.2, 0.001, 1))
-    after = link.measurement
+    unmet.receive(0.001, State(0.1, 0.2, 0.001, 1))
+    after = unmet.measurement
     assert (after.is_homed, after.is_busy) == (True, False)
     assert (after.left_mm, after.right_mm) == pytest.approx((0.1, 0.2))
 
@@ -291,24 +293,22 @@ def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_ori
 # -- what it measured ----------------------------------------------------------------------------------------------
 
 
-def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
-    link = DeviceLink(0.0)
-    link.receive(0.0, US)
+def test_a_measurement_takes_a_status_a_sense_and_a_state(unmet: DeviceLink) -> None:
+    unmet.receive(0.0, US)
     for message in (State(0.0, 0.0, 0.0, 0), Sense(0.1, 0.2, 0.3, 0.0), State(0.0, 0.0, 0.0, 1)):
-        link.receive(0.1, message)
-        assert link.measurement is None
-    link.receive(0.2, status(supply_V=11.5))
-    link.receive(0.7, State(-3.0, -4.0, 0.25, 2))
-    measurement = link.measurement
+        unmet.receive(0.1, message)
+        assert unmet.measurement is None
+    unmet.receive(0.2, status(supply_V=11.5))
+    unmet.receive(0.7, State(-3.0, -4.0, 0.25, 2))
+    measurement = unmet.measurement
     assert measurement == Measurement(
         0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5,
         0.1, 0.2,
     )  # fmt: skip
-    assert link.measurement is measurement
+    assert unmet.measurement is measurement
 
 
-def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
-    link = running()
+def test_a_status_updates_what_it_knows_and_leaves_the_number(link: DeviceLink) -> None:
     before = link.measurement
     link.receive(
         1.0, status(mode=DeviceMode.LATCHED, switches=Switches(0), faults=DeviceFault.SKEW, temperature_C=41.0)
@@ -335,8 +335,7 @@ def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
         (DeviceMode.LATCHED, DeviceFault(0), False, True),
     ],
 )
-def test_busy_and_latched(mode: DeviceMode, faults: DeviceFault, busy: bool, latched: bool) -> None:
-    link = running()
+def test_busy_and_latched(mode: DeviceMode, faults: DeviceFault, busy: bool, latched: bool, link: DeviceLink) -> None:
     told(link, 0.1, status(mode=mode, faults=faults))
     assert (link.measurement.is_busy, link.measurement.is_latched) == (busy, latched)
 
@@ -392,19 +391,17 @@ def test_wraps_are_taken_out(
         ((State(0.0, 0.0, 0.0, 1), Sense(0.0, 0.0, 0.0, 0.0)), {"State": "CRC-8"}, "no Status yet"),
     ],
 )
-def test_what_is_missing_for_a_measurement_is_said(heard, refused, missing: str) -> None:
-    link = DeviceLink(0.0)
-    assert not link.missing(refused), "it does not run yet"
-    told(link, 0.01, US, *heard)
-    assert (link.missing(refused), link.measurement) == (missing, None)
+def test_what_is_missing_for_a_measurement_is_said(heard, refused, missing: str, unmet: DeviceLink) -> None:
+    assert not unmet.missing(refused), "it does not run yet"
+    told(unmet, 0.01, US, *heard)
+    assert (unmet.missing(refused), unmet.measurement) == (missing, None)
 
 
 def test_nothing_is_missing_where_there_is_a_measurement() -> None:
     assert running().missing({"Status": "range"}) == ""
 
 
-def test_the_quality_goes_with_the_measurement() -> None:
-    link = running()
+def test_the_quality_goes_with_the_measurement(link: DeviceLink) -> None:
     for tick in range(1, 1_500):
         now_s = tick * 1e-3
         link.drive(0.0, 0.0, DriveMode.OFF)

@@ -50,23 +50,25 @@ def exchange(
             answers.setdefault(answered, []).append("identity")
 
 
+@pytest.fixture
+def trip() -> RoundTrip:
+    return RoundTrip()
+
+
 @pytest.mark.parametrize("way_ticks", [1, 2, 16, 120])
-def test_a_round_trip_of_any_length_is_known_after_one_hello(way_ticks: int) -> None:
+def test_a_round_trip_of_any_length_is_known_after_one_hello(way_ticks: int, trip: RoundTrip) -> None:
     """A USB adapter that keeps bytes back for 16 ms has 16 Drives under way at a time."""
-    trip = RoundTrip()
     assert trip.report() is None
     exchange(trip, range(1, 1_400), way_ticks)
     assert (set(trip.report().values()), trip.least_s) == ({way_ticks * 1e3}, pytest.approx(way_ticks * PERIOD_S))
 
 
-def test_a_lost_drive_is_made_good_by_the_next_hello() -> None:
-    trip = RoundTrip()
+def test_a_lost_drive_is_made_good_by_the_next_hello(trip: RoundTrip) -> None:
     exchange(trip, range(1, 2_400), 3, lost=frozenset({1_500, 1_501}))
     assert trip.least_s == pytest.approx(3 * PERIOD_S)
 
 
-def test_an_answer_to_what_has_not_been_sent_ends_the_count() -> None:
-    trip = RoundTrip()
+def test_an_answer_to_what_has_not_been_sent_ends_the_count(trip: RoundTrip) -> None:
     exchange(trip, range(1, 1_400), 1)
     trip.drive(10, 5.0)
     trip.state(200, 5.0)
@@ -164,9 +166,8 @@ UNANSWERED = {every: frozenset(tick for tick in range(1, 4_000) if tick % every)
     ],
 )
 def test_drives_that_are_not_answered_make_no_round_trip_long(
-    way_ticks: int, ticks: int, lost: frozenset[int], least_us: float, most_us: float, within_s: float
+    way_ticks: int, ticks: int, lost: frozenset[int], least_us: float, most_us: float, within_s: float, trip: RoundTrip
 ) -> None:
-    trip = RoundTrip()
     exchange(trip, range(1, ticks), way_ticks, lost=lost)
     report = trip.report() or {}
     assert least_us <= report["least"] <= report["p99"] <= most_us
@@ -174,8 +175,9 @@ def test_drives_that_are_not_answered_make_no_round_trip_long(
 
 
 @pytest.mark.parametrize("after_ticks", [1, 20, 40, 70, 150])
-def test_a_device_that_stood_still_for_its_timeout_has_the_round_trip_that_it_had(after_ticks: int) -> None:
-    trip = RoundTrip()
+def test_a_device_that_stood_still_for_its_timeout_has_the_round_trip_that_it_had(
+    after_ticks: int, trip: RoundTrip
+) -> None:
     paused = range(2_010, 2_058)
     exchange(trip, range(1, paused.stop + after_ticks), 1, paused=paused)
     assert trip.usual_s == pytest.approx(PERIOD_S)

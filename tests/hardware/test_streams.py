@@ -94,6 +94,11 @@ def frame_of(message: Message, node: int = 1) -> tuple[int, bytes]:
     return CanStream(node).pack(message)
 
 
+@pytest.fixture
+def stream() -> CanStream:
+    return CanStream(1)
+
+
 def test_the_frame_of_the_firmware_page() -> None:
     assert frame_of(Drive(0.125, 0.1234, DriveMode.RUN, 200)) == (0x021, bytes.fromhex("e204d20401c865"))
     assert frame_of(Home(3), node=15) == (0x06F, b"\x03")
@@ -105,8 +110,7 @@ def test_a_node_that_is_none_is_refused(node: int) -> None:
         CanStream(node)
 
 
-def test_what_the_device_says_comes_through_and_other_nodes_and_hosts_commands_are_not_ours() -> None:
-    stream = CanStream(1)
+def test_what_the_device_says_comes_through_and_other_nodes_and_hosts_commands_are_not_ours(stream: CanStream) -> None:
     others = (frame_of(STATUS, node=2), frame_of(Hello(1, 1, 1)), frame_of(Home(1)))
     assert [stream.unpack(*other) for other in others] == [None] * 3
     assert (stream.statistics.frames, stream.statistics.bytes) == (0, 7)
@@ -115,15 +119,13 @@ def test_what_the_device_says_comes_through_and_other_nodes_and_hosts_commands_a
     assert (stream.statistics.frames, stream.statistics.bytes, stream.statistics.corrupt) == (2, 23, 0)
 
 
-def test_a_drive_that_is_not_ours_is_another_host() -> None:
-    stream = CanStream(1)
+def test_a_drive_that_is_not_ours_is_another_host(stream: CanStream) -> None:
     assert stream.unpack(*stream.pack(Drive(0.5, 0.5, DriveMode.RUN, 9))) is None, "its echo"
     with pytest.raises(SecondHostError):
         stream.unpack(*frame_of(Drive(0.5, 0.5, DriveMode.RUN, 10)))
 
 
-def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
-    stream = CanStream(1)
+def test_what_is_damaged_is_counted_and_the_next_good_one_found_again(stream: CanStream) -> None:
     identifier, data = frame_of(state(7))
     damaged = [(identifier, spoilt) for spoilt in (data[:-1], data[:-1] + bytes((data[-1] ^ 1,)), b"")]
     assert [stream.unpack(*frame) for frame in (*damaged, (0x7F1, b""))] == [None] * 4
@@ -145,8 +147,7 @@ def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
     ],
     ids=["over the end", "a gap", "a gap over the end", "a stuck sender", "overtaken", "a device that began anew"],
 )
-def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost: int) -> None:
-    stream = CanStream(1)
+def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost: int, stream: CanStream) -> None:
     assert None not in [stream.unpack(*frame_of(state(counter))) for counter in counters]
     assert (stream.statistics.lost, stream.statistics.repeated) == (lost, 0), "no news is for the link to count"
 
