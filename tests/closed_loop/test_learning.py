@@ -51,11 +51,18 @@ def test_a_device_that_was_known_before_is_right_at_once(arm, render) -> None:
     assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)
 
 
-def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on(arm, render) -> None:
+PULSE = Config(scene="pulse")
+
+
+@pytest.fixture(scope="module")
+def frozen() -> Core:
+    """One that learns nothing."""
+    return build_core(PULSE, msgspec.structs.replace(load_scene("pulse"), terms=Terms(learning=False)))
+
+
+def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on(arm, render, frozen: Core) -> None:
     """It knows what the elastomer has relaxed and how its field lags; nothing is learned."""
-    config, scene = Config(scene="pulse"), load_scene("pulse")
-    alone = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
-    loop = arm(core=alone, config=config)
+    loop = arm(core=frozen, config=PULSE)
     begins_s = loop.now_s
     render(loop, 1.55, 2.0)
     errors_N = [
@@ -68,10 +75,8 @@ def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on
     assert loop.planner.believe.learned() == NOTHING_LEARNED
 
 
-def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces_leap(arm) -> None:
-    config, scene = Config(scene="pulse"), load_scene("pulse")
-    frozen = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
-    loop = arm("sample_3", ReversingHand(1.0), core=frozen, config=config)
+def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces_leap(arm, frozen: Core) -> None:
+    loop = arm("sample_3", ReversingHand(1.0), core=frozen, config=PULSE)
     list(loop.run(2.5, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)))
     assert (loop.planner.believe.learned(), loop.stepper.move.acceleration_scale) == (NOTHING_LEARNED, 1.0)
 

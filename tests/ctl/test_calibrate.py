@@ -27,7 +27,6 @@ from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_swee
 from tormagd.ctl.calibrate_device import ARRIVED_S, COLUMNS as DEVICE_COLUMNS, STEP_S, judged, lesson
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
 from tormagd.ctl.calibrate_run import Range
-from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
 from tormagd.lab.training import calibration
 from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
@@ -265,13 +264,22 @@ def test_a_motor_log_with_a_hole_is_refused():
         motor_log(given, "left")
 
 
-def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monkeypatch, ctl):
-    class Played:
-        def play(self, waveform, bar):
-            assert waveform.at(0.0).force_N > 0.6
-            return ticks(300)
+class Played:
+    """A run whose ticks are these whatever is asked."""
 
-    monkeypatch.setattr(ctl_calibrate_motors, "armed", lambda *_: contextlib.nullcontext(Played()))
+    def __init__(self, ticks) -> None:
+        self._ticks = ticks
+
+    def wait_for_handle(self, force_N: float) -> None:
+        assert force_N > 0.6
+
+    def play(self, waveform, bar):
+        assert waveform.at(0.0).force_N > 0.6
+        return self._ticks
+
+
+def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monkeypatch, ctl):
+    monkeypatch.setattr(ctl_calibrate_motors, "armed", lambda *_: contextlib.nullcontext(Played(ticks(300))))
     fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0)
     out = tmp_path / "right.csv"
     arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--motors", "--side", "right"]
@@ -341,6 +349,7 @@ def test_a_refused_fit_is_the_commands_refusal(tmp_path):
 
 
 FORCES = Range(0.6, 2.0)
+_, JUDGING = lesson(FORCES)
 
 
 def played(loop, waveform):
@@ -382,48 +391,34 @@ def test_the_lesson_covers_the_range_and_nothing_else() -> None:
 
 
 def steps(error_N: float = 0.0, rate_mm_s: float = 40.0):
-    """Ticks of the judging steps: the force arrives late, and then is off by `error_N`."""
-    _, judging = lesson(FORCES)
-    time_s = np.arange(0.0, judging.duration_s, 1e-3)
+    """Ticks of the JUDGING steps: the force arrives late, and then is off by `error_N`."""
+    time_s = np.arange(0.0, JUDGING.duration_s, 1e-3)
     late = time_s % STEP_S < ARRIVED_S
-    asked = np.array([judging.at(t_s).force_N for t_s in time_s])
+    asked = np.array([JUDGING.at(t_s).force_N for t_s in time_s])
     values = (7.0 + time_s, np.where(late, 0.1, asked + error_N), np.full(len(time_s), rate_mm_s))
     return dict(zip(DEVICE_COLUMNS, values, strict=True))
 
 
 def test_steps_are_judged_once_they_have_arrived_and_without_the_sensors_zero() -> None:
-    _, judging = lesson(FORCES)
-    found = judged(steps(error_N=0.05), judging, 0.02)
+    found = judged(steps(error_N=0.05), JUDGING, 0.02)
     assert found["mean_error_N"] == found["worst_error_N"] == pytest.approx(0.03)
     assert found["noise_N"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_handle_that_hardly_moves_is_refused() -> None:
-    _, judging = lesson(FORCES)
     with pytest.raises(CommandError, match="moved in 0% of the time"):
-        judged(steps(rate_mm_s=1.0), judging, 0.0)
-
-
-class Played:
-    """A run whose ticks are the steps' whatever is asked."""
-
-    def wait_for_handle(self, force_N: float) -> None:
-        assert force_N > 0.6
-
-    def play(self, waveform, bar):
-        return steps(error_N=0.01)
+        judged(steps(rate_mm_s=1.0), JUDGING, 0.0)
 
 
 @pytest.fixture
-def calibrated(fake_daemon, monkeypatch, capsys):
-    """Runs the command beside a daemon that says so; the exit code, and what it printed."""
+def calibrated(fake_daemon, monkeypatch, ctl):
+    """Runs the command beside a daemon that says so."""
 
     def run(**status):
-        monkeypatch.setattr(calibrate_device, "armed", lambda *_: contextlib.nullcontext(Played()))
+        monkeypatch.setattr(calibrate_device, "armed", lambda *_: contextlib.nullcontext(Played(steps(error_N=0.01))))
         monkeypatch.setattr(calibrate_device, "KEPT_WITHIN_S", 0.2)
         fake_daemon.says(**{"setpoint_age_ms": None, "least_N": 0.6} | status)
-        code = main(["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--device"])
-        return code, json.loads(capsys.readouterr().out)
+        return ctl(*fake_daemon.at, "--json", "calibrate", "--yes", "--device")
 
     return run
 
@@ -432,9 +427,8 @@ KEPT = {"is_used": True, "age_s": 0.1, "refusal": "", "folder": "/profiles"}
 
 
 def test_a_device_is_learned_judged_and_kept(calibrated) -> None:
-    code, answer = calibrated(profile=KEPT)
-    result = answer["result"]
-    assert (code, result["scale"], result["profile"], result["steps"]) == (0, 1.0, "/profiles", 6)
+    result = calibrated(profile=KEPT).ended(0).result
+    assert (result["scale"], result["profile"], result["steps"]) == (1.0, "/profiles", 6)
     assert result["worst_error_N"] == pytest.approx(0.01)
 
 
@@ -452,5 +446,4 @@ def test_a_device_is_learned_judged_and_kept(calibrated) -> None:
     ids=["no folder", "a full disk", "an old one only", "a sensor that lies"],
 )
 def test_what_taught_nothing_is_refused(calibrated, status, told) -> None:
-    code, answer = calibrated(**status)
-    assert (code, answer["error"]["code"]) == (1, told)
+    assert calibrated(**status).ended(1).error["code"] == told

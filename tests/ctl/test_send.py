@@ -202,9 +202,14 @@ def seen(status_with: Any, source_with: Any) -> Any:
     return made
 
 
-def test_setpoints_that_are_taken_while_enabled_are_rendered(seen):
-    assert held_back(seen({"state": "holds"}), "me") is None
-    assert held_back(seen({"state": "holds"}, limits=["F_MIN", "RATE", "TAKEOVER"]), "me") is None
+@pytest.mark.parametrize(
+    ("state", "limits", "is_over"),
+    [("holds", [], False), ("holds", ["F_MIN", "RATE", "TAKEOVER"], False), ("stale", ["RANGE"], True)],
+)
+def test_what_is_taken_while_enabled_is_rendered_and_when_sending_is_over_the_newest_may_be_stale(
+    seen, state, limits, is_over
+):
+    assert held_back(seen({"state": state}, limits=limits), "me", is_over=is_over) is None
 
 
 @pytest.mark.parametrize(
@@ -231,8 +236,7 @@ def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes,
     assert hint in held.value.hint
 
 
-def test_when_sending_is_over_the_newest_may_be_stale(seen):
-    assert held_back(seen({"state": "stale"}, limits=["RANGE"]), "me", is_over=True) is None
+def test_when_sending_is_over_another_source_still_counts(seen):
     assert held_back(seen({"state": "refused"}), "me", is_over=True).code == "other_source"
 
 

@@ -902,10 +902,6 @@ class Interrupted(Wire):
         return super().read(until_s)
 
 
-class Unplugged(Interrupted):
-    error = OSError
-
-
 def test_an_interrupted_run_leaves_the_gap_open(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
     device = VirtualDevice(NEAR_HOME, SteadyHand())
     assert ran(SerialLine(Interrupted(device)), "--yes", "--only", "silence_opens") == 1
@@ -916,7 +912,7 @@ def test_an_interrupted_run_leaves_the_gap_open(ran: Callable[..., int], capsys:
 
 
 def test_a_line_that_goes_is_told_and_no_success(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
-    assert ran(serial_line(wire=Unplugged), "--yes", "--only", "off_opens") == 1
+    assert ran(serial_line(wire=wrong(Interrupted, error=OSError)), "--yes", "--only", "off_opens") == 1
     assert "the line is gone" in capsys.readouterr().err
 
 

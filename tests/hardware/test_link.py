@@ -371,11 +371,15 @@ def test_wraps_are_taken_out(
         news = (State(left, right, time_s, number % 256), Sense(0.0, 0.0, 0.0, handle))
         told(link, number * 1e-3, *map(through_the_wire, news))
     last = link.measurement
-    assert last.number == len(moves)
-    assert last.left_mm - first.left_mm == pytest.approx(left - start[0], abs=2e-3)
-    assert last.right_mm - first.right_mm == pytest.approx(right - start[1], abs=2e-3)
-    assert last.device_time_s - first.device_time_s == pytest.approx(time_s - start[2], abs=2e-5)
-    assert last.handle_mm == pytest.approx(handle - start[3], abs=8e-3)
+    assert (last.number, last.left_mm - first.left_mm, last.right_mm - first.right_mm) == (
+        len(moves),
+        pytest.approx(left - start[0], abs=2e-3),
+        pytest.approx(right - start[1], abs=2e-3),
+    )
+    assert (last.device_time_s - first.device_time_s, last.handle_mm) == (
+        pytest.approx(time_s - start[2], abs=2e-5),
+        pytest.approx(handle - start[3], abs=8e-3),
+    )
 
 
 # -- each of its streams -------------------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ class Flight:
             self.planner,
             self._inbox,
             period_ns,
-            clock_ns=self._clock_ns,
+            clock_ns=lambda: self._now_ns,
             journal=self._journal,
             on_failure=self._fail,
             beside=self if core.element.is_beside else None,  # type: ignore[arg-type]
@@ -117,9 +117,6 @@ class Flight:
         """Whether it is a new one."""
         before, self._inbox.newest = self._inbox.newest, setpoint
         return setpoint is not None and (before is None or setpoint.stamp_s > before.stamp_s)
-
-    def _clock_ns(self) -> int:
-        return self._now_ns
 
     def _fail(self) -> None:
         self._journal.latched(Fault.PLAN_FAILED)

@@ -64,21 +64,9 @@ def test_the_same_seed_gives_the_same_row(rows: list[Row]) -> None:
     assert tried(stages()[place], EPISODES, seed=2) != rows[place]
 
 
-def passes_on(_: object, draw: Draw) -> float:
-    return draw(1.0)
-
-
 def keeps(stage: Pid, draw: Draw) -> float:
     stage.integral = draw(0.0)
     return 0.0
-
-
-def swallows(_: object, draw: Draw) -> float:
-    return min(max(0.0, draw(1.0)), 1.0)
-
-
-def fails(_: object, draw: Draw) -> float:
-    return math.log(draw(1.0))
 
 
 def refuses(_: object, draw: Draw) -> list[Limit]:
@@ -90,10 +78,10 @@ def refuses(_: object, draw: Draw) -> list[Limit]:
 @pytest.mark.parametrize(
     ("feed", "found", "told"),
     [
-        (passes_on, "nonfinite", "out = "),
+        (lambda _, draw: draw(1.0), "nonfinite", "out = "),
         (keeps, "nonfinite", ".Pid.integral = "),
-        (swallows, "swallowed", "of NaN came 0.0"),
-        (fails, "unnamed", "ValueError: "),
+        (lambda _, draw: min(max(0.0, draw(1.0)), 1.0), "swallowed", "of NaN came 0.0"),
+        (lambda _, draw: math.log(draw(1.0)), "unnamed", "ValueError: "),
     ],
 )
 def test_what_travels_is_counted_and_told(feed: Callable[..., object], found: str, told: str) -> None:
@@ -162,9 +150,6 @@ def test_configurations_are_summed() -> None:
         "gain_margin_dB": [7.0, 9.0],
         "told": ["wrong: d", "stated: e"],
     }
-
-
-# -- tools/numerics.py on a sample; that it can fail; and loads that it does not draw ----------------------------------
 
 
 # -- tools/numerics.py itself, on a sample; that it can fail; and loads that it does not draw --------------------------

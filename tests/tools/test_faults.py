@@ -7,6 +7,7 @@ from fault_matrix.recovery import recover
 
 from tormagd.scenes.scene import load_scene
 
+NAMED = {item.name: item for item in MATRIX}
 LOSING = (
     "another source takes over",
     "operator: disable",
@@ -99,7 +100,7 @@ def test_a_fault_is_named_and_ends_safe_and_not_at_once(item: Injection, bus: st
         assert cell.below_1N_ms < 1_000.0
 
 
-@pytest.mark.parametrize("item", [item for item in MATRIX if item.name in LOSING], ids=lambda item: item.name)
+@pytest.mark.parametrize("item", [NAMED[name] for name in LOSING], ids=lambda item: item.name)
 def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection) -> None:
     rig, watch = faults.spoiled(item, fastest_plant(item), item.buses[0])
     for sample in rig.run(SAMPLED_S):
@@ -111,11 +112,10 @@ def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection) -> None:
 
 def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None:
     """The judge has to be able to say no."""
-    (stuck,) = (item for item in MATRIX if item.name == "left encoder stuck")
-    _, unnamed = faults.inject(stuck._replace(names=("SENSOR",), within_ms=10.0), "sample_1", watched_s=JUDGED_S)
+    stuck = NAMED["left encoder stuck"]._replace(names=("SENSOR",), within_ms=10.0)
+    _, unnamed = faults.inject(stuck, "sample_1", watched_s=JUDGED_S)
     assert (unnamed.named, unnamed.safe, unnamed.in_time) == (False, True, False)
-    (supply,) = (item for item in MATRIX if item.name == "motor supply fails")
-    _, unsafe = faults.inject(supply._replace(safe=OPENS), "sample_1", watched_s=JUDGED_S)
+    _, unsafe = faults.inject(NAMED["motor supply fails"]._replace(safe=OPENS), "sample_1", watched_s=JUDGED_S)
     assert (unsafe.named, unsafe.safe) == (True, False)
 
 
@@ -132,22 +132,20 @@ RECOVERED = (
 def test_what_leads_out_of_a_fault_does_so_when_its_cause_has_gone(
     name: str, tried: str, recovery: tuple[str, ...]
 ) -> None:
-    (injection,) = (item for item in MATRIX if item.name == name)
-    cell = recover(injection, *faults.inject(injection, "sample_1", watched_s=SAMPLED_S))
+    cell = recover(NAMED[name], *faults.inject(NAMED[name], "sample_1", watched_s=SAMPLED_S))
     assert (cell.tried, cell.recovery, cell.recovered) == (tried, recovery, True)
 
 
 def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.MonkeyPatch) -> None:
     """The judge has to be able to say no here, too."""
-    (injection,) = (item for item in MATRIX if item.name == "device too hot")
-    rig, cell = faults.inject(injection, "sample_1", watched_s=JUDGED_S)
+    hot = NAMED["device too hot"]
+    rig, cell = faults.inject(hot, "sample_1", watched_s=JUDGED_S)
     monkeypatch.setattr(rig, "mend", lambda: None)
-    assert not recover(injection, rig, cell).recovered
+    assert not recover(hot, rig, cell).recovered
 
 
 def test_names_are_codes_and_faults_stand_once() -> None:
-    names = [injection.name for injection in MATRIX]
-    assert len(set(names)) == len(names)
-    assert set(ON_A_BUS_TOO) <= set(SAMPLED) <= set(names)
-    assert set(LOSING) <= set(names) - set(SAMPLED)
+    assert len(NAMED) == len(MATRIX)
+    assert set(ON_A_BUS_TOO) <= set(SAMPLED) <= set(NAMED)
+    assert set(LOSING) <= set(NAMED) - set(SAMPLED)
     assert all(bus in (SERIAL, CAN) for injection in MATRIX for bus in injection.buses)

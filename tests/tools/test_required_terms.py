@@ -1,9 +1,9 @@
 """The measurement of required terms: what is stored follows from its own numbers, and a case gives them again."""
 
 from collections.abc import Iterable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -150,11 +150,8 @@ def test_a_scene_without_a_signal_cannot_be_measured(tmp_path: Path) -> None:
         measure(str(bare), lambda cases: {})
 
 
-class Refusing(Executor):
-    """Takes no run at all."""
-
-    def submit(self, function: Any, /, *arguments: Any, **keywords: Any) -> Future[Any]:
-        raise ConnectionError("worker lost")
+REFUSING = Mock(submit=Mock(side_effect=ConnectionError("worker lost")))
+"Takes no run at all."
 
 
 def test_what_is_known_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,7 +161,7 @@ def test_what_is_known_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None
     with ThreadPoolExecutor(1) as pool:
         first = run_all(cases, pool, known)
     assert list(first.values()) == [0.0, 0.01]
-    assert run_all(cases, Refusing(), known) == first
+    assert run_all(cases, REFUSING, known) == first
     changed = {
         "scene": "bronchoscopy",
         "plant": "sample_2",
@@ -178,4 +175,4 @@ def test_what_is_known_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None
     assert list(changed) == list(Case.__struct_fields__)
     for name, value in changed.items():
         with pytest.raises(ConnectionError):
-            run_all([msgspec.structs.replace(cases[0], **{name: value})], Refusing(), known)
+            run_all([msgspec.structs.replace(cases[0], **{name: value})], REFUSING, known)

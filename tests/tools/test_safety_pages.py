@@ -1,6 +1,7 @@
 """The pages that are made of tables and of evidence are what these make of them."""
 
 import json
+from pathlib import Path
 
 import pytest
 import safety_pages
@@ -14,16 +15,13 @@ RECORD = json.loads(safety_pages.EVIDENCE.read_text(encoding="utf-8"))
 CELLS = RECORD["figures"]["cells"]
 
 
-def test_the_page_of_states_is_that_of_the_tables() -> None:
-    assert safety_pages.STATES.read_text(encoding="utf-8") == safety_pages.states_page(), (
-        "python tools/safety_pages.py writes it anew"
-    )
-
-
-def test_the_page_of_the_matrix_is_that_of_the_evidence() -> None:
-    assert safety_pages.MATRIX.read_text(encoding="utf-8") == safety_pages.matrix_page(RECORD), (
-        "python tools/safety_pages.py writes it anew"
-    )
+@pytest.mark.parametrize(
+    ("page", "expected"),
+    [(safety_pages.STATES, safety_pages.states_page()), (safety_pages.MATRIX, safety_pages.matrix_page(RECORD))],
+    ids=["of the tables", "of the evidence"],
+)
+def test_a_page_is_that_of_what_it_is_made_of(page: Path, expected: str) -> None:
+    assert page.read_text(encoding="utf-8") == expected, "python tools/safety_pages.py writes it anew"
 
 
 def test_the_page_of_states_has_every_code_and_every_event() -> None:
