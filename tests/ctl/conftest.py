@@ -93,6 +93,14 @@ SOURCE: dict[str, Any] = {
 "What the daemon says of a publisher that holds the brake, and whose clock is wrong."
 
 
+TIMES_US = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
+RATE: dict[str, Any] = {
+    **{"grade": "warning", "hz": 999.6, "runs": 9, "merged": 1, "overruns": 2, "stalls": 3},
+    **{"lateness_us": TIMES_US | {"worst": 2000.0}, "exec_us": TIMES_US},
+}
+"How a loop keeps its rate."
+
+
 def status(**changes: Any) -> dict[str, Any]:
     """What the daemon answers to `status`."""
     known: dict[str, Any] = msgspec.to_builtins(telemetry(1, 1))
@@ -126,7 +134,7 @@ def status(**changes: Any) -> dict[str, Any]:
                 "newest_source": "a",
                 "sources": {"a": 4},
             },
-            "rates": {},
+            "rates": {"control": RATE, "inference": RATE},
             "late_ticks_by": {},
             "fault_details": [],
             "limit_details": [],

@@ -24,7 +24,6 @@ ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "examples/grafana.json"
 BASE_UNITS = ("seconds", "newtons", "meters", "teslas", "hertz", "ratio")
 PROMTOOL = shutil.which("promtool")
-TIMES = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
 
 
 def read(text: str) -> dict[str, Metric]:
@@ -41,11 +40,8 @@ def full(
     fake_daemon: Any, source_with: Callable[..., dict[str, Any]], status_with: Callable[..., dict[str, Any]]
 ) -> Any:
     """A daemon of which everything is known."""
-    rate = {"grade": "ok", "hz": 1000.0, "runs": 9, "merged": 1, "overruns": 2, "stalls": 3}
-    rate |= {"lateness_us": TIMES | {"worst": 2000.0}, "exec_us": TIMES}
     setpoints = status_with()["setpoints"] | {"by_source": {'"\\\n': source_with()}}
     fake_daemon.says(
-        rates={"control": rate, "inference": rate},
         setpoints=setpoints,
         faults=["SKEW"],
         limits=["RATE"],
