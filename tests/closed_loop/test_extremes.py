@@ -87,8 +87,7 @@ def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:
 
 def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
     """Sample 2 reaches less than the speed limit: over the stroke it falls behind, but never so far as a fault."""
-    at_rest = RecordedHand((0.0,), (0.0,))  # in motion, the force over the scene's would be a fault
-    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), at_rest, seed=1))
+    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), AT_REST, seed=1))
     loop.arm(gap_plan(OPEN_MM))
     samples = on_the_way(loop, 47.0, 2_000) + on_the_way(loop, 93.0, 2_000)
     assert (samples[-1].safety.operating_state, samples[-1].truth.gap_mm) == (

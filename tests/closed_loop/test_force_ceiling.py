@@ -52,7 +52,7 @@ LIES: dict[str, Lie] = {
 
 
 @pytest.mark.parametrize("lie", ["+0.3 N", "-0.3 N", "+1 N", "-1 N", "frozen", "tenfold", "inverted"])
-def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(arm, render, lie: str, armed: ClosedLoop) -> None:
+def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(render, lie: str, armed: ClosedLoop) -> None:
     render(armed, ASKED_N, 2.0)
     LyingSensor(armed.simulated.plant, LIES[lie])
     samples = render(armed, ASKED_N, 1.5)
@@ -127,9 +127,7 @@ def slides(sample: Sample) -> bool:
     return estimate is not None and estimate.handle.rate_mm_s > 20.0 and estimate.handle.displacement_mm >= 2.0
 
 
-def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(
-    arm, render, armed: ClosedLoop
-) -> None:
+def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(render, armed: ClosedLoop) -> None:
     render(armed, ASKED_N, 2.0)
     before = armed.planner.believe.strength.fit
     # as after ten minutes of turning the one way
@@ -140,7 +138,7 @@ def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_of
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 
-def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, render, armed: ClosedLoop) -> None:
+def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(render, armed: ClosedLoop) -> None:
     render(armed, ASKED_N, 2.0)
     LyingSensor(armed.simulated.plant, LIES["-1 N"])
     samples = render(armed, ASKED_N, 3.0)

@@ -19,21 +19,15 @@ LONG_MS = [60, 400]
 
 
 @pytest.fixture
-def holding(arm) -> ClosedLoop:
+def holding(armed: ClosedLoop, render) -> ClosedLoop:
     """A loop that has settled on the force."""
-    loop = arm()
-    assert run(loop, FORCE_N, 1.6)[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
-    return loop
+    assert render(armed, FORCE_N, 1.6)[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
+    return armed
 
 
 def ticks(loop: ClosedLoop, force_N: float, duration_s: float) -> Iterable[Sample]:
     """While a publisher sends this force, a new setpoint every period."""
     return loop.run(duration_s, lambda now_s: TimedSetpoint(force_N, now_s, 0.2))
-
-
-def run(loop: ClosedLoop, force_N: float, duration_s: float) -> list[Sample]:
-    """All of them."""
-    return list(ticks(loop, force_N, duration_s))
 
 
 def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
@@ -96,29 +90,29 @@ def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedL
 
 
 @pytest.mark.parametrize("stall_ms", SHORT_MS)
-def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int) -> None:
+def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int, render) -> None:
     """Half way up a step the device goes on with the duty it has. No more than that comes of it."""
-    run(holding, 1.7, 0.08)
+    render(holding, 1.7, 0.08)
     stall(holding, stall_ms)
-    samples = run(holding, 1.7, 1.2)
+    samples = render(holding, 1.7, 1.2)
     assert samples[-1].safety.faults == ()
     assert max(sample.truth.force_N for sample in samples) < 1.7 + ALLOWED_N
     assert all(sample.truth.force_N == pytest.approx(1.7, abs=ALLOWED_N) for sample in samples[400:])
 
 
-def test_stalls_one_after_the_other(holding: ClosedLoop) -> None:
+def test_stalls_one_after_the_other(holding: ClosedLoop, render) -> None:
     for stall_ms in (45, 6, 30, 47, 10, 20):
         stall(holding, stall_ms)
-        samples = run(holding, FORCE_N, 0.05)
+        samples = render(holding, FORCE_N, 0.05)
         assert (samples[-1].safety.faults, samples[-1].truth.force_N) == ((), pytest.approx(FORCE_N, abs=ALLOWED_N))
 
 
 @pytest.mark.parametrize("stall_ms", LONG_MS)
 def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
-    holding: ClosedLoop, stall_ms: int
+    holding: ClosedLoop, stall_ms: int, render
 ) -> None:
     stall(holding, stall_ms)
-    samples = run(holding, FORCE_N, 2.0)
+    samples = render(holding, FORCE_N, 2.0)
     assert (samples[25].safety.operating_state, samples[-1].safety.faults) == (
         OperatingState.FAULT,
         (Fault.HOST_STALL,),
@@ -131,9 +125,11 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
 
 
 @pytest.mark.parametrize("stop_ms", SHORT_MS)
-def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(holding: ClosedLoop, stop_ms: int) -> None:
+def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(
+    holding: ClosedLoop, stop_ms: int, render
+) -> None:
     holding.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
-    samples = run(holding, FORCE_N, 0.6)
+    samples = render(holding, FORCE_N, 0.6)
     assert samples[-1].safety.faults == ()
     assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 5)
     assert Limit.HOST_STALL not in limits_of(samples)
@@ -141,9 +137,9 @@ def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(hold
 
 
 @pytest.mark.parametrize("stop_ms", LONG_MS)
-def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLoop, stop_ms: int) -> None:
+def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLoop, stop_ms: int, render) -> None:
     holding.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
-    samples = run(holding, FORCE_N, 2.0)
+    samples = render(holding, FORCE_N, 2.0)
     assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
     assert Fault.HOST_STALL not in samples[-1].safety.faults
     assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.safety.faults)
@@ -153,9 +149,11 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
 
 
 @pytest.mark.parametrize("force_N", [0.2, 0.5])
-def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(arm, force_N: float, armed: ClosedLoop) -> None:
+def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(
+    force_N: float, armed: ClosedLoop, render
+) -> None:
     """The switches close 0.2 mm before where they did at homing: the carriages coast on, but not all the way."""
-    run(armed, 1.2, 0.8)
+    render(armed, 1.2, 0.8)
     armed.device.messages._home_m -= 2e-4
     move = armed.stepper.move
     assert isinstance(move, Carriages)
@@ -167,6 +165,6 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(arm, force
     assert Limit.SATURATED not in limits_of(samples[1_500:])
     assert max(*left[1_500:], *right[1_500:]) < 0.1
     # and it comes off again as ever
-    forces_N = [sample.truth.force_N for sample in run(armed, 1.2, 1.5)]
+    forces_N = [sample.truth.force_N for sample in render(armed, 1.2, 1.5)]
     assert max(forces_N) < 1.2 + ALLOWED_N
     assert forces_N[-1] == pytest.approx(1.2, abs=0.06)

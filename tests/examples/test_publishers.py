@@ -105,8 +105,7 @@ def played(publisher, tmp_path, refusals):
 def test_it_waits_for_the_end_of_homing_and_publishes_every_row(publisher, tmp_path):
     asked, heard, code, said = played(publisher, tmp_path, [BUSY])
     assert (asked, code, said) == (["home", "enable", "enable"], 0, "")
-    assert [setpoint.servo_cf for setpoint in heard] == [force for _, force in ROWS]
-    assert [setpoint.seq for setpoint in heard] == [0, 1, 2]
+    assert [(setpoint.seq, setpoint.servo_cf) for setpoint in heard] == list(enumerate(force for _, force in ROWS))
     assert len({(setpoint.source, setpoint.session) for setpoint in heard}) == 1
     assert heard[0].session is not None
     assert [setpoint.stamp_ns - heard[0].stamp_ns for setpoint in heard] == [round(t * 1e9) for t, _ in ROWS]
@@ -114,8 +113,11 @@ def test_it_waits_for_the_end_of_homing_and_publishes_every_row(publisher, tmp_p
 
 def test_it_publishes_nothing_when_it_is_refused(publisher, tmp_path):
     asked, _, code, said = played(publisher, tmp_path, [BUSY, NOT_NEUTRAL])
-    assert (asked, code) == (["home", "enable", "enable"], 1)
-    assert said == "enable: the setpoint is 1.40 N; lower it\n"
+    assert (asked, code, said) == (
+        ["home", "enable", "enable"],
+        1,
+        "enable: the setpoint is 1.40 N; lower it\n",
+    )
 
 
 def test_the_one_in_python_is_the_readmes():

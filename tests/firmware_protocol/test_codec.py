@@ -109,10 +109,6 @@ def test_crc8_is_sae_j1850() -> None:
     assert payload[-1] != crc8(bytes([FUNCTION[Drive]]) + payload[:-1]), "it covers the function"
 
 
-def changed(payload: bytes, mask: int) -> bytes:
-    return (int.from_bytes(payload, "big") ^ mask).to_bytes(len(payload), "big")
-
-
 @pytest.mark.parametrize("message", [DRIVE, STATE], ids=["Drive", "State"])
 def test_one_and_two_flipped_bits_and_bursts_of_eight_are_refused(message: Message) -> None:
     function, payload = FUNCTION[type(message)], encode(message)
@@ -121,7 +117,7 @@ def test_one_and_two_flipped_bits_and_bursts_of_eight_are_refused(message: Messa
     bursts = {pattern << shift for pattern in range(1, 256, 2) for shift in range(bits - 7)}
     for mask in pairs | bursts:
         with pytest.raises(DecodeError, match="CRC"):
-            decode(function, changed(payload, mask))
+            decode(function, (int.from_bytes(payload, "big") ^ mask).to_bytes(len(payload), "big"))
 
 
 @given(layout=st.sampled_from(LAYOUTS), data=st.data())
@@ -473,11 +469,6 @@ def c_encode(library: ctypes.CDLL, function: int, name: str, steps: dict[str, in
     return result, payload.raw[: length.value]
 
 
-def hexed(data: bytes) -> str:
-    """As the exchange program writes bytes."""
-    return data.hex() or "-"
-
-
 # -- payloads ------------------------------------------------------------------------------------------------------
 
 
@@ -529,7 +520,9 @@ def test_under_sanitizers_any_payload_is_framed_as_by_python(exchange) -> None:
         # zeros are what COBS is about
         payload = bytes(generator.choice((0, 0, 1, 255, generator.randrange(256))) for _ in range(length))
         frames.append((generator.randrange(256), generator.randrange(256), payload))
-    answers = exchange([f"frame {function} {sequence} {hexed(payload)}" for function, sequence, payload in frames])
+    answers = exchange(
+        [f"frame {function} {sequence} {payload.hex() or '-'}" for function, sequence, payload in frames]
+    )
     assert answers == [encode_frame(*frame).hex() for frame in frames]
     assert exchange([f"frame 1 1 {'00' * (MAX_PAYLOAD + 1)}"]) == ["-"]
 

@@ -320,8 +320,7 @@ def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBacke
     flags = {"is_extended_id": False, "data": b"" if flag == "is_remote_frame" else data} | {flag: True}
     other = can.Message(arbitration_id=identifier, **flags)
     backend = failing(other, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-    assert backend.receive() + backend.receive() == [STATUS]
-    assert backend.statistics.corrupt == 0
+    assert (backend.receive() + backend.receive(), backend.statistics.corrupt) == ([STATUS], 0)
 
 
 # -- finding one ---------------------------------------------------------------------------------------------------

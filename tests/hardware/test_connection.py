@@ -232,8 +232,7 @@ def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
     bench.pass_ms(3_000)  # it has given up asking often by now
     heal(bench)
     bench.pass_ms(1_200)
-    assert bench.connection.state is LinkState.RUNNING
-    assert (bench.connection.cause, bench.connection.remedy) == ("", "")
+    assert (bench.connection.state, bench.connection.cause, bench.connection.remedy) == (LinkState.RUNNING, "", "")
     assert bench.connection.measurement is not None
 
 
@@ -316,8 +315,7 @@ def test_a_backend_that_shows_no_stream_has_no_frames_in_a_black_box(bench: Benc
 def test_a_closed_connection_stays_closed(bench: Bench) -> None:
     bench.running().connection.close()
     bench.pass_ms(3_000)
-    assert bench.connection.state is LinkState.CLOSED
-    assert len(bench.ports) == 1
+    assert (bench.connection.state, len(bench.ports)) == (LinkState.CLOSED, 1)
     bench.connection.close()
 
 

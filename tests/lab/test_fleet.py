@@ -172,8 +172,7 @@ def test_the_time_enabled_is_what_counts(written):
         1.1,
         30.0,
     )
-    assert (found.clock_drift_ppm, found.current_A) == pytest.approx((20.0, 0.4))
-    assert found.temperature_C is None
+    assert (found.clock_drift_ppm, found.current_A, found.temperature_C) == pytest.approx((20.0, 0.4, None))
 
 
 def test_what_is_not_kept_is_not_missed(written):

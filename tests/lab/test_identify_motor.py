@@ -116,11 +116,6 @@ def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
     return dict(zip(COLUMNS, np.array(rows).T, strict=True))
 
 
-def to_log(columns: Columns) -> Log:
-    """What `read_log` makes of the file."""
-    return Log(columns["t_s"], columns["input_V"], columns["position_mm"] * 1e-3, None, columns["current_A"])
-
-
 def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, float]:
     """What the plant file says, in the identified quantities; friction and offset as means over the gaps of the log.
 
@@ -163,7 +158,8 @@ def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, fl
 @pytest.fixture(scope="module")
 def sample_log():
     """Half of what `tormagctl calibrate --motors` records, on simulated sample 3, in virtual time."""
-    return to_log(motor_log(record("sample_3", rounds=1), "left"))
+    columns = motor_log(record("sample_3", rounds=1), "left")
+    return Log(columns["t_s"], columns["input_V"], columns["position_mm"] * 1e-3, None, columns["current_A"])
 
 
 def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log):

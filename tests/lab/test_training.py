@@ -112,8 +112,7 @@ def test_a_split_keeps_cycles_whole() -> None:
     data = dataset()
     training, validation = data.split(0.25, seed=3)
     assert set(training.cycle) & set(validation.cycle) == set()
-    assert len(set(validation.cycle)) == 2
-    assert len(training) + len(validation) == len(data)
+    assert (len(set(validation.cycle)), len(training) + len(validation)) == (2, len(data))
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan"), 0.01])

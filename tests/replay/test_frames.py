@@ -73,11 +73,8 @@ def damaged(raw: Any) -> Any:
 
 def number_of(entries: list[Any], place: int) -> int:
     """Of the newest frame in that entry, as the file counts."""
-    return sum(len(entry[2]) if isinstance(entry[2], list) else 1 for entry in entries[: place + 1] if _passed(entry))
-
-
-def _passed(entry: Any) -> bool:
-    return isinstance(entry, list) and entry[0] in ("read", "wrote")
+    passed = [entry for entry in entries[: place + 1] if isinstance(entry, list) and entry[0] in ("read", "wrote")]
+    return sum(len(entry[2]) if isinstance(entry[2], list) else 1 for entry in passed)
 
 
 def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -> None:

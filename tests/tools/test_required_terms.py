@@ -70,10 +70,6 @@ def test_a_publisher_sends_as_often_as_its_scene_says(scene: str, sent_hz: float
     assert forces_N == pytest.approx(np.interp(stamps_s - played.begins_s, played.time_s, played.force_N))
 
 
-def table(added_N: dict[str, float]) -> tuple[Without, ...]:
-    return tuple(Without(term, added_N.get(term, 0.0), 0.0, NO_COST) for term in TERMS)
-
-
 def test_a_term_is_required_that_costs_more_than_its_share_learning_or_not() -> None:
     terms = (
         Without("rate", 0.011, 0.0, NO_COST),
@@ -116,9 +112,10 @@ def test_what_is_only_missed_together_is_put_back() -> None:
 
 def test_what_was_put_back_is_tried_again() -> None:
     """`scale` counts for more, and is not enough; beside `offset` it is not needed."""
-    assert spared(table({"scale": 0.004, "offset": 0.003}), 0.05, lambda out: "offset" not in out) == tuple(
-        term for term in TERMS if term != "offset"
-    )
+    added_N = {"scale": 0.004, "offset": 0.003}
+    terms = tuple(Without(term, added_N.get(term, 0.0), 0.0, NO_COST) for term in TERMS)
+    expected = tuple(term for term in TERMS if term != "offset")
+    assert spared(terms, 0.05, lambda out: "offset" not in out) == expected
 
 
 @pytest.mark.usefixtures("costless")
