@@ -321,7 +321,7 @@ def test_one_that_leaves_in_the_handshake_is_not_taken_for_one_that_was_asked_ab
     rig.until(lambda: rig.endpoint.report().refused >= 2, "counted")
     rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 1, "closed")
     assert rig.endpoint.report().refused == 2
-    assert not any(has_left for _, has_left in rig.endpoint.admission.moves)
+    assert not rig.endpoint.admission.left
 
 
 # -- how many ------------------------------------------------------------------------------------------------------
@@ -344,9 +344,9 @@ def test_an_address_has_so_many_connections_and_no_more(rig: Rig, monkeypatch: p
 
 @over_tcp
 def test_refused_peers_beyond_those_that_are_told_apart_are_counted_together(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
+    rig: Rig,
 ) -> None:
-    monkeypatch.setattr(admission, "PEERS", 4)
+    rig.endpoint.admission.refusals.most = 4
     for _ in range(10):
         rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
     rig.until(lambda: rig.endpoint.report().refused == 10, "refused")

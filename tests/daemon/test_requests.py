@@ -5,10 +5,11 @@ import pytest
 
 from tormagd.daemon.allowance import PEERS, Allowance
 from tormagd.daemon.requests import FIRST, WAITING, WAITING_PER_CLIENT, Requests, Waiting, may_go_first
+from tormagd.daemon.tally import Peer
 
 
 def waiting(client: str, number: int = 0, opens: int = 0) -> Waiting:
-    return Waiting([client.encode()], str(number).encode(), "", "", opens)
+    return Waiting([client.encode()], str(number).encode(), Peer(""), opens)
 
 
 def taken(requests: Requests) -> list[str]:
@@ -52,18 +53,16 @@ def test_no_packing_of_a_first_command_is_overlooked(command: str) -> None:
 
 def test_a_peer_may_send_a_burst_and_then_its_rate() -> None:
     allowance = Allowance(100.0, 10.0)
-    assert [allowance.grants("a", 0.0) for _ in range(15)].count(True) == 10
-    assert allowance.dropped == {"a": 5}
-    assert [allowance.grants("a", 0.05) for _ in range(9)].count(True) == 5
-    assert [allowance.grants("b", 0.05) for _ in range(10)].count(True) == 10
-    assert [allowance.grants("a", 9.0) for _ in range(15)].count(True) == 10
-    assert set(allowance.dropped) == {"a"}
+    assert [allowance.grants(Peer("a"), 0.0) for _ in range(15)].count(True) == 10
+    assert [allowance.grants(Peer("a"), 0.05) for _ in range(9)].count(True) == 5
+    assert [allowance.grants(Peer("b"), 0.05) for _ in range(10)].count(True) == 10
+    assert [allowance.grants(Peer("a"), 9.0) for _ in range(15)].count(True) == 10
 
 
 def test_more_peers_than_are_kept_apart_cost_the_one_that_was_silent_longest() -> None:
     allowance = Allowance(1.0, 1.0)
-    assert all(allowance.grants(f"p{number}", float(number) * 1e-3) for number in range(PEERS))
-    assert not allowance.grants("p0", 0.5)
-    assert allowance.grants("new", 0.6)
-    assert not allowance.grants("p0", 0.6)
-    assert allowance.grants("p1", 0.6)
+    assert all(allowance.grants(Peer(f"p{number}"), float(number) * 1e-3) for number in range(PEERS))
+    assert not allowance.grants(Peer("p0"), 0.5)
+    assert allowance.grants(Peer("new"), 0.6)
+    assert not allowance.grants(Peer("p0"), 0.6)
+    assert allowance.grants(Peer("p1"), 0.6)

@@ -10,6 +10,7 @@ import logging
 import os
 import socket
 import struct
+import time
 from collections import Counter, deque
 
 import zmq
@@ -17,17 +18,18 @@ import zmq.utils.monitor
 from zmq.utils import z85
 
 from tormagd.daemon.arrivals import Arrivals
+from tormagd.daemon.tally import Peer, Tally
 from tormagd.keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
-from tormagd_client.messages import PeerReport
 
 CONNECTIONS = 200
 CONNECTIONS_PER_PEER = 160
 "Of one endpoint, and of one address or process among them. More are cut off as soon as they are accepted."
 PEERS = 32
-"Refused peers that are told apart; the one that was refused longest ago joins the others."
-OTHERS = "others"
+"Refused peers that are told apart."
+RECONNECT_S = 0.5
+"A peer that was cut off comes back within this time (libzmq's default is 0.1 s)."
 GUARDED = {
     zmq.ZAP_ENFORCE_DOMAIN: 1,
     zmq.HANDSHAKE_IVL: 2_000,
@@ -38,8 +40,6 @@ GUARDED = {
     zmq.TCP_KEEPALIVE_CNT: 4,
 }
 "Options of a guarded socket; times are in ms and s."
-NEWS_S = 10.0
-"At most one log line in this time."
 AT_ONCE = 4
 "Events taken in one slice at most."
 WATCHED = (
@@ -78,17 +78,17 @@ log = logging.getLogger(__name__)
 class _Connections:
     """The connections of one endpoint, as its monitor tells of them."""
 
-    def __init__(self, name: str, is_guarded: bool) -> None:
-        self.name, self.is_guarded = name, is_guarded
+    def __init__(self, name: str, endpoint: "zmq.Socket[bytes]", is_guarded: bool) -> None:
+        self.name, self.endpoint, self.is_guarded = name, endpoint, is_guarded
+        self.monitor = endpoint.get_monitor_socket(WATCHED)
         self.addresses: dict[int, str] = {}
-        self.of_address: Counter[str] = Counter()
         self.admitted: Counter[str] = Counter()
         self.turned_away: deque[str] = deque(maxlen=CONNECTIONS)
         "Addresses whose keys were refused, and whose connections are not closed yet."
         self.untold = 0
         "So many of these libzmq has not turned away yet: whoever leaves in the handshake may be one of them."
-        self.taken_for_one: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)
-        "Addresses of those that did, and of those that they were taken for."
+        self.taken_for_one: deque[str] = deque(maxlen=CONNECTIONS)
+        "Addresses of those that did, and that were taken for one of them."
         self.failed: str | None = None
         "Why the handshake failed of the connection that is closed next: libzmq closes it at once."
         self.cut: set[int] = set()
@@ -103,24 +103,20 @@ class _Connections:
         if self.untold:
             self.untold -= 1
             return None
-        other, address = self.taken_for_one.pop() if self.taken_for_one else ("", "")
+        address = self.taken_for_one.pop() if self.taken_for_one else ""
         self.turned_away.append(address)
-        return other
+        return address
 
     def left_untold(self, address: str) -> bool:
         """Whether a connection that was closed in the handshake is one whose key was refused."""
-        taken = self._turned_away(address) if self.untold else None
-        if taken is None:
+        if not self.untold or (taken := self.left(address)) is None:
             return False
         self.untold -= 1
-        self.taken_for_one.append((address, taken))
+        self.taken_for_one.append(taken)
         return True
 
-    def was_turned_away(self, address: str) -> bool:
-        """Whether a connection that is closed after its handshake is one whose key was refused."""
-        return self._turned_away(address) is not None
-
-    def _turned_away(self, address: str) -> str | None:
+    def left(self, address: str) -> str | None:
+        """The address of the one whose key was refused, if this connection was its."""
         if not address and self.turned_away:  # it had gone before it was seen
             return self.turned_away.popleft()
         if address not in self.turned_away:
@@ -135,15 +131,12 @@ class Admission:
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
         self._keys, self._arrivals = keys, arrivals
         self.allowed: Allowed = keys.allowed if keys else {}
-        self._refusals: dict[tuple[str, str, str, str], int] = {}
-        self.refused = 0
-        self.moves: deque[tuple[str, bool]] = deque(maxlen=64)
-        "Publishers that came (False) or, after a handshake that went well, left (True), by their address."
-        self._told = 0
-        self._newest = ""
-        self._tell_s = 0.0
-        self._endpoints: dict[zmq.Socket[bytes], _Connections] = {}
-        self._watched: list[zmq.Socket[bytes]] = []
+        self.refusals = Tally(PEERS, "refused %d peers, the newest at %s", self.name)
+        self.left: deque[tuple[str, float]] = deque(maxlen=64)
+        "Publishers that left after a handshake that went well, by their address, and when."
+        self.oversize = 0
+        "How often one of them came back at once: it had been cut off."
+        self._endpoints: dict[str, _Connections] = {}
         # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
         self._zap = context.socket(zmq.ROUTER)
         self._zap.linger = 0
@@ -160,27 +153,25 @@ class Admission:
             endpoint.setsockopt(zmq.ZAP_DOMAIN, name.encode())
             for option, value in GUARDED.items():
                 endpoint.setsockopt(option, value)
-        monitor = endpoint.get_monitor_socket(WATCHED)
-        self._arrivals.watch(monitor)
-        self._endpoints[monitor] = _Connections(name, is_guarded)
-        self._watched.append(endpoint)
+        known = self._endpoints[name] = _Connections(name, endpoint, is_guarded)
+        self._arrivals.watch(known.monitor)
 
     def update(self) -> bool:
         """Takes a few of the events that wait, of one socket; False where there were none."""
         if self._arrivals.has(self._zap):
             self._admit()
             return True
-        for monitor, known in self._endpoints.items():
-            if self._arrivals.has(monitor):
-                self._watch(monitor, known)
+        for known in self._endpoints.values():
+            if self._arrivals.has(known.monitor):
+                self._watch(known)
                 return True
         return False
 
     def close(self) -> None:
         """Watches no more; the sockets are the context's to close."""
-        for endpoint in self._watched:
+        for known in self._endpoints.values():
             # or ZeroMQ's thread would wait for ever for a monitor that has gone
-            endpoint.disable_monitor()
+            known.endpoint.disable_monitor()
 
     def roles(self, public: str) -> frozenset[str]:
         """What a key may do now."""
@@ -198,22 +189,11 @@ class Admission:
 
     def connections(self) -> dict[str, int]:
         """How many connections each endpoint has."""
-        return {each.name: len(each.addresses) for each in self._endpoints.values()}
+        return {name: len(known.addresses) for name, known in self._endpoints.items()}
 
     def is_connected(self, name: str) -> bool:
         """Whether this endpoint has any."""
-        return bool(self._of(name).addresses)
-
-    def refusals(self) -> tuple[PeerReport, ...]:
-        """Who was refused, the newest last."""
-        return tuple(PeerReport(*peer, count) for peer, count in self._refusals.items())
-
-    def tell(self, now_s: float) -> None:
-        """Says in the log whether peers were refused: some times a second."""
-        new = self.refused - self._told
-        if new and now_s >= self._tell_s:
-            log.warning("refused %d peers, the newest at %s", new, self._newest)
-            self._told, self._tell_s = self.refused, now_s + NEWS_S
+        return bool(self._endpoints[name].addresses)
 
     def let_in(self, allowed: Allowed) -> None:
         """From now on these keys are let in."""
@@ -229,7 +209,7 @@ class Admission:
 
     def cut_off(self, name: str, address: str) -> None:
         """Ends the connections that an address has to an endpoint; whoever may connect comes back."""
-        self._cut(self._of(name), address)
+        self._cut(self._endpoints[name], address)
 
     def _admit(self) -> None:
         for _ in range(AT_ONCE):
@@ -247,26 +227,22 @@ class Admission:
             self._arrivals.touch(self._zap)
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
-        known = self._of(name)
+        known = self._endpoints[name]
         if self.has_role(public, MAY[name]):
-            self._moved(name, address, has_left=False)
+            self._came(name, address)
             known.admitted[address] += 1
             return True
         known.turn_away(address)
         listed = self.allowed.get(public)
         reason = UNLISTED if listed is None else f"{WRONG_ROLE}: {', '.join(sorted(listed.roles))}"
-        self._refuse(name, address, self.name(public) if public else "", reason)
+        self.refusals.add(name, Peer(address, public), reason)
         return False
 
-    def _of(self, name: str) -> _Connections:
-        (known,) = (each for each in self._endpoints.values() if each.name == name)
-        return known
-
-    def _watch(self, monitor: "zmq.Socket[bytes]", known: _Connections) -> None:
+    def _watch(self, known: _Connections) -> None:
         for _ in range(AT_ONCE):
-            if not self._arrivals.has(monitor):
+            if not self._arrivals.has(known.monitor):
                 return
-            event = zmq.utils.monitor.recv_monitor_message(monitor, zmq.NOBLOCK)
+            event = zmq.utils.monitor.recv_monitor_message(known.monitor, zmq.NOBLOCK)
             kind, value = event["event"], event["value"]
             if kind == zmq.EVENT_ACCEPTED:
                 self._accepted(known, value)
@@ -276,90 +252,60 @@ class Admission:
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                 other = known.told()
                 if other is not None:
-                    self._refuse(known.name, other, "", PLAIN)
+                    self.refusals.add(known.name, Peer(other), PLAIN)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 known.failed = REASONS.get(value, BROKEN_HANDSHAKE) if known.is_guarded else UNASKED_KEY
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
                 known.failed = PLAIN if known.is_guarded else LEFT
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
-        connection = _connection(descriptor)
-        if connection is None:  # it has gone already, and its address with it
-            known.addresses[descriptor] = ""
+        address = known.addresses[descriptor] = _address(descriptor)
+        if not address:
             return
-        with connection:
-            address = _address(connection)
-            known.addresses[descriptor] = address
-            if not address:
-                return
-            known.of_address[address] += 1
-            if known.of_address[address] > CONNECTIONS_PER_PEER or len(known.addresses) > CONNECTIONS:
-                known.cut.add(descriptor)
-                with contextlib.suppress(OSError):
-                    connection.shutdown(socket.SHUT_RDWR)
-            elif not known.is_guarded:
-                self._moved(known.name, address, has_left=False)
+        of_address = sum(each == address for each in known.addresses.values())
+        if of_address > CONNECTIONS_PER_PEER or len(known.addresses) > CONNECTIONS:
+            known.cut.add(descriptor)
+            _end(descriptor, address)
+        elif not known.is_guarded:
+            self._came(known.name, address)
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
-        if address:
-            _count_down(known.of_address, address)
-        was_asked = known.was_turned_away(address) if failed is None else failed == PLAIN and known.left_untold(address)
+        was_asked = (
+            known.left(address) is not None if failed is None else failed == PLAIN and known.left_untold(address)
+        )
         if descriptor in known.cut:
             known.cut.discard(descriptor)
             failed = TOO_MANY
         if was_asked:
-            pass  # counted then
-        elif failed is not None:
-            self._refuse(known.name, address, "", failed)
-        elif not known.is_guarded:
-            self._moved(known.name, address, has_left=True)
-        elif known.admitted[address]:
-            _count_down(known.admitted, address)
-            self._moved(known.name, address, has_left=True)
+            return  # counted then
+        if failed is None and (not known.is_guarded or known.admitted[address]):
+            known.admitted -= Counter((address,))
+            if known.name == "setpoint" and address:
+                self.left.append((address, time.monotonic()))
         else:
             # a peer of an old version is closed without an event of its own
-            self._refuse(known.name, address, "", PLAIN)
+            self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
-    def _moved(self, name: str, address: str, has_left: bool) -> None:
-        if name == "setpoint" and address:
-            self.moves.append((address, has_left))
-
-    def _refuse(self, name: str, address: str, key: str, reason: str) -> None:
-        self.refused += 1
-        peer = (name, shown(address), key, reason)
-        self._newest = f"{name}: {peer[1]}{f', key {key}' if key else ''}: {reason}"
-        self._refusals[peer] = self._refusals.pop(peer, 0) + 1
-        if len(self._refusals) > PEERS:
-            first = next(each for each in self._refusals if each[1] != OTHERS)
-            others = (first[0], OTHERS, "", first[3].split(":")[0])
-            self._refusals[others] = self._refusals.pop(others, 0) + self._refusals.pop(first)
+    def _came(self, name: str, address: str) -> None:
+        # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
+        # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
+        # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
+        if name != "setpoint":
+            return
+        since_s = time.monotonic() - RECONNECT_S
+        for left in self.left:
+            if left[0] == address and left[1] > since_s:
+                self.left.remove(left)
+                self.oversize += 1
+                return
 
     def _cut(self, known: _Connections, whose: str = "") -> None:
         """Ends the connections of an address, or all."""
         for descriptor, address in known.addresses.items():
-            connection = _connection(descriptor) if address == whose or not whose else None
-            if connection is not None:
-                with connection:
-                    if _address(connection) == address:  # or its number has gone to another one since
-                        with contextlib.suppress(OSError):
-                            connection.shutdown(socket.SHUT_RDWR)
-
-
-def shown(address: str) -> str:
-    """A peer's address for people: the host, or the process."""
-    if not address:
-        return "gone before it was seen"
-    parts = address.split(":")
-    return f"process {parts[3]} of user {parts[1]}" if len(parts) == 4 else address
-
-
-def _count_down(counts: Counter[str], name: str) -> None:
-    """One less; what is not there any more is not kept."""
-    counts[name] -= 1
-    if not counts[name]:
-        del counts[name]
+            if address == whose or not whose:
+                _end(descriptor, address)
 
 
 def _counts(allowed: Allowed) -> str:
@@ -367,20 +313,21 @@ def _counts(allowed: Allowed) -> str:
     return ", ".join(f"{role} {roles[role]}" for role in ROLES)
 
 
-def _connection(descriptor: int) -> socket.socket | None:
-    try:
-        return socket.socket(fileno=os.dup(descriptor))
-    except OSError:
-        return None
-
-
-def _address(connection: socket.socket) -> str:
+def _address(descriptor: int) -> str:
     """The peer as libzmq names it: its host, or `localhost:USER:GROUP:PROCESS`; empty where it has gone."""
     try:
-        if connection.family == socket.AF_UNIX:
-            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-            process, user, group = _CREDENTIALS.unpack(made)
-            return f"localhost:{user}:{group}:{process}"
-        return str(connection.getpeername()[0])
+        with socket.socket(fileno=os.dup(descriptor)) as connection:
+            if connection.family == socket.AF_UNIX:
+                made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+                process, user, group = _CREDENTIALS.unpack(made)
+                return f"localhost:{user}:{group}:{process}"
+            return str(connection.getpeername()[0])
     except OSError:
         return ""
+
+
+def _end(descriptor: int, address: str) -> None:
+    """Ends the connection of this address, unless its number has gone to another one since."""
+    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
+        if _address(connection.fileno()) == address:
+            connection.shutdown(socket.SHUT_RDWR)

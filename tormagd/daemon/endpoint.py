@@ -5,21 +5,20 @@ and control goes on. Who may connect at all is `admission`'s to say; how much ea
 """
 
 import contextlib
-import logging
 import os
 import time
-from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import zmq
 
-from tormagd.daemon.admission import MAY, OTHERS, Admission, shown
+from tormagd.daemon.admission import MAY, Admission
 from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.arrivals import Arrivals, is_readable
-from tormagd.daemon.inbox import SOURCES, SetpointInbox
+from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
+from tormagd.daemon.tally import Peer, Tally
 from tormagd.keys import KeyRing
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
@@ -28,7 +27,6 @@ from tormagd_client.messages import (
     VERSION,
     ErrorReply,
     MessageError,
-    PeerReport,
     PeersReport,
     Reply,
     Request,
@@ -54,12 +52,8 @@ ANSWERS_NS = 300_000
 "For how long requests are answered in one beat."
 FIRST_AT_ONCE = 4
 "Requests that may be a `stop`, looked at in one go at most."
-RECONNECT_S = 0.5
-"A peer that was cut off comes back within this time (libzmq's default is 0.1 s)."
-NEWS_S = 10.0
-"At most one log line about what was not read in this time."
 PEERS = 16
-"Peers whose messages were not read, as many as are named."
+"Peers whose messages were not read, as many as are told apart."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
@@ -68,8 +62,6 @@ PUBLISHER = frozenset({"publish"})
 
 Answer = Callable[[Request], Any]
 "Returns the result, as plain data or packed already, or raises RefusedError."
-
-log = logging.getLogger(__name__)
 
 
 class Endpoint:
@@ -110,10 +102,7 @@ class Endpoint:
         self._subscriptions = {
             name: Allowance(SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST) for name in ("telemetry", "recording")
         }
-        self._drops: Counter[tuple[str, str, str]] = Counter()
-        self._dropped = self._told = 0
-        self._tell_s = 0.0
-        self._cut_off: deque[tuple[str, float]] = deque(maxlen=SOURCES)
+        self._drops = Tally(PEERS, "%d messages were not read, the newest at %s", self.admission.name)
 
     @property
     def waiting(self) -> int:
@@ -136,11 +125,12 @@ class Endpoint:
                 continue  # of a message that was refused by its first part
             # both clocks at once, for each message: how they part says which clock was set, and a drain may be held up
             now_s, realtime_ns = time.monotonic(), time.time_ns()
-            public, peer = self._sender(frame, "setpoint")
+            peer = self._sender(frame, "setpoint")
             if not self._allowance.grants(peer, now_s):
+                self._drops.add("setpoint", peer, TOO_MUCH)
                 continue
-            if public and not self.admission.has_role(public, PUBLISHER):
-                self._drop("setpoint", peer, OFF_THE_LIST, 1)
+            if peer.key and not self.admission.has_role(peer.key, PUBLISHER):
+                self._drops.add("setpoint", peer, OFF_THE_LIST)
                 continue
             data = b"" if frame.more else frame.bytes
             is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
@@ -169,7 +159,7 @@ class Endpoint:
             may_be_first = may_go_first(waiting.data)
             looked_at += may_be_first
             if not (may_be_first and self._is_answered_first(waiting, answer)) and not self._requests.put(waiting):
-                self._drop("control", waiting.peer, TOO_MUCH, 1)
+                self._drops.add("control", waiting.peer, TOO_MUCH)
             if looked_at == FIRST_AT_ONCE or time.monotonic_ns() >= until_ns:
                 return
 
@@ -184,21 +174,18 @@ class Endpoint:
 
     def tell(self, now_s: float) -> None:
         """Counts and tells what was not read: some times a second."""
-        self._count_oversize(now_s)
-        self._tell_drops(now_s)
-        self.admission.tell(now_s)
+        self.inbox.oversize = self.admission.oversize
+        self._drops.tell(now_s)
+        self.admission.refusals.tell(now_s)
 
     def report(self) -> PeersReport:
         """Who connects, who was refused, who sent too much."""
         return PeersReport(
             connections=self.admission.connections(),
-            refused=self.admission.refused,
-            dropped=self._dropped,
-            refusals=self.admission.refusals(),
-            drops=tuple(
-                PeerReport(name, *self._known(peer), reason, count)
-                for (name, peer, reason), count in self._drops.most_common()
-            ),
+            refused=self.admission.refusals.total,
+            dropped=self._drops.total,
+            refusals=self.admission.refusals.report(),
+            drops=tuple(sorted(self._drops.report(), key=lambda each: -each.count)),
         )
 
     def close(self) -> None:
@@ -244,25 +231,17 @@ class Endpoint:
                 return
             frame = publisher.recv(zmq.NOBLOCK, copy=False)
             try:
-                _, peer = self._sender(frame, name)
+                peer = self._sender(frame, name)
             except zmq.ZMQError:
                 continue  # what libzmq says for one that has gone
             if not allowance.grants(peer, now_s):
-                self.admission.cut_off(name, peer.partition(" ")[0])
+                self._drops.add(name, peer, TOO_MUCH)
+                self.admission.cut_off(name, peer.address)
 
-    def _sender(self, frame: zmq.Frame, name: str) -> tuple[str, str]:
-        """The key that a message was sent with, empty at an open endpoint; and what its sender is counted by."""
-        # its host, or for a local socket its process
-        address = str(frame.get("Peer-Address"))
-        if name not in self._guarded:
-            return "", address
-        public = str(frame.get("User-Id"))
-        return public, f"{address} {public}"
-
-    def _known(self, peer: str) -> tuple[str, str]:
-        """Address and key of a sender, as people know them."""
-        address, _, public = peer.partition(" ")
-        return address if address == OTHERS else shown(address), self.admission.name(public) if public else ""
+    def _sender(self, frame: zmq.Frame, name: str) -> Peer:
+        """Who sent a message."""
+        key = str(frame.get("User-Id")) if name in self._guarded else ""
+        return Peer(str(frame.get("Peer-Address")), key)
 
     def _next_request(self) -> Waiting | None:
         """The next message, which there has to be; None for a further part of one that had too many.
@@ -278,8 +257,8 @@ class Endpoint:
             envelope.append(b"")
             part = self._control.recv(zmq.NOBLOCK, copy=False)
         self._is_in_parts_of_request = part.more
-        public, peer = self._sender(part, "control")
-        return Waiting(envelope, b"" if part.more else part.bytes, public, peer, self._requests.opens)
+        data = b"" if part.more else part.bytes
+        return Waiting(envelope, data, self._sender(part, "control"), self._requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
         try:
@@ -310,12 +289,12 @@ class Endpoint:
             return Reply(v=VERSION, id=request.id, ok=False, error=ErrorReply(error.code, error.message, error.hint))
 
     def _require_permitted(self, request: Request, waiting: Waiting) -> None:
-        is_observed = request.command in OBSERVED
-        if waiting.public and not self.admission.has_role(waiting.public, MAY["control"] if is_observed else OPERATOR):
-            self._drop("control", waiting.peer, NOT_ALLOWED, 1)
+        is_observed, key = request.command in OBSERVED, waiting.peer.key
+        if key and not self.admission.has_role(key, MAY["control"] if is_observed else OPERATOR):
+            self._drops.add("control", waiting.peer, NOT_ALLOWED)
             raise RefusedError(
                 "forbidden",
-                f"{request.command!r} is not for the key {self.admission.name(waiting.public)}",
+                f"{request.command!r} is not for the key {self.admission.name(key)}",
                 "its .key belongs in the daemon's folder of operators (operate), which SIGHUP reads again",
             )
         # the gap has been told to open since this came: whatever it asks, it was meant for before that
@@ -331,40 +310,6 @@ class Endpoint:
         # a client that has gone meanwhile is not our business
         with contextlib.suppress(zmq.ZMQError):
             self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
-
-    def _drop(self, name: str, peer: str, reason: str, count: int) -> None:
-        self._dropped += count
-        if (name, peer, reason) not in self._drops and len(self._drops) >= PEERS:
-            peer = OTHERS
-        self._drops[name, peer, reason] += count
-
-    def _tell_drops(self, now_s: float) -> None:
-        for name, allowance in ({"setpoint": self._allowance} | self._subscriptions).items():
-            while allowance.dropped:
-                peer, count = allowance.dropped.popitem()
-                self._drop(name, peer, TOO_MUCH, count)
-        if self._dropped > self._told and now_s >= self._tell_s:
-            (name, peer, reason), count = self._drops.most_common(1)[0]
-            who = " ".join(self._known(peer)).strip()
-            news = self._dropped - self._told
-            log.warning("%d messages were not read; most of all from %s at %s: %d, %s", news, who, name, count, reason)
-            self._told, self._tell_s = self._dropped, now_s + NEWS_S
-
-    def _count_oversize(self, now_s: float) -> None:
-        # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
-        # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
-        # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
-        moves = self.admission.moves
-        while moves:
-            peer, has_left = moves.popleft()
-            if has_left:
-                self._cut_off.append((peer, now_s))
-                continue
-            for cut_off in self._cut_off:
-                if cut_off[0] == peer and now_s - cut_off[1] < RECONNECT_S:
-                    self._cut_off.remove(cut_off)
-                    self.inbox.oversize += 1
-                    break
 
 
 def context(io_priority: int) -> "zmq.Context[zmq.Socket[bytes]]":

@@ -3,6 +3,8 @@
 from collections import deque
 from typing import NamedTuple
 
+from tormagd.daemon.tally import Peer
+
 FIRST = ("stop", "disable")
 "These are carried out before anything that waits."
 _SIGNS = tuple(name.encode() for name in FIRST)
@@ -12,15 +14,11 @@ WAITING = 1_024
 
 
 class Waiting(NamedTuple):
-    """A request as it came, with the key that it was sent with (empty at an open endpoint) and who is counted for it.
-
-    `opens` is how often the gap had been told to open by then.
-    """
+    """A request as it came, and who sent it. `opens` is how often the gap had been told to open by then."""
 
     envelope: list[bytes]
     data: bytes
-    public: str
-    peer: str
+    peer: Peer
     opens: int
 
 

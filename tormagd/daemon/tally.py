@@ -1,0 +1,65 @@
+"""Peers that were refused, or whose messages were not read: how often, and who."""
+
+import logging
+from collections.abc import Callable
+from typing import NamedTuple
+
+from tormagd_client.messages import PeerReport
+
+OTHERS = "others"
+NEWS_S = 10.0
+"At most one log line in this time."
+
+log = logging.getLogger(__name__)
+
+
+class Peer(NamedTuple):
+    """Who is counted: a host, or the process at a local socket, as libzmq names it; and the key it showed, if any."""
+
+    address: str
+    key: str = ""
+
+
+class Tally:
+    """Counts by endpoint, peer and reason. At most `most` are told apart; whoever was counted longest ago joins the
+    others. `line` is for the log, with how many and the newest; `name` is a key's for people."""
+
+    def __init__(self, most: int, line: str, name: Callable[[str], str]) -> None:
+        self.most, self._line, self._name = most, line, name
+        self.total = self._told = 0
+        self._tell_s = 0.0
+        self._counts: dict[tuple[str, Peer, str], int] = {}
+
+    def add(self, endpoint: str, peer: Peer, reason: str) -> None:
+        """Counts one more."""
+        self.total += 1
+        self._add((endpoint, peer, reason), 1)
+        if len(self._counts) > self.most:
+            first = next(each for each in self._counts if each[1].address != OTHERS)
+            self._add((first[0], Peer(OTHERS), first[2].split(":")[0]), self._counts.pop(first))
+
+    def report(self) -> tuple[PeerReport, ...]:
+        """Who they are, the newest last."""
+        return tuple(
+            PeerReport(endpoint, shown(peer.address), peer.key and self._name(peer.key), reason, count)
+            for (endpoint, peer, reason), count in self._counts.items()
+        )
+
+    def tell(self, now_s: float) -> None:
+        """Says in the log how many there were: some times a second."""
+        if self.total > self._told and now_s >= self._tell_s:
+            it = self.report()[-1]
+            newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
+            log.warning(self._line, self.total - self._told, newest)
+            self._told, self._tell_s = self.total, now_s + NEWS_S
+
+    def _add(self, entry: tuple[str, Peer, str], count: int) -> None:
+        self._counts[entry] = self._counts.pop(entry, 0) + count
+
+
+def shown(address: str) -> str:
+    """A peer's address for people: the host, or the process."""
+    if address.startswith("localhost:"):
+        _, user, _, process = address.split(":")
+        return f"process {process} of user {user}"
+    return address or "gone before it was seen"
