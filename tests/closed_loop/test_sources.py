@@ -106,7 +106,7 @@ def run(
         way.ticked(loop.stepper.time_s, used)
     for _ in range(8):
         inbox.refresh(loop.now_s)
-    way.refresh()
+    way.to_duty.refresh()
     return Run(samples, inbox, way, start_s)
 
 

@@ -117,7 +117,9 @@ def test_what_is_listed_goes_before_what_comes_later_or_is_not(holder: str, othe
     assert not is_passed(Hold(holder), other, (), is_stale=False)
 
 
-def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is_stale(publishing: Publishing) -> None:
+def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is_stale(
+    publishing: Publishing, caplog: pytest.LogCaptureFixture
+) -> None:
     assert publishing.send(1, 1.0, "a")
     assert not publishing.send(1, 2.0, "b", at_s=0.04)
     assert (publishing.counters(), publishing.force_N) == ((1, 1, 0), 1.0)
@@ -132,7 +134,8 @@ def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is
     assert publishing.send(2, 2.0, "b", at_s=0.0901)
     newest = publishing.newest
     assert (newest.force_N, newest.holder, newest.is_contested) == (2.0, 1, False)
-    assert "'b' holds the brake instead of 'a': that is stale" in str(publishing.inbox.news(publishing.now_s))
+    publishing.inbox.tell(publishing.now_s)
+    assert "'b' holds the brake instead of 'a': that is stale" in caplog.text
     # and now the first is the other one
     assert not publishing.send(3, 1.0, "a")
 
@@ -206,7 +209,9 @@ def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publ
 
 
 @pytest.mark.parametrize("by_s", [-0.5, 0.5])
-def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publishing, by_s: float) -> None:
+def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(
+    publishing: Publishing, by_s: float, caplog: pytest.LogCaptureFixture
+) -> None:
     for tick in range(100):
         publishing.send(tick, 1.0, "a", 0.0 if tick < 50 else -by_s, at_s=tick * 0.002)
         assert publishing.age_s == pytest.approx(0.0, abs=1e-3)
@@ -214,7 +219,8 @@ def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publ
     found = publishing.of("a")
     assert found.clock_steps == 1
     assert f"it was set {'forward' if by_s > 0.0 else 'back'} by 0.500 s" in found.cause
-    assert found.cause in str(publishing.inbox.news(publishing.now_s))
+    publishing.inbox.tell(publishing.now_s)
+    assert found.cause in caplog.text
 
 
 def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock(publishing: Publishing) -> None:

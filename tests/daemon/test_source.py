@@ -230,7 +230,7 @@ def test_a_drifting_clock_is_followed_for_an_hour_and_its_drift_told(drift_ppm: 
     clock, heard = listen(lambda t: t * (1.0 + drift_ppm * 1e-6), exponential(2), 3_600.0, period_s=0.1)
     assert worst_error_s(heard, 1.0) < 0.006
     # one message in ten of the half second's five comes without a queue
-    assert (clock.steps, clock.fit().drift_ppm) == (0, pytest.approx(drift_ppm, abs=40.0))
+    assert (clock.steps, clock.line.fit().drift_ppm) == (0, pytest.approx(drift_ppm, abs=40.0))
 
 
 def test_a_step_is_counted_with_its_size() -> None:

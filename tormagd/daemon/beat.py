@@ -11,7 +11,6 @@ from time import monotonic_ns, thread_time_ns
 from typing import NamedTuple
 
 from tormagd.daemon.rate_group import Histogram
-from tormagd_client.messages import ExecReport
 
 KERNEL = "kernel"
 "To blame where nothing of ours ran: the thread was not given the processor, or was stopped."
@@ -43,45 +42,36 @@ class Delay(NamedTuple):
     share_ns: int
 
 
-class News(NamedTuple):
-    """Late beats since the last line about them."""
-
-    beats: int
-    worst: Delay
-
-    def __str__(self) -> str:
-        took_ns, culprit, share_ns = self.worst
-        return (
-            f"control ticks that were late: {self.beats}, the worst done {took_ns * 1e-6:.1f} ms after it "
-            f"was due; {share_ns * 1e-6:.1f} ms of that went to {culprit}"
-        )
-
-
 class Phases:
     """Runs all phases in their order, then one slice: the slices take turns. An error ends its phase alone."""
 
-    def __init__(self, clock_ns: Callable[[], int] = monotonic_ns, cpu_ns: Callable[[], int] = thread_time_ns) -> None:
-        self._clock_ns, self._cpu_ns = clock_ns, cpu_ns
+    def __init__(
+        self,
+        stall_ns: float,
+        clock_ns: Callable[[], int] = monotonic_ns,
+        cpu_ns: Callable[[], int] = thread_time_ns,
+    ) -> None:
+        """A beat that drives later than `stall_ns` after it was due is an error in the log."""
+        self._stall_ns, self._clock_ns, self._cpu_ns = stall_ns, clock_ns, cpu_ns
         self._phases: list[Part] = []
         self._slices: list[Part] = []
-        self._turn = self._refreshed = self._beats = 0
+        self._turn = self._beats = 0
         self._is_busy = False
         self._cpu_before_ns = cpu_ns()
         self._ran: list[tuple[str, int, int]] = []
         self._last_ran: list[tuple[str, int, int]] = []
-        self._spent: dict[str, Histogram] = {}
-        self.report: dict[str, ExecReport] = {}
-        "What each took, as of its last `refresh`."
+        self.spent: dict[str, Histogram] = {}
+        "What each took."
         self._errors: dict[str, str] = {}
         self.blamed: Counter[str] = Counter()
         "How many late beats each is to blame for."
-        self._news = News(0, Delay(0, "", 0))
-        self._news_due_ns = clock_ns()
+        self._late, self._worst = 0, Delay(0, "", 0)
+        self._tell_ns = clock_ns()
 
     def begin(self, phases: list[Part], slices: list[Part]) -> None:
         """From now on a beat is this."""
         self._phases, self._slices = phases, slices
-        self._spent = {name: Histogram() for name, _ in (*phases, *slices)}
+        self.spent = {name: Histogram() for name, _ in (*phases, *slices)}
 
     def run(self, due_ns: int, merged: int) -> None:
         """One beat that was due at `due_ns`, and stands for `merged` missed ones too."""
@@ -98,7 +88,7 @@ class Phases:
         self._beats += 1
         if self._beats % COUNTED == 0:
             for name, start_ns, end_ns in self._ran:
-                self._spent[name].add_at(end_ns * 1e-9, (end_ns - start_ns) * 1e-3)
+                self.spent[name].add(end_ns * 1e-9, (end_ns - start_ns) * 1e-3)
 
     def on_time(self) -> None:
         """The device was driven in time: what ran before does not matter any more."""
@@ -125,23 +115,22 @@ class Phases:
         self.on_time()
         delay = Delay(took_ns, culprit, share_ns)
         self.blamed[culprit] += 1
-        self._news = News(self._news.beats + 1, max(self._news.worst, delay))
+        self._late += 1
+        self._worst = max(self._worst, delay)
         return delay
 
-    def news(self) -> News | None:
-        """What there is to log now; None where no beat was late or the last line is not long enough ago."""
+    def tell(self) -> None:
+        """Says in the log how many beats were late, and of the worst why: some times a second."""
         now_ns = self._clock_ns()
-        if not self._news.beats or now_ns < self._news_due_ns:
-            return None
-        news, self._news = self._news, News(0, Delay(0, "", 0))
-        self._news_due_ns = now_ns + NEWS_NS
-        return news
-
-    def refresh(self) -> None:
-        """Makes the report of one phase anew: of each in turn."""
-        name = list(self._spent)[self._refreshed % len(self._spent)]
-        self._refreshed += 1
-        self.report[name] = self._spent[name].summary()
+        if self._late and now_ns >= self._tell_ns:
+            took_ns, culprit, share_ns = self._worst
+            log.log(
+                logging.ERROR if took_ns > self._stall_ns else logging.WARNING,
+                "control ticks that were late: %d, the worst done %.1f ms after it was due; %.1f ms of that went to %s",
+                *(self._late, took_ns * 1e-6, share_ns * 1e-6, culprit),
+            )
+            self._late, self._worst = 0, Delay(0, "", 0)
+            self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
         """Runs one part; whether it had something to do."""

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 from tormagd.config import Device
 from tormagd.control.core import Stepper
@@ -15,29 +15,20 @@ from tormagd_client.messages import Explained, StallReport
 log = logging.getLogger(__name__)
 
 
-class Stall(NamedTuple):
-    """The newest stall of the control loop: how long it stood still, and who is to blame for most of that."""
-
-    took_s: float
-    culprit: str
-
-    def __str__(self) -> str:
-        return f"the control loop stood still for {self.took_s * 1e3:.0f} ms ({self.culprit})"
-
-
 class Causes:
     """Remembers the newest stall, and of each fault what made it."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._stall: Stall | None = None
+        self.stall: StallReport | None = None
+        "The newest stall of the control loop."
         self._told: dict[str, str] = {}
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:
         """A tick was late. Only what the step took for a stall, too, is one; of two close together the longer stays."""
-        sight, known = stepper.measure.sight, self._stall
-        if sight.stalled_s == stepper.time_s and (known is None or known.took_s != sight.stall_s):
-            self._stall = Stall(sight.stall_s, delay.culprit)
+        sight, known, stall_ms = stepper.measure.sight, self.stall, round(stepper.measure.sight.stall_s * 1e3, 1)
+        if sight.stalled_s == stepper.time_s and (known is None or known.ms != stall_ms):
+            self.stall = StallReport(stall_ms, delay.culprit)
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
         """Says which faults are new, and remembers what is known of their causes now."""
@@ -45,7 +36,7 @@ class Causes:
             self._told.pop(fault, None)
         if Fault.HOST_STALL in faults:
             opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
-            self._told[Fault.HOST_STALL] = f"{self._stall}; {opened}"
+            self._told[Fault.HOST_STALL] = f"{self._stood_still()}; {opened}"
         if Fault.MEASUREMENT_STALE in faults and measurement is not None:
             silent_ms = (stepper.time_s - measurement.received_s) * 1e3
             self._told[Fault.MEASUREMENT_STALE] = (
@@ -88,17 +79,16 @@ class Causes:
     ) -> tuple[Explained, ...]:
         """Each limit with its cause and remedy; `replaced` says what the model was not asked, `of_sources` what is
         known of those that publish, `measurement` is the newest."""
-        told = {Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered"}
+        told = {Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered"}
         told |= {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"}
         if measurement is not None:
             told[Limit.LINK_DEGRADED] = f"{LIMITS[Limit.LINK_DEGRADED].cause}: {measurement.link}"
             told[Limit.CLOCK] = f"{LIMITS[Limit.CLOCK].cause}: {measurement.link.clock_drift:+.1%}"
         return explanations(limits, {**LIMITS, **of_sources}, told)
 
-    def newest_stall(self) -> StallReport | None:
-        """The newest stall, None while there was none."""
-        stall = self._stall
-        return None if stall is None else StallReport(round(stall.took_s * 1e3, 1), stall.culprit)
+    def _stood_still(self) -> str:
+        stall = self.stall
+        return "" if stall is None else f"the control loop stood still for {stall.ms:.0f} ms ({stall.culprit})"
 
 
 def explanations(

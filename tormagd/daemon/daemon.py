@@ -21,6 +21,7 @@ from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, state_folder
+from tormagd.daemon.rate_group import ERROR_PERIODS
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
 from tormagd.daemon.search_process import SearchProcess
@@ -64,17 +65,16 @@ class Daemon:
         runs beside the plans."""
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
-        self._phases = Phases()
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, self._lose_link)
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
         self._endpoint.inbox.has_way = core.scene.element == "torque"
         self._keys = keys
         rates = config.rates
+        period_ns = NS // rates.control_hz
+        self._phases = Phases(ERROR_PERIODS * period_ns)
         self._box = box or BlackBox(None, {}, rates.control_hz)
-        self._control = ControlLoop(
-            core.stepper(time.monotonic()), self._connection, NS // rates.control_hz, self._box.journal
-        )
+        self._control = ControlLoop(core.stepper(time.monotonic()), self._connection, period_ns, self._box.journal)
         self._inference = InferenceLoop(
             core.planner(time.monotonic()),
             self._endpoint.inbox,

@@ -4,6 +4,7 @@ Each message goes through three judgements, a module each: is it newer than what
 how old is it by a clock that may be wrong (`source_clock`), and does its source hold the brake (`hold`)?
 """
 
+import logging
 import math
 import shlex
 from collections import deque
@@ -36,6 +37,8 @@ NEWS, NEWS_S = 4, 1.0
 STEP_NAMED_S = 60.0
 "A clock that was set is named for so long."
 
+log = logging.getLogger(__name__)
+
 
 class _Source:
     """What is known of one publisher."""
@@ -52,7 +55,8 @@ class _Source:
 
     def refresh(self, now_s: float) -> bool:
         """Makes the figures anew; True if there is something wrong with the clock that was not named before."""
-        self.fit, self.summary = self.clock.fit(), self.delays.summary()
+        self.delays.refresh()
+        self.fit = self.clock.line.fit()
         self.cause, self.remedy = _of_clock(self.clock, self.fit, now_s)
         was_named, self.is_named = self.is_named, self.clock.is_settled and bool(self.cause)
         return self.is_named and not was_named
@@ -62,7 +66,7 @@ class _Source:
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float) -> None:
         if self.clock.is_settled:
-            self.delays.add_at(now_s, delay_s * 1e6)
+            self.delays.add(now_s, delay_s * 1e6)
         # the worse of arrival and corrected stamp: a stamp of the time to come is of now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 
@@ -127,13 +131,11 @@ class SetpointInbox:
             self.refused += 1
             self.last_refusal = reason[:LONGEST_REFUSAL]
 
-    def news(self, now_s: float) -> str | None:
-        """A line for the log, where there is one: who holds the brake now, whose clock is wrong. At most one in
-        NEWS_S."""
-        if not self._news or now_s - self._told_s < NEWS_S:
-            return None
-        self._told_s = now_s
-        return self._news.popleft()
+    def tell(self, now_s: float) -> None:
+        """Says in the log who holds the brake now, whose clock is wrong: a line in NEWS_S at most."""
+        if self._news and now_s - self._told_s >= NEWS_S:
+            self._told_s = now_s
+            log.warning("%s", self._news.popleft())
 
     def told(self, now_s: float) -> dict[Limit, Explanation]:
         """What is known now of the limits that are about sources."""
@@ -146,10 +148,9 @@ class SetpointInbox:
         """Makes the figures of one source anew, for `report`: of each in turn."""
         if self._sources:
             self._turn += 1
-            name = tuple(self._sources)[self._turn % len(self._sources)]
-            source = self._sources[name]
+            source = tuple(self._sources.values())[self._turn % len(self._sources)]
             if source.refresh(now_s):
-                self._news.append(f"source {name!r}: {source.cause}: {source.remedy}")
+                self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
     def report(self, now_s: float) -> SetpointReport:
         """Counters, the last refusal, and each source with its newest sequence number; the newest ones in full."""
@@ -278,7 +279,7 @@ class SetpointInbox:
             refused=source.refused,
             lost=sequence.lost,
             restarts=sequence.restarts,
-            delay_us=source.summary,
+            delay_us=source.delays.report,
             jitter_us=round(clock.jitter_s * 1e6, 1),
             clock_behind_ms=round(clock.offset_s * 1e3, 3) if clock.is_settled else None,
             clock_steps=clock.steps,

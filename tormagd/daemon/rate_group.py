@@ -13,7 +13,7 @@ ERROR_PERIODS: Final = 10.0
 "This late it is a stall; at 1 kHz a fifth of the time after which the firmware opens the gap."
 HORIZON_NS: Final = 5_000_000_000
 "Percentiles cover the time since one to two of these ago."
-SHARES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
+SHARES: Final = (0.5, 0.99, 0.999)
 _EXACT: Final = 64  # bins of one microsecond each; beyond, 32 bins for each doubling: 3% resolution
 _DOUBLINGS: Final = 20
 _BINS: Final = _EXACT + 32 * _DOUBLINGS
@@ -21,46 +21,39 @@ _BINS: Final = _EXACT + 32 * _DOUBLINGS
 
 @final
 class Histogram:
-    """Durations in microseconds, counted in bins. Adding costs a fraction of a microsecond, whatever has been added."""
+    """Durations in microseconds, counted in bins. Adding costs a fraction of a microsecond, whatever has been added;
+    percentiles cost a hundred times that, and are those of the last `refresh`."""
 
     def __init__(self) -> None:
         self._now = [0] * _BINS
         self._before = [0] * _BINS
         self._most_now = self._most_before = 0.0
         self._turned_s = -math.inf
+        self.report: ExecReport
+        "p50, p99, p99.9 (upper edges of their bins) and the largest, us; all 0 while nothing was added."
+        self.refresh()
 
-    def add(self, value_us: float) -> None:
-        """Counts one duration; a negative one (a clock's grain) counts as 0."""
+    def add(self, now_s: float, value_us: float) -> None:
+        """Counts one duration; a negative one (a clock's grain) counts as 0. Forgets those of two horizons ago."""
+        if now_s - self._turned_s > HORIZON_NS * 1e-9:
+            self._turned_s = now_s
+            self._before, self._now = self._now, [0] * _BINS
+            self._most_before, self._most_now = self._most_now, 0.0
         self._now[_bin(value_us)] += 1
         if value_us > self._most_now:
             self._most_now = value_us
 
-    def add_at(self, now_s: float, value_us: float) -> None:
-        """Counts one duration, at `now_s`: what there is then is of the time since one to two horizons ago."""
-        if now_s - self._turned_s > HORIZON_NS * 1e-9:
-            self.turn()
-            self._turned_s = now_s
-        self.add(value_us)
-
-    def turn(self) -> None:
-        """Begins a new horizon and forgets the one before the last."""
-        self._before, self._now = self._now, [0] * _BINS
-        self._most_before, self._most_now = self._most_now, 0.0
-
-    def summary(self) -> ExecReport:
-        """p50, p99, p99.9 (upper edges of their bins) and the largest, us; all 0 while nothing was added."""
-        most = max(self._most_now, self._most_before)
-        used = _bin(most) + 1
-        counts = [now + before for now, before in zip(self._now[:used], self._before[:used], strict=True)]
-        total = sum(counts)
-        found = dict.fromkeys(SHARES, 0.0)
-        waiting = list(SHARES.items()) if total else []
-        seen = 0
-        for index, count in enumerate(counts):
-            seen += count
-            while waiting and seen >= waiting[0][1] * total:
-                found[waiting.pop(0)[0]] = min(float(_upper_edge(index)), round(most, 1))
-        return ExecReport(**found, max=round(most, 1))
+    def refresh(self) -> None:
+        """Makes `report` anew."""
+        most = round(max(self._most_now, self._most_before), 1)
+        total, seen, used = sum(self._now) + sum(self._before), 0, 0
+        edges = []
+        for share in SHARES:
+            while seen < share * total:
+                seen += self._now[used] + self._before[used]
+                used += 1
+            edges.append(min(float(_upper_edge(used - 1)), most))
+        self.report = ExecReport(p50=edges[0], p99=edges[1], p999=edges[2], max=most)
 
 
 def _bin(value_us: float) -> int:
@@ -89,7 +82,7 @@ class _Mark(NamedTuple):
 
 @final
 class RateGroup:
-    """Timing of one periodic activity. Recording is cheap; a report is built by `refresh`, and only read by others."""
+    """Timing of one periodic activity."""
 
     def __init__(self, name: str, period_ns: int) -> None:
         self.name = name
@@ -102,27 +95,23 @@ class RateGroup:
         "From when the newest run, or the first one it stands for, was due until it was done."
         self.lateness_us = 0.0
         self.exec_us = 0.0
-        self._lateness = Histogram()
-        self._exec = Histogram()
+        self.lateness = Histogram()
+        self.exec = Histogram()
         self._worst_us = 0.0
         # the last two turns of the horizon: rate and grade cover what the percentiles cover
-        self._marks: tuple[_Mark, _Mark] | None = None
+        self._marks = (_Mark(0, 0, 0, 0), _Mark(0, 0, 0, 0))
         self._newest_ns = 0
-        self.report: RateReport
-        self.refresh()
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
         """One run that was due, began and ended at these times, and stands for `merged` missed ones too."""
-        if self._marks is None:
+        if not self.runs:
             self._marks = (_Mark(start_ns, 0, 0, 0), _Mark(start_ns, 0, 0, 0))
         elif start_ns - self._marks[1].time_ns > HORIZON_NS:
             self._marks = (self._marks[1], _Mark(start_ns, self.runs, self.overruns, self.stalls))
-            self._lateness.turn()
-            self._exec.turn()
         self.lateness_us = (start_ns - due_ns) * 1e-3
         self.exec_us = (end_ns - start_ns) * 1e-3
-        self._lateness.add(self.lateness_us)
-        self._exec.add(self.exec_us)
+        self.lateness.add(start_ns * 1e-9, self.lateness_us)
+        self.exec.add(start_ns * 1e-9, self.exec_us)
         self._worst_us = max(self._worst_us, self.lateness_us)
         self._newest_ns = start_ns
         self.runs += 1
@@ -133,32 +122,21 @@ class RateGroup:
             if self.delay_ns > ERROR_PERIODS * self.period_ns:
                 self.stalls += 1
 
-    def rate_hz(self) -> float:
-        """Mean rate over the horizon, Hz."""
-        if self._marks is None or self._newest_ns <= self._marks[0].time_ns:
-            return 0.0
+    def report(self) -> RateReport:
+        """Counts since the start; rate, grade and percentiles over the horizon, the percentiles as last refreshed."""
         since = self._marks[0]
-        return (self.runs - 1 - since.runs) / ((self._newest_ns - since.time_ns) * 1e-9)
-
-    def grade(self) -> str:
-        """How well time was kept over the horizon: error with a stall in it, warning with an overrun, else good."""
-        if self._marks is None:
-            return "good"
-        since = self._marks[0]
-        if self.stalls > since.stalls:
-            return "error"
-        return "warning" if self.overruns > since.overruns else "good"
-
-    def refresh(self) -> None:
-        """Builds `report`: counts since the start, percentiles over the horizon."""
-        lateness = self._lateness.summary()
-        self.report = RateReport(
-            grade=self.grade(),
-            hz=round(self.rate_hz(), 2),
+        hz, grade = 0.0, "good"
+        if self._newest_ns > since.time_ns:
+            hz = (self.runs - 1 - since.runs) / ((self._newest_ns - since.time_ns) * 1e-9)
+        if self.overruns > since.overruns:
+            grade = "error" if self.stalls > since.stalls else "warning"
+        return RateReport(
+            grade=grade,
+            hz=round(hz, 2),
             runs=self.runs,
             merged=self.merged,
             overruns=self.overruns,
             stalls=self.stalls,
-            lateness_us=LatenessReport(**asdict(lateness), worst=round(self._worst_us, 1)),
-            exec_us=self._exec.summary(),
+            lateness_us=LatenessReport(**asdict(self.lateness.report), worst=round(self._worst_us, 1)),
+            exec_us=self.exec.report,
         )

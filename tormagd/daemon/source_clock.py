@@ -12,7 +12,7 @@ No I/O and no clock: times are handed in.
 import math
 from typing import final
 
-from tormagd.hardware.link_statistics import ClockFit, DeviceClock
+from tormagd.hardware.link_statistics import DeviceClock
 
 MOST_WAY_S = 0.2
 """A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take. More is
@@ -51,7 +51,8 @@ class SourceClock:
         self._lateness_s = self._leaked_s = 0.0
         self._heard_s: float | None = None
         self._settles_s: float | None = None
-        self._line = DeviceClock()
+        self.line = DeviceClock()
+        "The line through the last half minute, or since the clock was set."
 
     @property
     def is_settled(self) -> bool:
@@ -74,22 +75,18 @@ class SourceClock:
         else:
             self._follow(now_s, lateness_s, now_s - self._heard_s, is_continued)
         self._heard_s, self._lateness_s = now_s, lateness_s
-        self._line.add(now_s, now_s - lateness_s)
+        self.line.add(now_s, now_s - lateness_s)
         if self._settles_s is not None:
             if now_s < self._settles_s:
                 return lateness_s
             self._settle()
         return max(lateness_s - self.offset_s, 0.0)
 
-    def fit(self) -> ClockFit | None:
-        """The line through the last half minute, or since the clock was set; None before some seconds."""
-        return self._line.fit()
-
     def _begin(self, now_s: float, lateness_s: float) -> None:
         """Nothing is known: a lateness that no way takes is the clock's, if it stays."""
         self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
         self._settles_s = now_s + SETTLED_S
-        self._line = DeviceClock()
+        self.line = DeviceClock()
         if -AHEAD_S <= lateness_s <= MOST_WAY_S:
             self._settle()
 
@@ -134,4 +131,4 @@ class SourceClock:
     def _set(self, now_s: float, by_s: float) -> None:
         self.steps += 1
         self.stepped_s, self.stepped_at_s = by_s, now_s
-        self._line = DeviceClock()
+        self.line = DeviceClock()

@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
-from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
+from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.service import READY, Service, status_line
 from tormagd.daemon.telemetry import snapshot, tick_record
 from tormagd.daemon.way import Way
@@ -50,6 +51,8 @@ REQUESTS = 16
 "Answered in a telemetry period at most: whoever asks on and on must not keep a `stop` waiting."
 TELL_S = 0.1
 "How often systemd, log and black box are seen to."
+REFRESHED = 2
+"Histograms whose percentiles are made anew each time."
 PORTRAIT_STEP = 5
 "Every fifth point of the portrait is told: it is smooth."
 
@@ -91,7 +94,8 @@ class TelemetryLoop:
         self._service = Service()
         self._status: msgspec.Raw | None = None
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // config.rates.telemetry_hz
-        self._answers, self._turn, self._told_s = 0, 0, -math.inf
+        self._answers, self._told_s = 0, -math.inf
+        self._histograms = self._in_turn()
         self._reports: dict[str, Any] = {}
         self._reported_s, self._reported_state = -math.inf, connection.state
 
@@ -146,12 +150,14 @@ class TelemetryLoop:
         if now_s - self._told_s < TELL_S:
             return False
         self._told_s = now_s
-        self._refresh(now_s)
+        for _ in range(REFRESHED):
+            next(self._histograms).refresh()
+        self._endpoint.inbox.refresh(now_s)
+        self._endpoint.inbox.tell(now_s)
         self._box.look()
         self._tell_service(now_s, self._is_homed())
         self._endpoint.tell(now_s)
-        self._report_late_ticks()
-        self._report_sources(now_s)
+        self._phases.tell()
         return True
 
     def serve(self, _beat: Beat) -> bool:
@@ -239,29 +245,12 @@ class TelemetryLoop:
                 log.info("ready: the device is identified; next: %s", "enable" if is_homed_ else "home")
             notify.notify(message)
 
-    def _report_late_ticks(self) -> None:
-        news = self._phases.news()
-        if news is not None:
-            is_stall = news.worst.took_ns > ERROR_PERIODS * self._control.timing.period_ns
-            log.log(logging.ERROR if is_stall else logging.WARNING, "%s", news)
-
-    def _refresh(self, now_s: float) -> None:
-        """Makes one report anew: all of them at once would take too long for one beat."""
-        self._turn += 1
-        turn = self._turn % (len(self._groups) + 3)
-        if turn < len(self._groups):
-            self._groups[turn].refresh()
-        elif turn == len(self._groups):
-            self._way.refresh()
-        elif turn == len(self._groups) + 1:
-            self._endpoint.inbox.refresh(now_s)
-        else:
-            self._phases.refresh()
-
-    def _report_sources(self, now_s: float) -> None:
-        news = self._endpoint.inbox.news(now_s)
-        if news is not None:
-            log.warning("%s", news)
+    def _in_turn(self) -> Iterator[Histogram]:
+        """All histograms, again and again: making all percentiles anew at once would take too long for one beat."""
+        while True:
+            for group in self._groups:
+                yield from (group.lateness, group.exec)
+            yield from (self._way.to_duty, *self._phases.spent.values())
 
     def _answer(self, request: Request) -> Any:
         if request.command == "status":
@@ -376,7 +365,7 @@ class TelemetryLoop:
             limit_details=self._causes.of_limits(
                 newest.limits, outside, self._endpoint.inbox.told(now_s), self._control.measurement
             ),
-            newest_stall=self._causes.newest_stall(),
+            newest_stall=self._causes.stall,
             not_granted=self._not_granted,
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, is_homed_))),
@@ -395,8 +384,8 @@ class TelemetryLoop:
                 "profile": self._profiles.report(),
                 "setpoints": self._endpoint.inbox.report(now_s),
                 "peers": self._endpoint.report(),
-                "rates": {group.name: group.report for group in self._groups},
-                "phases_us": dict(self._phases.report),
+                "rates": {group.name: group.report() for group in self._groups},
+                "phases_us": {name: spent.report for name, spent in self._phases.spent.items()},
                 "late_ticks_by": dict(self._phases.blamed),
                 "way": self._way.report(device_us, self._inference.planner.believe.carriages.lag_s),
                 "black_box": self._box.report(),

@@ -19,9 +19,8 @@ class Way:
     """Takes every control tick; remembers a bounded number of figures."""
 
     def __init__(self) -> None:
-        self._to_duty = Histogram()
+        self.to_duty = Histogram()
         self._stamp_s = -math.inf
-        self._summary = self._to_duty.summary()
 
     def ticked(self, now_s: float, used: Plan) -> None:
         """A control tick at `now_s`, and what had been planned when it ran."""
@@ -29,19 +28,15 @@ class Way:
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
             if stamp_s > -math.inf:  # a duty that follows no setpoint ends no way
-                self._to_duty.add_at(now_s, (now_s - stamp_s) * 1e6)
-
-    def refresh(self) -> None:
-        """Makes the percentiles anew, for `report`."""
-        self._summary = self._to_duty.summary()
+                self.to_duty.add(now_s, (now_s - stamp_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float) -> WayReport:
         """The way's parts; `device_us` is the link's, `lag_s` that of the carriages."""
-        carriages_ms, total_ms = 1e3 * lag_s, None
-        if self._summary.max > 0.0 and device_us is not None:
-            total_ms = round((self._summary.p99 + device_us) * 1e-3 + carriages_ms, 2)
+        to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
+        if to_duty_us.max > 0.0 and device_us is not None:
+            total_ms = round((to_duty_us.p99 + device_us) * 1e-3 + carriages_ms, 2)
         return WayReport(
-            to_duty_us=self._summary,
+            to_duty_us=to_duty_us,
             device_us=device_us,
             carriages_ms=round(carriages_ms, 2),
             total_ms=total_ms,
