@@ -5,38 +5,29 @@ import os
 import struct
 import time
 
-_CLOCK_MONOTONIC = 1
 _TFD_FLAGS = os.O_NONBLOCK | os.O_CLOEXEC
 _TFD_TIMER_ABSTIME = 1
+_ITIMERSPEC = struct.Struct("@4l")
+"Interval and first beat, each in seconds and nanoseconds."
 _NS = 1_000_000_000
 
 # os.timerfd_create exists from Python 3.13 on
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-class _Timespec(ctypes.Structure):
-    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
-
-
-class _Itimerspec(ctypes.Structure):
-    _fields_ = (("interval", _Timespec), ("value", _Timespec))
-
-
 class Heartbeat:
     """A periodic CLOCK_MONOTONIC timer. Missed beats are merged by the kernel and counted here."""
 
     def __init__(self, period_ns: int) -> None:
-        self._fd: int = _libc.timerfd_create(_CLOCK_MONOTONIC, _TFD_FLAGS)
+        self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, _TFD_FLAGS)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")
         self.period_ns = period_ns
-        self.due_ns = time.monotonic_ns() + period_ns
+        self.due_ns = time.monotonic_ns()
         "When the newest beat was due."
-        first, interval = divmod(self.due_ns, _NS), divmod(period_ns, _NS)
-        setting = _Itimerspec(_Timespec(*interval), _Timespec(*first))
-        if _libc.timerfd_settime(self._fd, _TFD_TIMER_ABSTIME, ctypes.byref(setting), None) < 0:
+        setting = _ITIMERSPEC.pack(*divmod(period_ns, _NS), *divmod(self.due_ns + period_ns, _NS))
+        if _libc.timerfd_settime(self._fd, _TFD_TIMER_ABSTIME, setting, None) < 0:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
-        self.due_ns -= period_ns
 
     def fileno(self) -> int:
         """The descriptor to watch for reading."""
