@@ -89,7 +89,7 @@ class Rig:
         until_s = time.monotonic() + PATIENCE_S
         while not reached():
             assert time.monotonic() < until_s, f"not {what}: {self.endpoint.report()}"
-            self.endpoint.look()
+            self.endpoint.arrivals.look()
             self.endpoint.take_setpoints()
             self.endpoint.take_requests(self.answer)
             self.endpoint.serve(self.answer, 4)

@@ -82,7 +82,7 @@ class Rig:
     def until(self, reached: Callable[[], bool], work: Callable[[], object] | None = None) -> None:
         """Does some work, or drains setpoints, until it is so; in between others have their turn."""
         for _ in range(PATIENCE_MS // 5):
-            self.endpoint.look()
+            self.endpoint.arrivals.look()
             (work or self.endpoint.take_setpoints)()
             self.endpoint.admission.update()
             if reached():

@@ -408,7 +408,7 @@ async def _bare(config: Config) -> None:
 
     def publish(heartbeat: Heartbeat, _beats: int, now_ns: int) -> None:
         nonlocal left
-        endpoint.look()
+        endpoint.arrivals.look()
         endpoint.take_requests(reply)
         endpoint.admission.update()
         if left:
@@ -417,7 +417,7 @@ async def _bare(config: Config) -> None:
         if len(rows) >= TELEMETRY_EVERY:
             endpoint.publish_ticks(rows, ("t_ns", "lateness_us", "exec_us"))
             rows.clear()
-            left = endpoint.waiting
+            left = endpoint.requests.count
 
     await beat(1_000_000_000 // config.rates.control_hz, publish, asyncio.Event())
 

@@ -93,11 +93,6 @@ class _Connections:
         "Why the handshake failed of the connection that is closed next: libzmq closes it at once."
         self.cut: set[int] = set()
 
-    def turn_away(self, address: str) -> None:
-        """Its key is refused, which libzmq will be told."""
-        self.turned_away.append(address)
-        self.untold += 1
-
     def told(self) -> str | None:
         """libzmq turns one away. The address of another that had left in the handshake and was taken for this one."""
         if self.untold:
@@ -173,14 +168,9 @@ class Admission:
             # or ZeroMQ's thread would wait for ever for a monitor that has gone
             known.endpoint.disable_monitor()
 
-    def roles(self, public: str) -> frozenset[str]:
-        """What a key may do now."""
-        listed = self.allowed.get(public)
-        return listed.roles if listed else frozenset()
-
     def has_role(self, public: str, roles: frozenset[str]) -> bool:
         """Whether the key is listed for one of these now: one that was let in may have been taken off the list."""
-        return not roles.isdisjoint(self.roles(public))
+        return public in self.allowed and not roles.isdisjoint(self.allowed[public].roles)
 
     def name(self, public: str) -> str:
         """A key as people know it: its fingerprint, and the name of its file."""
@@ -191,25 +181,28 @@ class Admission:
         """How many connections each endpoint has."""
         return {name: len(known.addresses) for name, known in self._endpoints.items()}
 
-    def is_connected(self, name: str) -> bool:
-        """Whether this endpoint has any."""
-        return bool(self._endpoints[name].addresses)
-
     def let_in(self, allowed: Allowed) -> None:
         """From now on these keys are let in."""
         before, self.allowed = self.allowed, allowed
-        log.info("%d keys are let in: %s", len(allowed), _counts(allowed))
-        lost = [key for key, listed in before.items() if not listed.roles <= self.roles(key)]
+        roles = Counter(role for listed in allowed.values() for role in listed.roles)
+        log.info("%d keys are let in: %s", len(allowed), ", ".join(f"{role} {roles[role]}" for role in ROLES))
+        lost = [
+            key
+            for key, listed in before.items()
+            if not all(self.has_role(key, frozenset({role})) for role in listed.roles)
+        ]
         if lost:
             # what they send is looked at again each time; what is sent to them is not. Who may stay is back in a moment
             log.warning("keys that are let in no more, or for less: %s", ", ".join(before[key].name for key in lost))
-            for known in self._endpoints.values():
-                if known.is_guarded and known.name in ("telemetry", "recording"):
-                    self._cut(known)
+            for name in ("telemetry", "recording"):
+                if self._endpoints[name].is_guarded:
+                    self.cut_off(name)
 
-    def cut_off(self, name: str, address: str) -> None:
-        """Ends the connections that an address has to an endpoint; whoever may connect comes back."""
-        self._cut(self._endpoints[name], address)
+    def cut_off(self, name: str, whose: str = "") -> None:
+        """Ends the connections that an address has to an endpoint, or all; whoever may connect comes back."""
+        for descriptor, address in self._endpoints[name].addresses.items():
+            if address == whose or not whose:
+                _end(descriptor, address)
 
     def _admit(self) -> None:
         for _ in range(AT_ONCE):
@@ -232,7 +225,8 @@ class Admission:
             self._came(name, address)
             known.admitted[address] += 1
             return True
-        known.turn_away(address)
+        known.turned_away.append(address)
+        known.untold += 1
         listed = self.allowed.get(public)
         reason = UNLISTED if listed is None else f"{WRONG_ROLE}: {', '.join(sorted(listed.roles))}"
         self.refusals.add(name, Peer(address, public), reason)
@@ -300,17 +294,6 @@ class Admission:
                 self.left.remove(left)
                 self.oversize += 1
                 return
-
-    def _cut(self, known: _Connections, whose: str = "") -> None:
-        """Ends the connections of an address, or all."""
-        for descriptor, address in known.addresses.items():
-            if address == whose or not whose:
-                _end(descriptor, address)
-
-
-def _counts(allowed: Allowed) -> str:
-    roles = Counter(role for listed in allowed.values() for role in listed.roles)
-    return ", ".join(f"{role} {roles[role]}" for role in ROLES)
 
 
 def _address(descriptor: int) -> str:

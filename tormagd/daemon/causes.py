@@ -32,39 +32,23 @@ class Causes:
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
         """Says which faults are new, and remembers what is known of their causes now."""
+        figures = {} if measurement is None else _figures(stepper, measurement)
         for fault in faults:
             self._told.pop(fault, None)
+            if fault in figures:
+                self._told[fault] = f"{FAULTS[fault].cause}: {figures[fault]}"
         if Fault.HOST_STALL in faults:
             opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
             self._told[Fault.HOST_STALL] = f"{self._stood_still()}; {opened}"
         if Fault.MEASUREMENT_STALE in faults and measurement is not None:
-            silent_ms = (stepper.time_s - measurement.received_s) * 1e3
+            silent_ms, behind_ms = (stepper.time_s - measurement.received_s) * 1e3, measurement.delay_s * 1e3
             self._told[Fault.MEASUREMENT_STALE] = (
                 f"the device had sent no new state for {silent_ms:.0f} ms"
-                if silent_ms > measurement.delay_s * 1e3
-                else f"the device was {measurement.delay_s * 1e3:.0f} ms behind with the commands that it obeyed"
+                if silent_ms > behind_ms
+                else f"the device was {behind_ms:.0f} ms behind with the commands that it obeyed"
             )
-        if measurement is not None:
-            self._tell_what_was_measured(faults, stepper, measurement)
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
-
-    def _tell_what_was_measured(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement) -> None:
-        """The causes whose figures are the measurement's, or what the step has remembered of it."""
-        figures: dict[Fault, str] = {
-            Fault.SENSE_STALE: f"for {(stepper.time_s - measurement.sensed_s) * 1e3:.0f} ms",
-            Fault.STATUS_STALE: f"for {(stepper.time_s - measurement.reported_s) * 1e3:.0f} ms",
-            Fault.LINK_DEGRADED: str(measurement.link),
-            Fault.CLOCK: f"by {measurement.link.clock_drift:+.1%}",
-            Fault.OUT_OF_STROKE: f"left {measurement.left_mm:.1f} mm, right {measurement.right_mm:.1f} mm from home",
-        }
-        if stepper.measure.leap is not None:
-            figures[Fault.ENCODER] = str(stepper.measure.leap)
-        figures |= dict.fromkeys(stepper.homing.faults, str(stepper.homing))
-        figures |= dict.fromkeys(stepper.opening.faults, str(stepper.opening))
-        for fault in faults:
-            if fault in figures:
-                self._told[fault] = f"{FAULTS[fault].cause}: {figures[fault]}"
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
         """Each fault with its cause and remedy."""
@@ -89,6 +73,21 @@ class Causes:
     def _stood_still(self) -> str:
         stall = self.stall
         return "" if stall is None else f"the control loop stood still for {stall.ms:.0f} ms ({stall.culprit})"
+
+
+def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
+    """Of the causes that have some: the measurement's, or what the step has remembered of it."""
+    leap, homing, opening = stepper.measure.leap, stepper.homing, stepper.opening
+    return {
+        Fault.SENSE_STALE: f"for {(stepper.time_s - measurement.sensed_s) * 1e3:.0f} ms",
+        Fault.STATUS_STALE: f"for {(stepper.time_s - measurement.reported_s) * 1e3:.0f} ms",
+        Fault.LINK_DEGRADED: str(measurement.link),
+        Fault.CLOCK: f"by {measurement.link.clock_drift:+.1%}",
+        Fault.OUT_OF_STROKE: f"left {measurement.left_mm:.1f} mm, right {measurement.right_mm:.1f} mm from home",
+        **({} if leap is None else {Fault.ENCODER: str(leap)}),
+        **dict.fromkeys(homing.faults, str(homing)),
+        **dict.fromkeys(opening.faults, str(opening)),
+    }
 
 
 def explanations(

@@ -66,7 +66,7 @@ class Daemon:
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
-        self._connection = Connection(config.device, open_backend, self._lose_link)
+        self._connection = Connection(config.device, open_backend, lambda: self._control.lose_link())
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
         self._endpoint.inbox.has_way = core.scene.element == "torque"
         self._keys = keys
@@ -164,7 +164,7 @@ class Daemon:
 
     def _receive(self, _beat: Beat) -> None:
         self._connection.receive(time.monotonic())
-        self._endpoint.look()
+        self._endpoint.arrivals.look()
 
     def _plan(self, beat: Beat) -> None:
         # before the step: a setpoint is driven in the beat that takes it
@@ -213,9 +213,6 @@ class Daemon:
         )
         if again.waiting:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
-
-    def _lose_link(self) -> None:
-        self._control.lose_link()
 
     async def _open_gap(self) -> None:
         """Asks the device to open and waits until it has; what it cannot do in time it goes on doing without us."""

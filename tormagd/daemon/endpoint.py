@@ -82,8 +82,8 @@ class Endpoint:
         self._files: list[SocketFile] = []
         self._guarded = {name for name in ENDPOINTS if endpoints.is_guarded(name)}
         self.inbox = SetpointInbox(priority)
-        self._arrivals = Arrivals()
-        self.admission = Admission(self._context, keys, self._arrivals)
+        self.arrivals = Arrivals()
+        self.admission = Admission(self._context, keys, self.arrivals)
         try:
             self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
             # XPUB is a PUB that tells what its subscribers say
@@ -94,30 +94,21 @@ class Endpoint:
             self.close()
             raise
         self._setpoints.subscribe(b"")
-        self._arrivals.watch(self._setpoints)
-        self._arrivals.watch(self._control)
+        self.arrivals.watch(self._setpoints)
+        self.arrivals.watch(self._control)
         self._is_in_parts = self._is_in_parts_of_request = False
-        self._requests = Requests()
+        self.requests = Requests()
         self._allowance = Allowance(SETPOINTS_PER_S, SETPOINT_BURST)
         self._subscriptions = {
             name: Allowance(SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST) for name in ("telemetry", "recording")
         }
         self._drops = Tally(PEERS, "%d messages were not read, the newest at %s", self.admission.name)
 
-    @property
-    def waiting(self) -> int:
-        """How many requests wait to be answered."""
-        return self._requests.count
-
-    def look(self) -> None:
-        """Asks which sockets have news: once a beat, before anything is taken."""
-        self._arrivals.look()
-
     def take_setpoints(self) -> bool:
         """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
         is_newer = False
         for _ in range(DRAIN):
-            if not self._arrivals.has(self._setpoints):
+            if not self.arrivals.has(self._setpoints):
                 break
             frame = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             is_rest, self._is_in_parts = self._is_in_parts, frame.more
@@ -151,14 +142,14 @@ class Endpoint:
         """
         looked_at, until_ns = 0, time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
-            if not self._arrivals.has(self._control):
+            if not self.arrivals.has(self._control):
                 return
             waiting = self._next_request()
             if waiting is None:
                 continue
             may_be_first = may_go_first(waiting.data)
             looked_at += may_be_first
-            if not (may_be_first and self._is_answered_first(waiting, answer)) and not self._requests.put(waiting):
+            if not (may_be_first and self._is_answered_first(waiting, answer)) and not self.requests.put(waiting):
                 self._drops.add("control", waiting.peer, TOO_MUCH)
             if looked_at == FIRST_AT_ONCE or time.monotonic_ns() >= until_ns:
                 return
@@ -167,7 +158,7 @@ class Endpoint:
         """Answers the waiting requests, for ANSWERS_NS and not more than `most`; how many there were."""
         until_ns = time.monotonic_ns() + ANSWERS_NS
         for number in range(most):
-            if time.monotonic_ns() > until_ns or (waiting := self._requests.next()) is None:
+            if time.monotonic_ns() > until_ns or (waiting := self.requests.next()) is None:
                 return number
             self._reply(waiting, self._answered(waiting, answer))
         return most
@@ -197,12 +188,11 @@ class Endpoint:
 
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
         made = self._context.socket(kind)
-        made.setsockopt(zmq.LINGER, 0)
-        made.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        made.setsockopt(zmq.RCVHWM, SUBSCRIPTIONS if kind == zmq.XPUB else 1_000)
+        options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
         if kind == zmq.XPUB:
-            made.setsockopt(zmq.XPUB_VERBOSER, 1)  # every word, not only the first of each topic
-        made.setsockopt(zmq.SNDHWM, 1_000)
+            options |= {zmq.RCVHWM: SUBSCRIPTIONS, zmq.XPUB_VERBOSER: 1}  # every word, not only the first of each topic
+        for option, value in options.items():
+            made.setsockopt(option, value)
         path = ipc_path(address)
         try:
             self.admission.guard(made, name, name in self._guarded)
@@ -258,7 +248,7 @@ class Endpoint:
             part = self._control.recv(zmq.NOBLOCK, copy=False)
         self._is_in_parts_of_request = part.more
         data = b"" if part.more else part.bytes
-        return Waiting(envelope, data, self._sender(part, "control"), self._requests.opens)
+        return Waiting(envelope, data, self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
         try:
@@ -269,7 +259,7 @@ class Endpoint:
             return False
         reply = self._carried_out(request, waiting, answer)
         if reply.ok:
-            self._requests.opens += 1
+            self.requests.opens += 1
         self._reply(waiting, reply)
         return True
 
@@ -298,7 +288,7 @@ class Endpoint:
                 "its .key belongs in the daemon's folder of operators (operate), which SIGHUP reads again",
             )
         # the gap has been told to open since this came: whatever it asks, it was meant for before that
-        if waiting.opens < self._requests.opens and not is_observed:
+        if waiting.opens < self.requests.opens and not is_observed:
             raise RefusedError(
                 "overtaken",
                 f"stop or disable came after {request.command!r} and went first",
@@ -306,7 +296,7 @@ class Endpoint:
             )
 
     def _reply(self, waiting: Waiting, reply: Reply) -> None:
-        self._arrivals.touch(self._control)
+        self.arrivals.touch(self._control)
         # a client that has gone meanwhile is not our business
         with contextlib.suppress(zmq.ZMQError):
             self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)

@@ -35,12 +35,9 @@ class Requests:
     def put(self, waiting: Waiting) -> bool:
         """Lets a request wait for its client's turn; False where too many wait."""
         client = waiting.envelope[0]
-        of_client = self._waiting.get(client)
-        if self.count >= WAITING or (of_client is not None and len(of_client) >= WAITING_PER_CLIENT):
+        if self.count >= WAITING or len(self._waiting.get(client, ())) >= WAITING_PER_CLIENT:
             return False
-        if of_client is None:
-            of_client = self._waiting[client] = deque()
-        of_client.append(waiting)
+        self._waiting.setdefault(client, deque()).append(waiting)
         self.count += 1
         return True
 

@@ -125,14 +125,14 @@ class TelemetryLoop:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
         start_ns = time.monotonic_ns()
-        endpoint, is_connected = self._endpoint, self._endpoint.admission.is_connected
+        endpoint, connections = self._endpoint, self._endpoint.admission.connections()
         # with this very snapshot those are answered who wait now; who asks later waits for the next
-        self._status, self._answers = None, min(endpoint.waiting, REQUESTS)
+        self._status, self._answers = None, min(endpoint.requests.count, REQUESTS)
         # nothing is packed for nobody
-        if is_connected("telemetry") or self._answers:
+        if connections["telemetry"] or self._answers:
             self._newest = self._snapshot(start_ns * 1e-9)
             endpoint.publish(self._newest)
-        if is_connected("recording"):
+        if connections["recording"]:
             endpoint.publish_ticks(list(self._ticks))
         self._ticks.clear()
         # before anything is learned of a new device
@@ -260,7 +260,7 @@ class TelemetryLoop:
             return self._status
         return self._describe() if request.command == "describe" else self._command(request)
 
-    def _describe(self) -> dict[str, Any]:
+    def _describe(self) -> Any:
         link = self._connection.report()
         description = Description(
             version=__version__,
@@ -273,8 +273,7 @@ class TelemetryLoop:
             serial_number=link.serial_number,
             portrait=self._portrait(),
         )
-        described: dict[str, Any] = msgspec.to_builtins(description)
-        return described
+        return msgspec.to_builtins(description)
 
     def _portrait(self) -> PortraitReport:
         portrait, device = self._core.portrait, self._inference.planner.believe.device
