@@ -145,6 +145,12 @@ def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) 
     rig.tick(100)
 
 
+def test_a_process_that_has_ended_hinders_no_end(rig: Rig) -> None:
+    rig.its.close()
+    rig.box.close()
+    assert "ended" in rig.box.report().refusal
+
+
 def test_it_says_when_it_ends(rig: Rig) -> None:
     rig.heard()
     rig.box.close()

@@ -14,7 +14,6 @@ import socket
 import subprocess
 import time
 from collections import deque
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from tormagd.assembly.build import Core, platform_name, sources_hash
 from tormagd.assembly.journal import FORMAT, Journal, Packer
 from tormagd.config import Config
 from tormagd.control.core import Planner, Stepper
-from tormagd.daemon.beside import start_beside
+from tormagd.daemon.beside import Beside, Start, start_beside
 from tormagd.hardware.connection import Connection
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.safety.operating_state import RefusedError
@@ -42,11 +41,9 @@ BUFFER_BYTES = 4_000_000
 "What the kernel is asked to keep for a process that is held up; it may grant less, which is a third of a second."
 LEAVING_S = 2.0
 MOST_ASKED = 8
-GONE = "the process that keeps it has ended"
 ASKED = "REQUEST"
 
 log = logging.getLogger(__name__)
-Start = Callable[[socket.socket], "subprocess.Popen[bytes]"]
 start_keeper: Start = partial(start_beside, KEEPER)
 "The process that keeps."
 
@@ -78,8 +75,7 @@ class BlackBox:
     ) -> None:
         self._folder = folder
         self._refusal, self._newest, self._dropped = "", "", 0
-        self._socket: socket.socket | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._beside: Beside | None = None
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
@@ -87,7 +83,7 @@ class BlackBox:
             log.warning("no black box: %s", self._refusal)
         else:
             self._start(Begin(str(folder), header), start)
-        self.journal = Journal(is_kept=self._socket is not None)
+        self.journal = Journal(is_kept=self._beside is not None)
         self._packer = Packer()
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
@@ -97,13 +93,13 @@ class BlackBox:
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """With these states the first tick is run, and with what comes through this connection."""
-        if self._socket is not None:
+        if self._beside is not None:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
         """A control period is over, with these states."""
-        if self._socket is None:
+        if self._beside is None:
             return
         self.journal.ticked(record)
         try:
@@ -124,7 +120,7 @@ class BlackBox:
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Asks for a black box, and says where it will be. Raises RefusedError."""
-        if self._folder is None or self._socket is None:
+        if self._folder is None or self._beside is None:
             raise RefusedError(
                 "no_black_box",
                 f"there is no black box: {self._refusal}",
@@ -141,16 +137,7 @@ class BlackBox:
     def look(self) -> None:
         """Takes what the other process has said: some times a second."""
         self._ask()
-        while self._socket is not None:
-            try:
-                data = self._socket.recv(65_536)
-            except BlockingIOError:
-                return
-            except OSError:
-                data = b""
-            if not data:
-                self._lose(GONE)
-                return
+        while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
             if answer.refusal:
@@ -158,6 +145,7 @@ class BlackBox:
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
+        self._see_to()
 
     def report(self) -> BlackBoxReport:
         """For `status`."""
@@ -170,29 +158,25 @@ class BlackBox:
 
     def close(self) -> None:
         """Lets the other process end, once it has written what it was asked for."""
-        if self._socket is not None and self._process is not None:
+        beside = self._beside
+        if beside is not None:
             self._say(End())
-            self._socket.close()
-            self._socket = None
+            self._beside = None
+            beside.close()
             try:
-                self._process.wait(LEAVING_S)
+                beside.process.wait(LEAVING_S)
             except subprocess.TimeoutExpired:
                 log.info("the black box is still being written")
 
     def _start(self, first: Begin, start: Start) -> None:
-        ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setblocking(False)
-        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        with its:
-            try:
-                self._process = start(its)
-            except OSError as error:
-                ours.close()
-                self._refusal = f"the process that keeps it did not start: {error.strerror}"
-                log.warning("no black box: %s", self._refusal)
-                return
-        self._socket = ours
-        ours.send(msgspec.msgpack.encode(first))
+        try:
+            self._beside = Beside(start)
+        except OSError as error:
+            self._refusal = f"the process that keeps it did not start: {error.strerror}"
+            log.warning("no black box: %s", self._refusal)
+            return
+        self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        self._beside.send(msgspec.msgpack.encode(first))
 
     def _ask(self) -> None:
         """Passes on what it has not heard yet: it may have been held up."""
@@ -204,22 +188,19 @@ class BlackBox:
 
     def _say(self, what: Said) -> bool:
         """Whether the socket took it."""
-        if self._socket is None:
-            return False
-        try:
-            self._socket.send(self._encoder.encode(what))
-        except ConnectionError:
-            self._lose(GONE)
-            return False
-        except OSError:  # it does not take any now, or this is more than a packet holds
-            return False
-        return True
+        is_taken = self._beside is not None and self._beside.send(self._encoder.encode(what))
+        self._see_to()
+        return is_taken
+
+    def _see_to(self) -> None:
+        if self._beside is not None and self._beside.is_gone:
+            self._lose("the process that keeps it has ended")
 
     def _lose(self, reason: str) -> None:
         self._refusal = reason
         log.error("no black box any more: %s", reason)
-        if self._socket is not None:
-            self._socket.close()
-        self._socket = None
+        if self._beside is not None:
+            self._beside.close()
+        self._beside = None
         self.journal.is_kept = False
         self.journal.take()

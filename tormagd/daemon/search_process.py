@@ -11,54 +11,37 @@ import signal
 import socket
 import sys
 import time
+from functools import partial
 
 from tormagd.assembly.build import Core, build_core
-from tormagd.daemon.beside import start_beside
+from tormagd.daemon.beside import MOST_PACKET, Beside, start_beside
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.inverse.solution import Answer, Question
 from tormagd_client.endpoints import ConfigError
 
 STARTS_S = 60.0
 "Loading torch takes seconds, on a cold disk more."
-MOST_PACKET = 65_536
 
 log = logging.getLogger(__name__)
 
 
 class SearchProcess:
-    """The daemon's end. To be made before the daemon's thread is a real-time one, whose processors the search would
-    have. Raises ConfigError where the search does not start."""
+    """The daemon's end. Raises ConfigError where the search does not start."""
 
     def __init__(self, core: Core) -> None:
         self.timing = RateGroup("search", 1_000_000_000 // core.config.rates.inference_hz)
         self._asked_ns = self._due_ns = 0
-        self._is_idle, self._is_lost = True, False
-        self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with its:
-            self._process = start_beside(__name__, its)
-        self._socket.settimeout(STARTS_S)
-        try:
-            self._socket.send(pickle.dumps((core.config, core.scene, core.models)))
-            started = self._socket.recv(MOST_PACKET)
-        except OSError:
-            started = b""
-        if not started:
+        self._is_idle, self._is_told = True, False
+        self._beside = Beside(partial(start_beside, __name__))
+        self._beside.send(pickle.dumps((core.config, core.scene, core.models)))
+        if self._beside.receive(STARTS_S) is None:
             self.close()
             raise ConfigError(f"solver.name = {core.solver.solver!r}: its process did not start within {STARTS_S:g} s")
-        self._socket.setblocking(False)
 
     def answer(self) -> Answer | None:
         """What it found, if it has since the last time. Never waits."""
-        if self._is_idle or self._is_lost:
-            return None
-        try:
-            data = self._socket.recv(MOST_PACKET)
-        except BlockingIOError:
-            return None
-        except OSError:
-            data = b""
-        if not data:
-            self._lose()
+        data = None if self._is_idle else self._beside.receive()
+        if data is None:
             return None
         self._is_idle = True
         self.timing.record(self._due_ns, self._asked_ns, time.monotonic_ns())
@@ -69,30 +52,25 @@ class SearchProcess:
         return None
 
     def ask(self, question: Question | None) -> None:
-        """Asks, unless a question is open or the next is not due yet."""
+        """Asks, unless a question is open or the next is not due yet. Plans fail as soon as the last answer is too old:
+        that the search has ended is said once."""
+        if self._beside.is_gone and not self._is_told:
+            self._is_told = True
+            log.error("the search beside the plans has ended; restart the daemon")
         now_ns, period_ns = time.monotonic_ns(), self.timing.period_ns
-        if question is None or self._is_lost or not self._is_idle or now_ns < self._due_ns + period_ns:
+        if question is None or not self._is_idle or now_ns < self._due_ns + period_ns:
             return
         self._due_ns += period_ns
         if now_ns - self._due_ns > period_ns:  # what was missed is not made up for
             self._due_ns = now_ns
         self._asked_ns = now_ns
-        try:
-            self._socket.send(pickle.dumps(question))
-            self._is_idle = False
-        except OSError:
-            self._lose()
-
-    def _lose(self) -> None:
-        """Says once that it has ended: plans fail as soon as its last answer is too old."""
-        self._is_lost = True
-        log.error("the search beside the plans has ended; restart the daemon")
+        self._is_idle = not self._beside.send(pickle.dumps(question))
 
     def close(self) -> None:
         """Ends the process."""
-        self._socket.close()
-        self._process.kill()
-        self._process.wait()
+        self._beside.close()
+        self._beside.process.kill()
+        self._beside.process.wait()
 
 
 def main() -> None:
