@@ -37,7 +37,7 @@ sys.meta_path.insert(0, Finder)
 
 def test_ctrl_c_is_seen_to_before_anything_slow(monkeypatch: pytest.MonkeyPatch):
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(daemon_main, "_start", lambda _options: signal.getsignal(signal.SIGINT))
+    monkeypatch.setattr("tormagd.daemon.start.start", lambda _options: signal.getsignal(signal.SIGINT))
     assert daemon_main.main([]) is signal.SIG_DFL  # what starts the daemon finds, and so its exit code here
     assert signal.getsignal(signal.SIGINT) == before
 

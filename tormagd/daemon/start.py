@@ -1,0 +1,93 @@
+"""Builds the core as the configuration says, and runs the daemon; or prints what it would be."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from functools import partial
+
+import msgspec
+import uvloop
+
+from tormagd.assembly.build import Core, at_rates_of, build_core, least_resolution_N
+from tormagd.config import Config, load_config
+from tormagd.daemon.black_box import BlackBox, header
+from tormagd.daemon.daemon import Daemon
+from tormagd.daemon.profiles import state_folder
+from tormagd.daemon.realtime import prepare
+from tormagd.daemon.search_process import SearchProcess
+from tormagd.hardware.backend import Backend, choose, installed
+from tormagd.keys import KeyRing
+from tormagd.output import write_line
+from tormagd.scenes.scene import load_scene, terms_of
+from tormagd.toml_file import placed
+from tormagd_client.endpoints import ENDPOINTS, ConfigError
+from tormagd_client.printable import printable
+
+
+def start(options: argparse.Namespace) -> int:
+    """Returns the exit code: 0 ended on request, 1 could not run. Raises ConfigError for what is refused."""
+    try:
+        config = _configured(options)
+        # the daemon's keys where an endpoint demands them
+        is_guarded = any(config.endpoints.is_guarded(name) for name in ENDPOINTS)
+        keys = KeyRing(config.endpoints) if is_guarded else None
+        core = build_core(config)
+        backend = choose(config.device, config.rates)
+    except ConfigError as error:
+        raise ConfigError(placed(options.config, str(error))) from error
+    if options.check:
+        _print_resolved(config, core, backend.options)
+        return 0
+    try:
+        uvloop.run(_run(config, core, backend.open, keys, partial(_configured, options)))
+    except (ConfigError, OSError) as error:
+        write_line(f"tormagd: {printable(str(error))}", sys.stderr)
+        return 1
+    return 0
+
+
+def _configured(options: argparse.Namespace) -> Config:
+    """What the file says, and the command line beside it. Raises ConfigError."""
+    config = load_config(options.config)
+    if options.scene is not None:
+        config = msgspec.structs.replace(config, scene=options.scene)
+    return at_rates_of(load_scene(config.scene), config)
+
+
+async def _run(
+    config: Config,
+    core: Core,
+    open_backend: Callable[[], Backend],
+    keys: KeyRing | None,
+    read_again: Callable[[], Config],
+) -> None:
+    # before this thread is a real-time one: the process that is started keeps off its processors
+    folder = state_folder(config.black_box.folder, "blackbox")
+    box = BlackBox(folder, {} if folder is None else header(config, core), config.rates.control_hz)
+    beside = SearchProcess(core) if core.element.is_beside else None
+    refused = prepare(config.realtime)
+    await Daemon(config, core, open_backend, refused, keys, box, read_again, beside).run()
+
+
+def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> None:
+    device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
+    resolved = {
+        "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),
+        "scene": msgspec.to_builtins(core.scene),
+        "derived": {
+            "least_N": core.portrait.min_N,
+            "most_N": core.portrait.max_N,
+            "phase_margin_deg": core.margins.phase_margin_deg,
+            "gain_margin_dB": core.margins.gain_margin_dB,
+            "solver": core.solver._asdict(),
+            "control_hz": config.rates.control_hz,
+            "inference_hz": config.rates.inference_hz,
+            "fingerprint": core.scene.fingerprint,
+            "terms_out": terms_of(core.scene).left_out,
+            "least_resolution_N": least_resolution_N(core.portrait, core.scene.force.most_N),
+            "missed_rms_N": None if core.missed is None else core.missed.rms_N,
+            "missed_share": None if core.missed is None else core.missed.share,
+        },
+        "backends": {name: reason or "loads" for name, reason in installed().items()},
+    }
+    write_line(msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode(), sys.stdout)
