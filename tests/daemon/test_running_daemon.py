@@ -20,7 +20,7 @@ from tormagd.closed_loop import VirtualPort
 from tormagd.config import Config, Rates, RealTime
 from tormagd.control.core import Planner
 from tormagd.control.records import Plan
-from tormagd.daemon import daemon as daemon_module, notify
+from tormagd.daemon import daemon as daemon_module, telemetry_loop
 from tormagd.daemon.beat import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.hardware.backend import BackendError
@@ -308,7 +308,7 @@ def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(alone: Running, error
 
 def test_the_watchdog_is_fed_while_plans_are_fresh(alone: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     notified: list[str] = []
-    monkeypatch.setattr(notify, "notify", notified.append)
+    monkeypatch.setattr(telemetry_loop, "notify", notified.append)
     alone.tick(100)
     assert "WATCHDOG=1" in notified
     alone.planner.error = TypeError("nobody expects this")

@@ -13,7 +13,7 @@ import pytest
 from tormagd import __version__
 from tormagd.config import Config
 from tormagd.ctl.main import parser
-from tormagd.daemon.notify import notify
+from tormagd.daemon.service import notify
 
 UNITS = Path(__file__).parents[2] / "systemd"
 needs_analyze = pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="systemd-analyze is not installed")

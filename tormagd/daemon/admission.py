@@ -50,8 +50,6 @@ WATCHED = (
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
 _CREDENTIALS = struct.Struct("3i")
-_ZAP = "inproc://zeromq.zap.01"
-_KEY_BYTES = 32
 
 MAY: dict[str, frozenset[str]] = {
     "setpoint": frozenset({"publish"}),
@@ -67,10 +65,7 @@ REASONS: dict[int, str] = {
     zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH: PLAIN,
     zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC: "another server's key",
 }
-UNLISTED, WRONG_ROLE = "key not listed", "role not allowed"
-TOO_MANY = "too many connections"
 UNASKED_KEY = "no handshake that an open endpoint knows: a key is not to be shown here"
-BROKEN_HANDSHAKE, LEFT = "broken handshake", "left in the handshake"
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +130,7 @@ class Admission:
         # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
         self._zap = context.socket(zmq.ROUTER)
         self._zap.linger = 0
-        self._zap.bind(_ZAP)
+        self._zap.bind("inproc://zeromq.zap.01")
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
@@ -211,7 +206,7 @@ class Admission:
             frames = self._zap.recv_multipart(zmq.NOBLOCK)
             envelope, (version, request, domain, address, _, mechanism, *credentials) = frames[:2], frames[2:]
             public = ""
-            if mechanism == b"CURVE" and len(credentials) == 1 and len(credentials[0]) == _KEY_BYTES:
+            if mechanism == b"CURVE" and len(credentials) == 1 and len(credentials[0]) == 32:
                 public = z85.encode(credentials[0]).decode()
             name = domain.decode()
             is_admitted = self._is_admitted(name, address.decode(errors="replace"), public)
@@ -228,7 +223,7 @@ class Admission:
         known.turned_away.append(address)
         known.untold += 1
         listed = self.allowed.get(public)
-        reason = UNLISTED if listed is None else f"{WRONG_ROLE}: {', '.join(sorted(listed.roles))}"
+        reason = "key not listed" if listed is None else f"role not allowed: {', '.join(sorted(listed.roles))}"
         self.refusals.add(name, Peer(address, public), reason)
         return False
 
@@ -248,9 +243,9 @@ class Admission:
                 if other is not None:
                     self.refusals.add(known.name, Peer(other), PLAIN)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
-                known.failed = REASONS.get(value, BROKEN_HANDSHAKE) if known.is_guarded else UNASKED_KEY
+                known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
-                known.failed = PLAIN if known.is_guarded else LEFT
+                known.failed = PLAIN if known.is_guarded else "left in the handshake"
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
         address = known.addresses[descriptor] = _address(descriptor)
@@ -271,7 +266,7 @@ class Admission:
         )
         if descriptor in known.cut:
             known.cut.discard(descriptor)
-            failed = TOO_MANY
+            failed = "too many connections"
         if was_asked:
             return  # counted then
         if failed is None and (not known.is_guarded or known.admitted[address]):

@@ -41,7 +41,6 @@ BUFFER_BYTES = 4_000_000
 "What the kernel is asked to keep for a process that is held up; it may grant less, which is a third of a second."
 LEAVING_S = 2.0
 MOST_ASKED = 8
-ASKED = "REQUEST"
 
 log = logging.getLogger(__name__)
 start_keeper: Start = partial(start_beside, KEEPER)

@@ -12,7 +12,6 @@ from functools import partial
 from tormagd.assembly.build import Core
 from tormagd.config import Config
 from tormagd.control.believe.strength import device_bounds
-from tormagd.daemon import notify
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox
 from tormagd.daemon.causes import Causes
@@ -25,6 +24,7 @@ from tormagd.daemon.rate_group import ERROR_PERIODS
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
 from tormagd.daemon.search_process import SearchProcess
+from tormagd.daemon.service import notify
 from tormagd.daemon.telemetry_loop import TelemetryLoop
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
@@ -145,7 +145,7 @@ class Daemon:
         heartbeat = Heartbeat(NS // self._config.rates.control_hz)
         self._loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
         await self._ended.wait()
-        notify.notify("STOPPING=1")
+        notify("STOPPING=1")
         await self._open_gap()
         self._profiles.look(None, is_driven=False)
         await self._profiles.finished()

@@ -50,15 +50,12 @@ TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket in one beat at most, and for how long."
 ANSWERS_NS = 300_000
 "For how long requests are answered in one beat."
-FIRST_AT_ONCE = 4
-"Requests that may be a `stop`, looked at in one go at most."
 PEERS = 16
 "Peers whose messages were not read, as many as are told apart."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
-PUBLISHER = frozenset({"publish"})
 
 Answer = Callable[[Request], Any]
 "Returns the result, as plain data or packed already, or raises RefusedError."
@@ -120,7 +117,7 @@ class Endpoint:
             if not self._allowance.grants(peer, now_s):
                 self._drops.add("setpoint", peer, TOO_MUCH)
                 continue
-            if peer.key and not self.admission.has_role(peer.key, PUBLISHER):
+            if peer.key and not self.admission.has_role(peer.key, MAY["setpoint"]):
                 self._drops.add("setpoint", peer, OFF_THE_LIST)
                 continue
             data = b"" if frame.more else frame.bytes
@@ -140,19 +137,15 @@ class Endpoint:
 
         `answer` returns the result or raises RefusedError.
         """
-        looked_at, until_ns = 0, time.monotonic_ns() + TAKEN_NS
+        until_ns = time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
-            if not self.arrivals.has(self._control):
+            if not self.arrivals.has(self._control) or time.monotonic_ns() >= until_ns:
                 return
             waiting = self._next_request()
-            if waiting is None:
+            if waiting is None or (may_go_first(waiting.data) and self._is_answered_first(waiting, answer)):
                 continue
-            may_be_first = may_go_first(waiting.data)
-            looked_at += may_be_first
-            if not (may_be_first and self._is_answered_first(waiting, answer)) and not self.requests.put(waiting):
+            if not self.requests.put(waiting):
                 self._drops.add("control", waiting.peer, TOO_MUCH)
-            if looked_at == FIRST_AT_ONCE or time.monotonic_ns() >= until_ns:
-                return
 
     def serve(self, answer: Answer, most: int) -> int:
         """Answers the waiting requests, for ANSWERS_NS and not more than `most`; how many there were."""
@@ -199,7 +192,7 @@ class Endpoint:
             if path is not None:
                 file = SocketFile(path)
                 self._files.append(file)
-                made.setsockopt(zmq.USE_FD, file.detach())
+                made.setsockopt(zmq.USE_FD, file.listener.detach())
             made.bind(address)
         except zmq.ZMQError as error:
             raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}") from error
@@ -258,8 +251,7 @@ class Endpoint:
         if request.command not in FIRST:
             return False
         reply = self._carried_out(request, waiting, answer)
-        if reply.ok:
-            self.requests.opens += 1
+        self.requests.opens += reply.ok
         self._reply(waiting, reply)
         return True
 

@@ -230,14 +230,14 @@ class SetpointInbox:
     def _make_room(self, name: str, now_s: float) -> None:
         if len(self._sources) < SOURCES:
             return
-        others = [other for other in self._sources if other != self.hold.source]
-        oldest = min(others, key=lambda other: self._sources[other].heard_s)
-        if now_s - self._sources[oldest].heard_s <= SILENT_S:
-            unlisted = [other for other in others if other not in self.priority]
-            if name not in self.priority or not unlisted:
-                raise MessageError(f"source = {name!r}: allowed are {SOURCES} publishers at a time")
-            oldest = min(unlisted, key=lambda other: self._sources[other].heard_s)
-        del self._sources[oldest]
+        others = [source for other, source in self._sources.items() if other != self.hold.source]
+        silent = [source for source in others if now_s - source.heard_s > SILENT_S]
+        unlisted = [source for source in others if source.setpoint.source not in self.priority]
+        may_go = silent or (unlisted if name in self.priority else [])
+        if not may_go:
+            raise MessageError(f"source = {name!r}: allowed are {SOURCES} publishers at a time")
+        oldest = min(may_go, key=lambda source: source.heard_s)
+        del self._sources[oldest.setpoint.source]
 
     def _why_stale(self, holder: _Source, now_s: float) -> Explanation:
         name, silent_ms = self.hold.source, (now_s - holder.heard_s) * 1e3

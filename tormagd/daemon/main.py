@@ -13,7 +13,6 @@ from tormagd.output import write_line
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import printable
 
-REFUSED = 2
 EXIT_TEXT = """exit codes: 0 ended on request, 1 could not run, 2 configuration refused. SIGTERM opens the gap and ends;
 SIGHUP reads keys and configuration again."""
 
@@ -42,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
         return start(options)
     except ConfigError as error:
         write_line(f"tormagd: {printable(str(error))}", sys.stderr)
-        return REFUSED
+        return 2
     finally:
         signal.signal(signal.SIGINT, interrupt)
 

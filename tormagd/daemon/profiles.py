@@ -42,14 +42,13 @@ class ProfileFolder:
         path = self.path(serial_number)
         try:
             data = read_bounded(path, MAX_BYTES)
+            return read_profile(
+                data, serial_number=serial_number, insert=self.insert, model=self.model, bounds=self._bounds
+            )
         except FileNotFoundError:
             return None
         except OSError as error:
             raise ProfileError(f"{path}: {error.strerror}") from error
-        try:
-            return read_profile(
-                data, serial_number=serial_number, insert=self.insert, model=self.model, bounds=self._bounds
-            )
         except ProfileError as error:
             raise ProfileError(f"{path}: {error}") from error
 

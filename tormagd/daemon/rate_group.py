@@ -1,6 +1,7 @@
 """How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
 
 import math
+from collections import deque
 from typing import Final, NamedTuple, final
 
 from msgspec.structs import asdict
@@ -99,15 +100,13 @@ class RateGroup:
         self.exec = Histogram()
         self._worst_us = 0.0
         # the last two turns of the horizon: rate and grade cover what the percentiles cover
-        self._marks = (_Mark(0, 0, 0, 0), _Mark(0, 0, 0, 0))
+        self._marks: deque[_Mark] = deque(maxlen=2)
         self._newest_ns = 0
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
         """One run that was due, began and ended at these times, and stands for `merged` missed ones too."""
-        if not self.runs:
-            self._marks = (_Mark(start_ns, 0, 0, 0), _Mark(start_ns, 0, 0, 0))
-        elif start_ns - self._marks[1].time_ns > HORIZON_NS:
-            self._marks = (self._marks[1], _Mark(start_ns, self.runs, self.overruns, self.stalls))
+        if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
+            self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
         self.lateness_us = (start_ns - due_ns) * 1e-3
         self.exec_us = (end_ns - start_ns) * 1e-3
         self.lateness.add(start_ns * 1e-9, self.lateness_us)
@@ -124,7 +123,7 @@ class RateGroup:
 
     def report(self) -> RateReport:
         """Counts since the start; rate, grade and percentiles over the horizon, the percentiles as last refreshed."""
-        since = self._marks[0]
+        since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"
         if self._newest_ns > since.time_ns:
             hz = (self.runs - 1 - since.runs) / ((self._newest_ns - since.time_ns) * 1e-9)

@@ -4,7 +4,6 @@ import ctypes
 import gc
 import logging
 import os
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,7 +14,6 @@ _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _LATENCY = Path("/dev/cpu_dma_latency")
 """While it is open, no processor sleeps so deep that waking takes longer than what was written, us (the kernel's
 Documentation/power/pm_qos_interface)."""
-_NO_LATENCY = (0).to_bytes(4, sys.byteorder)
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +42,7 @@ def prepare(settings: RealTime) -> list[str]:
     if settings.keep_awake:
         try:
             # never closed: it holds until the process ends
-            os.write(os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC), _NO_LATENCY)
+            os.write(os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC), bytes(4))
         except OSError as error:
             refused.append(f"realtime.keep_awake: {_LATENCY}: {error.strerror}; see systemd/udev")
     for line in refused:

@@ -1,8 +1,7 @@
-"""What systemd is told: ready once the device is identified, a line on how it stands, and that we live.
+"""What systemd is told: ready once the device is identified, a line on how it stands, and that we live."""
 
-No socket, no clock: `notify` sends what this says.
-"""
-
+import os
+import socket
 from collections.abc import Sequence
 
 from tormagd.hardware.link import LinkState
@@ -11,13 +10,12 @@ READY = "READY=1"
 EXTENSION_S = 30.0
 "Before it is ready, a daemon that lives is given so much longer to start, each time it says so."
 REPEAT_S = 1.0
-_EXTEND = f"EXTEND_TIMEOUT_USEC={round(EXTENSION_S * 1e6)}"
 _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
 "Nobody can be silent behind a port that is not open, and starting the daemon again would not bring one."
 
 
 class Service:
-    """The service as systemd knows it."""
+    """The service as systemd knows it. No socket, no clock: `notify` sends what this says."""
 
     def __init__(self) -> None:
         self.is_ready = False
@@ -56,7 +54,7 @@ class Service:
             messages.append("WATCHDOG=1")
             if not self.is_ready and now_s - self._extended_s >= REPEAT_S:
                 self._extended_s = now_s
-                messages.append(_EXTEND)
+                messages.append(f"EXTEND_TIMEOUT_USEC={round(EXTENSION_S * 1e6)}")
         return messages
 
 
@@ -72,3 +70,20 @@ def status_line(
     if faults:
         return f"{told}; next: tormagctl status"
     return told if is_homed else f"{told}; next: tormagctl home"
+
+
+def notify(message: str) -> bool:
+    """Sends `message`, lines of `NAME=value`, to the service manager, as sd_notify(3) does; False where there is none,
+    or it does not listen.
+
+    A NOTIFY_SOCKET that begins with `@` is an abstract socket. Never blocks.
+    """
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK) as sender:
+        try:
+            sender.sendto(message.encode(), "\0" + address[1:] if address.startswith("@") else address)
+        except OSError:
+            return False
+    return True

@@ -7,7 +7,6 @@ import socket
 import stat
 from pathlib import Path
 
-BACKLOG = 100
 _LOCK_FLAGS = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 
 
@@ -27,19 +26,15 @@ class SocketFile:
             raise OSError(f"the directory {path.parent} cannot be made: {error.filename}: {error.strerror}") from error
         self._lock = _locked(self._lock_path)
         try:
-            self._listener = _listening(path)
+            self.listener = _listening(path)
         except OSError:
             self._unlock()
             raise
         self._identity = _identity(path)
 
-    def detach(self) -> int:
-        """The listening descriptor, which is the caller's from now on."""
-        return self._listener.detach()
-
     def close(self) -> None:
         """Takes path and lock away, unless somebody has put others in their place."""
-        self._listener.close()
+        self.listener.close()
         if self._identity is not None and _identity(self._path) == self._identity:
             with contextlib.suppress(OSError):
                 self._path.unlink()
@@ -100,7 +95,7 @@ def _listening(path: Path) -> socket.socket:
     try:
         path.unlink(missing_ok=True)  # nobody has the lock: it is what a killed process left behind
         made.bind(str(path))
-        made.listen(BACKLOG)
+        made.listen(100)
     except OSError as error:
         made.close()
         raise OSError(f"{path} cannot be bound: {error.strerror or error}") from error

@@ -101,9 +101,7 @@ def _names(bits: Switches | DeviceFault) -> tuple[str, ...]:
 
 def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...]:
     """What holds the force back now; nothing does while the device is not driven."""
-    if not safety.is_driven:
-        return ()
-    return tuple(dict.fromkeys((*plan.limits, *output.limits)))
+    return tuple(dict.fromkeys((*plan.limits, *output.limits))) if safety.is_driven else ()
 
 
 def snapshot(

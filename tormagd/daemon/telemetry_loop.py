@@ -18,16 +18,15 @@ from tormagd.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.config import Config
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.move.opening import is_open
-from tormagd.daemon import notify
 from tormagd.daemon.beat import Beat, Phases
-from tormagd.daemon.black_box import ASKED, BlackBox
+from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import Histogram, RateGroup
-from tormagd.daemon.service import READY, Service, status_line
+from tormagd.daemon.service import READY, Service, notify, status_line
 from tormagd.daemon.telemetry import snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
@@ -44,7 +43,6 @@ from tormagd_client.messages import (
     TickRecord,
 )
 
-NS = 1_000_000_000
 MOST_TICKS = 100
 "Ticks in one recording message at most."
 REQUESTS = 16
@@ -83,7 +81,7 @@ class TelemetryLoop:
         self._control, self._inference, self._profiles = control, inference, profiles
         self._connection, self._endpoint = connection, endpoint
         self._phases, self._causes, self._box = phases, causes, box
-        self.timing = RateGroup("telemetry", NS // config.rates.telemetry_hz)
+        self.timing = RateGroup("telemetry", 1_000_000_000 // config.rates.telemetry_hz)
         self._groups = [control.timing, inference.timing, self.timing]
         if inference.beside is not None:
             self._groups.append(inference.beside.timing)
@@ -197,8 +195,8 @@ class TelemetryLoop:
 
     def is_busy(self) -> bool:
         """Whether the device homes or opens, or is about to."""
-        connection, control = self._connection, self._control
-        return is_busy(connection.measurement, connection.pending, control.stepper, control.output)
+        connection = self._connection
+        return is_busy(connection.measurement, connection.pending, self._control.stepper, self._control.output)
 
     def is_open(self) -> bool | None:
         """Whether the gap is open; None without a device."""
@@ -243,7 +241,7 @@ class TelemetryLoop:
         for message in service.news(now_s, is_alive, link, status):
             if message == READY:
                 log.info("ready: the device is identified; next: %s", "enable" if is_homed_ else "home")
-            notify.notify(message)
+            notify(message)
 
     def _in_turn(self) -> Iterator[Histogram]:
         """All histograms, again and again: making all percentiles anew at once would take too long for one beat."""
@@ -290,7 +288,7 @@ class TelemetryLoop:
         if request.command == "confirm":
             return self._confirm(request.args.get("what"))
         if request.command == "blackbox":
-            return {"file": str(self.keep(ASKED, 0.0))}
+            return {"file": str(self.keep("REQUEST", 0.0))}
         self._control.command(request.command, self.conditions())
         return {
             "operating_state": str(self._control.stepper.safety.operating_state),
