@@ -134,13 +134,13 @@ class Running:
 
     def __init__(self, runner: asyncio.Runner, clock: Clock, core: Core, folder: Path) -> None:
         self.clock, self.port, self.core = clock, Port(), core
-        self._runner, self._folder = runner, str(folder)
+        self._runner, self.folder = runner, str(folder)
         self.clients: list[Client] = []
         self.client = self.publisher("test")
 
     def publisher(self, source: str) -> Client:
         """A client with a name of its own."""
-        self.clients.append(Client.local(self._folder, 1e-3, source))
+        self.clients.append(Client.local(self.folder, 1e-3, source))
         return self.clients[-1]
 
     def start(self, rates: Rates = Rates(), *, is_plugged_in: bool = True) -> None:  # noqa: B008 it is immutable
@@ -149,7 +149,7 @@ class Running:
         self._runner.run(self._begun(rates))
 
     async def _begun(self, rates: Rates) -> None:
-        config = Config(endpoints=in_folder(self._folder), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
+        config = Config(endpoints=in_folder(self.folder), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
         self.daemon = Daemon(config, self.core, self.port.open, [])
         self.planner = FailingPlanner(self.daemon._inference.planner)
         self.daemon._inference.planner = self.planner  # type: ignore[assignment]
@@ -316,6 +316,21 @@ def test_the_watchdog_is_fed_while_plans_are_fresh(alone: Running, monkeypatch: 
     notified.clear()
     alone.tick(100)
     assert notified == []
+
+
+def test_sighup_takes_over_what_it_can_and_names_what_waits(alone: Running, caplog: pytest.LogCaptureFixture) -> None:
+    read = Config(scene="pulse", endpoints=in_folder(alone.folder), realtime=RealTime(watchdog_ms=800.0))
+    alone.daemon._read_again = lambda: read
+    with caplog.at_level(logging.INFO):
+        signal.raise_signal(signal.SIGHUP)
+        while "restart" not in caplog.text:
+            alone.tick()
+    assert [record.getMessage() for record in caplog.records][-3:] == [
+        "no list of keys to read again: there is no endpoints.curve",
+        "configuration read again: now in force: realtime.watchdog_ms",
+        "not before a restart (systemctl restart tormagd): scene",
+    ]
+    assert alone.command("describe")["configuration"]["realtime"]["watchdog_ms"] == 800.0
 
 
 def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.LogCaptureFixture) -> None:

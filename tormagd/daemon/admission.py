@@ -12,6 +12,7 @@ import socket
 import struct
 import time
 from collections import Counter, deque
+from typing import Any
 
 import zmq
 import zmq.utils.monitor
@@ -138,10 +139,12 @@ class Admission:
         if is_guarded:
             if self._keys is None:
                 raise OSError("CURVE keys are needed: endpoints.curve.server_secret")
-            endpoint.curve_secretkey = self._keys.server.secret
-            endpoint.curve_server = True
-            endpoint.setsockopt(zmq.ZAP_DOMAIN, name.encode())
-            for option, value in GUARDED.items():
+            keyed: dict[int, Any] = {
+                zmq.CURVE_SERVER: 1,
+                zmq.CURVE_SECRETKEY: self._keys.server.secret,
+                zmq.ZAP_DOMAIN: name.encode(),
+            }
+            for option, value in (GUARDED | keyed).items():
                 endpoint.setsockopt(option, value)
         known = self._endpoints[name] = _Connections(name, endpoint, is_guarded)
         self._arrivals.watch(known.monitor)

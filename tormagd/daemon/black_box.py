@@ -79,9 +79,16 @@ class BlackBox:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
             self._refusal = "mcap is not installed: pip install 'tormagd[record]'"
-            log.warning("no black box: %s", self._refusal)
         else:
-            self._start(Begin(str(folder), header), start)
+            try:
+                self._beside = Beside(start)
+            except OSError as error:
+                self._refusal = f"the process that keeps it did not start: {error.strerror}"
+            else:
+                self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+                self._beside.send(msgspec.msgpack.encode(Begin(str(folder), header)))
+        if folder is not None and self._refusal:
+            log.warning("no black box: %s", self._refusal)
         self.journal = Journal(is_kept=self._beside is not None)
         self._packer = Packer()
         self._ticks = PART_TICKS // 2
@@ -166,16 +173,6 @@ class BlackBox:
                 beside.process.wait(LEAVING_S)
             except subprocess.TimeoutExpired:
                 log.info("the black box is still being written")
-
-    def _start(self, first: Begin, start: Start) -> None:
-        try:
-            self._beside = Beside(start)
-        except OSError as error:
-            self._refusal = f"the process that keeps it did not start: {error.strerror}"
-            log.warning("no black box: %s", self._refusal)
-            return
-        self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        self._beside.send(msgspec.msgpack.encode(first))
 
     def _ask(self) -> None:
         """Passes on what it has not heard yet: it may have been held up."""

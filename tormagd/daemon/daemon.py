@@ -28,7 +28,7 @@ from tormagd.daemon.service import notify
 from tormagd.daemon.telemetry_loop import TelemetryLoop
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
-from tormagd.keys import Allowed, KeyRing
+from tormagd.keys import KeyRing
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.scenes.scene import terms_of
@@ -58,7 +58,7 @@ class Daemon:
         refused: list[str],
         keys: KeyRing | None = None,
         box: BlackBox | None = None,
-        read_again: Callable[[], Config] | None = None,
+        read_again: Callable[[], Config] = Config,
         beside: SearchProcess | None = None,
     ) -> None:
         """`box` is one whose process runs already; without it none is kept. `beside` is there where the core's search
@@ -128,7 +128,7 @@ class Daemon:
         """Runs until SIGTERM or SIGINT; opens the gap before it returns."""
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, self._ended.set)
-        self._loop.add_signal_handler(signal.SIGHUP, self._reload)
+        self._loop.add_signal_handler(signal.SIGHUP, self._begin_reload)
         self._connection.open(time.monotonic())
         freeze_garbage()
         sys.setswitchinterval(SWITCH_S)
@@ -184,28 +184,25 @@ class Daemon:
             with contextlib.suppress(RefusedError):  # where none is kept
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
 
-    def _reload(self) -> None:
-        # in threads: reading a file is nothing that a beat should wait for
-        if self._keys is None:
-            log.info("no list of keys to read again: there is no endpoints.curve")
-        else:
-            self._loop.run_in_executor(None, self._keys.load_allowed).add_done_callback(self._let_in)
-        if self._read_again is not None:
-            self._loop.run_in_executor(None, self._read_again).add_done_callback(self._take_over)
+    def _begin_reload(self) -> None:
+        self._reloading = self._loop.create_task(self._reload())
+        # an error that nobody expects is told at once
+        self._reloading.add_done_callback(asyncio.Task.result)
 
-    def _let_in(self, reading: "asyncio.Future[Allowed]") -> None:
+    async def _reload(self) -> None:
+        # in threads: reading a file is nothing that a beat should wait for
         try:
-            self._endpoint.admission.let_in(reading.result())
+            if self._keys is None:
+                log.info("no list of keys to read again: there is no endpoints.curve")
+            else:
+                self._endpoint.admission.let_in(await asyncio.to_thread(self._keys.load_allowed))
         except ConfigError as error:
             log.error("the lists of keys stay as they were: %s", error)
-
-    def _take_over(self, reading: "asyncio.Future[Config]") -> None:
         try:
-            read = reading.result()
+            again = reread(self._config, await asyncio.to_thread(self._read_again))
         except ConfigError as error:
             log.error("the configuration stays as it was: %s", error)
             return
-        again = reread(self._config, read)
         self._config = again.config
         self._telemetry.take_over(again.config)
         log.info(

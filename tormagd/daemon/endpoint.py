@@ -139,13 +139,16 @@ class Endpoint:
         """
         until_ns = time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
-            if not self.arrivals.has(self._control) or time.monotonic_ns() >= until_ns:
+            if not self.arrivals.has(self._control):
                 return
             waiting = self._next_request()
-            if waiting is None or (may_go_first(waiting.data) and self._is_answered_first(waiting, answer)):
+            if waiting is None:
                 continue
-            if not self.requests.put(waiting):
+            is_first = may_go_first(waiting.data) and self._is_answered_first(waiting, answer)
+            if not is_first and not self.requests.put(waiting):
                 self._drops.add("control", waiting.peer, TOO_MUCH)
+            if time.monotonic_ns() >= until_ns:
+                return
 
     def serve(self, answer: Answer, most: int) -> int:
         """Answers the waiting requests, for ANSWERS_NS and not more than `most`; how many there were."""
@@ -201,18 +204,15 @@ class Endpoint:
         return made
 
     def _send(self, to: "zmq.Socket[bytes]", name: str, data: bytes) -> None:
+        """Sends to all subscribers, and cuts off who says more than subscribers need to."""
         # drops for a subscriber that does not keep up; it never blocks
         with contextlib.suppress(zmq.Again):
             to.send(data, zmq.NOBLOCK)
-        self._hear_subscribers(to, name)
-
-    def _hear_subscribers(self, publisher: "zmq.Socket[bytes]", name: str) -> None:
-        """Cuts off who says more than subscribers need to."""
         now_s, allowance = time.monotonic(), self._subscriptions[name]
         for _ in range(DRAIN):
-            if not is_readable(publisher):
+            if not is_readable(to):
                 return
-            frame = publisher.recv(zmq.NOBLOCK, copy=False)
+            frame = to.recv(zmq.NOBLOCK, copy=False)
             try:
                 peer = self._sender(frame, name)
             except zmq.ZMQError:
@@ -259,8 +259,8 @@ class Endpoint:
         try:
             request = decode(waiting.data, Request)
         except MessageError as error:
-            refused = ErrorReply("bad_request", str(error), "see the message table in the README")
-            return Reply(v=VERSION, id=None, ok=False, error=refused)
+            told = ErrorReply("bad_request", str(error), "see the message table in the README")
+            return Reply(v=VERSION, id=None, ok=False, error=told)
         return self._carried_out(request, waiting, answer)
 
     def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:

@@ -14,14 +14,6 @@ class Hold(NamedTuple):
     number: int = 0
     is_given: bool = False
 
-    def passed_to(self, source: str, *, is_given: bool = False) -> "Hold":
-        """The hold of this source, from another one; of the first ever, there is nobody to take over from."""
-        return Hold(source, self.number + 1 if self.source else self.number, is_given)
-
-    def restarted(self) -> "Hold":
-        """The same source's, behind which there is another process now."""
-        return self._replace(number=self.number + 1)
-
 
 def is_passed(hold: Hold, source: str, priority: tuple[str, ...], *, is_stale: bool) -> bool:
     """Whether a message of another source makes it the holder. `is_stale`: the holder's newest setpoint is too old."""

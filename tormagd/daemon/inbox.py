@@ -104,8 +104,7 @@ class SetpointInbox:
                 _refuse_way(setpoint)
             return self._judge(setpoint, now_s, (realtime_ns - setpoint.stamp_ns) * 1e-9)
         except MessageError as error:
-            self.refused += 1
-            self.last_refusal = str(error)[:LONGEST_REFUSAL]
+            self._refuse(str(error))
             return False
 
     def give(self, name: str, now_s: float) -> None:
@@ -128,8 +127,11 @@ class SetpointInbox:
         """Forgets the newest setpoint: nothing can be planned for it. It counts as refused, too."""
         if self.newest is not None:
             self.newest = None
-            self.refused += 1
-            self.last_refusal = reason[:LONGEST_REFUSAL]
+            self._refuse(reason)
+
+    def _refuse(self, reason: str) -> None:
+        self.refused += 1
+        self.last_refusal = reason[:LONGEST_REFUSAL]
 
     def tell(self, now_s: float) -> None:
         """Says in the log who holds the brake now, whose clock is wrong: a line in NEWS_S at most."""
@@ -196,7 +198,7 @@ class SetpointInbox:
                 return False
             self._pass(setpoint.source, "that is stale" if is_free else "it goes before that")
         elif order is not Order.NEWER:
-            self.hold = hold.restarted()
+            self.hold = hold._replace(number=hold.number + 1)  # behind it there is another process now
         source.accepted += 1
         self.accepted += 1
         self.newest = self._timed(source, now_s)
@@ -205,7 +207,8 @@ class SetpointInbox:
     def _pass(self, name: str, why: str, *, is_given: bool = False) -> None:
         if self.hold.source:
             self._news.append(f"source {name!r} holds the brake instead of {self.hold.source!r}: {why}")
-        self.hold = self.hold.passed_to(name, is_given=is_given)
+        # of the first ever, there is nobody to take over from
+        self.hold = Hold(name, self.hold.number + bool(self.hold.source), is_given)
         if self._other == name:
             self._other_s = -SILENT_S
 

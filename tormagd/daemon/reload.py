@@ -1,5 +1,6 @@
 """SIGHUP: the configuration is read again. What can change while control runs does; what cannot is named."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import msgspec
@@ -20,7 +21,7 @@ class Reread(NamedTuple):
 
 def reread(running: Config, read: Config) -> Reread:
     """The `running` configuration with what can change taken from the one that was `read`. Keys are paths, `a.b`."""
-    differing = _differing(msgspec.to_builtins(running), msgspec.to_builtins(read), "")
+    differing = tuple(_differing(msgspec.to_builtins(running), msgspec.to_builtins(read), ""))
     config = msgspec.structs.replace(
         running,
         sources=read.sources,
@@ -30,12 +31,10 @@ def reread(running: Config, read: Config) -> Reread:
     return Reread(config, taken, tuple(key for key in differing if key not in LIVE))
 
 
-def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> list[str]:
-    keys = []
+def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:
     for name in sorted(before.keys() | after.keys()):
         old, new = before.get(name), after.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
-            keys += _differing(old, new, f"{path}{name}.")
+            yield from _differing(old, new, f"{path}{name}.")
         elif old != new:
-            keys.append(f"{path}{name}")
-    return keys
+            yield f"{path}{name}"

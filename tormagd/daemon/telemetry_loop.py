@@ -172,11 +172,11 @@ class TelemetryLoop:
 
     def keep(self, reason: str, after_s: float) -> Path:
         """Has a black box written, with what comes `after_s` later; where it will be. Raises RefusedError."""
-        link, profile = self._connection.report(), self._profiles.report()
+        link = self._connection.report()
         details = {
             "firmware": link.firmware or "",
             "serial_number": "" if link.serial_number is None else f"{link.serial_number:08x}",
-            "profile_sha256": self._profiles.digest if profile.is_used else "",
+            "profile_sha256": self._profiles.digest if self._profiles.report().is_used else "",
         }
         return self._box.write(reason, after_s, details)
 
@@ -259,7 +259,8 @@ class TelemetryLoop:
         return self._describe() if request.command == "describe" else self._command(request)
 
     def _describe(self) -> Any:
-        link = self._connection.report()
+        link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
+        scaled_mm_s = device.scale * self._core.gap_speed_mm_s
         description = Description(
             version=__version__,
             build=str(settle()),
@@ -269,17 +270,12 @@ class TelemetryLoop:
             profile=self._profiles.report(),
             firmware=link.firmware,
             serial_number=link.serial_number,
-            portrait=self._portrait(),
+            portrait=PortraitReport(
+                force_N=tuple(round(device.force_N(force_N), 4) for force_N in portrait.force_N[::PORTRAIT_STEP]),
+                rate_N_s=tuple(round(scaled_mm_s * slope, 4) for slope in portrait.slope_N_mm[::PORTRAIT_STEP]),
+            ),
         )
         return msgspec.to_builtins(description)
-
-    def _portrait(self) -> PortraitReport:
-        portrait, device = self._core.portrait, self._inference.planner.believe.device
-        scaled_mm_s = device.scale * self._core.gap_speed_mm_s
-        return PortraitReport(
-            force_N=tuple(round(device.force_N(force_N), 4) for force_N in portrait.force_N[::PORTRAIT_STEP]),
-            rate_N_s=tuple(round(scaled_mm_s * slope, 4) for slope in portrait.slope_N_mm[::PORTRAIT_STEP]),
-        )
 
     def _command(self, request: Request) -> dict[str, Any]:
         self._status, self._reported_s = None, -math.inf
