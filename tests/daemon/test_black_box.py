@@ -5,7 +5,7 @@ import socket
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import msgspec
 import pytest
@@ -42,11 +42,12 @@ class Rig:
         self.process = Mock()
         self.stepper, self.planner = core.stepper(), core.planner()
         self.output = self.stepper.step(1.0, None, self.planner.planned)
-        self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000, self.start)
+        with patch("tormagd.daemon.beside.start_beside", self.start):
+            self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000)
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
         self.box.begin(self.stepper, self.planner, connection)
 
-    def start(self, its: socket.socket) -> Any:
+    def start(self, _module: str, its: socket.socket) -> Any:
         self.its = its.dup()
         self.its.setblocking(False)
         return self.process
@@ -173,8 +174,9 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     assert state_folder("/elsewhere", "blackbox") == Path("/elsewhere")
 
 
-def test_a_process_that_does_not_start_is_no_reason_not_to_run(core: Core) -> None:
-    box = BlackBox(Path("/boxes"), {}, 1_000, Mock(side_effect=OSError(11, "Resource temporarily unavailable")))
+def test_a_process_that_does_not_start_is_no_reason_not_to_run() -> None:
+    with patch("tormagd.daemon.beside.start_beside", side_effect=OSError(11, "Resource temporarily unavailable")):
+        box = BlackBox(Path("/boxes"), {}, 1_000)
     assert "did not start" in box.report().refusal
     box.close()
 
@@ -189,7 +191,8 @@ def test_a_journal_that_nobody_takes_is_bounded_and_says_so() -> None:
 
 def test_without_what_writes_the_files_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    box = BlackBox(Path("/boxes"), {}, 1_000, lambda _its: pytest.fail("a process for nothing"))
+    monkeypatch.setattr("tormagd.daemon.beside.start_beside", lambda *_: pytest.fail("a process for nothing"))
+    box = BlackBox(Path("/boxes"), {}, 1_000)
     assert (box.report().refusal, box.journal.is_kept) == (
         "mcap is not installed: pip install 'tormagd[record]'",
         False,

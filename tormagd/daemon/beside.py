@@ -4,13 +4,9 @@ import select
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 
 MOST_PACKET = 65_536
 "Bytes in one packet that is received, at most."
-
-Start = Callable[[socket.socket], "subprocess.Popen[bytes]"]
-"Starts the process, with this as its end of the socket."
 
 
 def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
@@ -27,11 +23,11 @@ class Beside:
     Raises OSError where it does not start; from then on nothing does, and nothing waits.
     """
 
-    def __init__(self, start: Start) -> None:
+    def __init__(self, module: str) -> None:
         self.socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.socket.setblocking(False)
         with its:
-            self.process = start(its)
+            self.process = start_beside(module, its)
         self.is_gone = False
         "Whether it was found to have ended, or this end was closed."
 

@@ -14,7 +14,6 @@ import socket
 import subprocess
 import time
 from collections import deque
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -25,7 +24,7 @@ from tormagd.assembly.build import Core, platform_name, sources_hash
 from tormagd.assembly.journal import FORMAT, Journal, Packer
 from tormagd.config import Config
 from tormagd.control.core import Planner, Stepper
-from tormagd.daemon.beside import Beside, Start, start_beside
+from tormagd.daemon.beside import Beside
 from tormagd.hardware.connection import Connection
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.safety.operating_state import RefusedError
@@ -43,8 +42,6 @@ LEAVING_S = 2.0
 MOST_ASKED = 8
 
 log = logging.getLogger(__name__)
-start_keeper: Start = partial(start_beside, KEEPER)
-"The process that keeps."
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
@@ -69,9 +66,7 @@ def header(config: Config, core: Core) -> dict[str, str]:
 class BlackBox:
     """Hands over what the journal has. Without a `folder` nothing is kept, and `report` says so."""
 
-    def __init__(
-        self, folder: Path | None, header: dict[str, str], control_hz: int, start: Start = start_keeper
-    ) -> None:
+    def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
         self._folder = folder
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: Beside | None = None
@@ -81,7 +76,7 @@ class BlackBox:
             self._refusal = "mcap is not installed: pip install 'tormagd[record]'"
         else:
             try:
-                self._beside = Beside(start)
+                self._beside = Beside(KEEPER)
             except OSError as error:
                 self._refusal = f"the process that keeps it did not start: {error.strerror}"
             else:

@@ -94,6 +94,4 @@ def explanations(
     codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str] = MappingProxyType({})
 ) -> tuple[Explained, ...]:
     """Each code with its cause and remedy; `told` has causes with the figures of this very time."""
-    kind = Fault if Fault.STOPPED in table else Limit
-    known = [(str(code), table[kind(code)]) for code in codes]
-    return tuple(Explained(code, told.get(code, found.cause), found.remedy) for code, found in known)
+    return tuple(Explained(str(code), told.get(code, table[code].cause), table[code].remedy) for code in codes)

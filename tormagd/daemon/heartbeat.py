@@ -5,7 +5,6 @@ import os
 import struct
 import time
 
-_TFD_FLAGS = os.O_NONBLOCK | os.O_CLOEXEC
 _TFD_TIMER_ABSTIME = 1
 _ITIMERSPEC = struct.Struct("@4l")
 "Interval and first beat, each in seconds and nanoseconds."
@@ -19,7 +18,7 @@ class Heartbeat:
     """A periodic CLOCK_MONOTONIC timer. Missed beats are merged by the kernel and counted here."""
 
     def __init__(self, period_ns: int) -> None:
-        self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, _TFD_FLAGS)
+        self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")
         self.period_ns = period_ns

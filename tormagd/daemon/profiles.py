@@ -107,9 +107,8 @@ class Profiles:
 
         A profile that nothing was added to stays as it is: it does not get younger by being used."""
         learned, is_disputed = self._believe.learned(), self._believe.sensor.is_disputed
-        if self._folder is None or self._serial_number is None or learned.device is UNSEEN or is_disputed:
-            return
-        if learned == self._on_disk:
+        is_news = learned.device is not UNSEEN and learned != self._on_disk
+        if self._folder is None or self._serial_number is None or not is_news or is_disputed:
             return
         now_ns = time.time_ns()
         profile = profile_of(

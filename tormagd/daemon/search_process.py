@@ -11,10 +11,9 @@ import signal
 import socket
 import sys
 import time
-from functools import partial
 
 from tormagd.assembly.build import Core, build_core
-from tormagd.daemon.beside import MOST_PACKET, Beside, start_beside
+from tormagd.daemon.beside import MOST_PACKET, Beside
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.inverse.solution import Answer, Question
 from tormagd_client.endpoints import ConfigError
@@ -32,7 +31,7 @@ class SearchProcess:
         self.timing = RateGroup("search", 1_000_000_000 // core.config.rates.inference_hz)
         self._asked_ns = self._due_ns = 0
         self._is_idle, self._is_told = True, False
-        self._beside = Beside(partial(start_beside, __name__))
+        self._beside = Beside(__name__)
         self._beside.send(pickle.dumps((core.config, core.scene, core.models)))
         if self._beside.receive(STARTS_S) is None:
             self.close()

@@ -7,8 +7,6 @@ import socket
 import stat
 from pathlib import Path
 
-_LOCK_FLAGS = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-
 
 class SocketFile:
     """A listening socket with its path. Raises OSError saying what is in the way.
@@ -60,7 +58,7 @@ def _locked(path: Path) -> int:
     """A descriptor that holds the lock, with our process number in the file."""
     while True:
         try:
-            descriptor = os.open(path, _LOCK_FLAGS, 0o660)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o660)
         except OSError as error:
             raise OSError(f"{path} cannot be opened: {error.strerror}") from error
         try:
