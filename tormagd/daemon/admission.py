@@ -207,11 +207,9 @@ class Admission:
             if not self._arrivals.has(self._zap):
                 return
             frames = self._zap.recv_multipart(zmq.NOBLOCK)
-            envelope, (version, request, domain, address, _, mechanism, *credentials) = frames[:2], frames[2:]
-            public = ""
-            if mechanism == b"CURVE" and len(credentials) == 1 and len(credentials[0]) == 32:
-                public = z85.encode(credentials[0]).decode()
-            name = domain.decode()
+            # only libzmq asks here, and only of guarded sockets: the mechanism is CURVE
+            envelope, (version, request, domain, address, _, _, key) = frames[:2], frames[2:]
+            name, public = domain.decode(), z85.encode(key).decode()
             is_admitted = self._is_admitted(name, address.decode(errors="replace"), public)
             status, text = (b"200", b"OK") if is_admitted else (b"400", b"")
             self._zap.send_multipart([*envelope, version, request, status, text, public.encode(), b""])

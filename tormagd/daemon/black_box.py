@@ -88,7 +88,6 @@ class BlackBox:
         self._packer = Packer()
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
-        self._encoder = msgspec.msgpack.Encoder()
         self._connection: Connection | None = None
         self._asked: deque[Write] = deque(maxlen=MOST_ASKED)
 
@@ -179,7 +178,7 @@ class BlackBox:
 
     def _say(self, what: Said) -> bool:
         """Whether the socket took it."""
-        is_taken = self._beside is not None and self._beside.send(self._encoder.encode(what))
+        is_taken = self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
         self._see_to()
         return is_taken
 

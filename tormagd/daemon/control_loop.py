@@ -64,7 +64,5 @@ class ControlLoop:
     def new_faults(self) -> tuple[Fault, ...]:
         """The faults that were latched since this was last asked."""
         faults, known = self.stepper.safety.faults, self._known_faults
-        if faults == known:
-            return ()
         self._known_faults = faults
         return tuple(fault for fault in faults if fault not in known)

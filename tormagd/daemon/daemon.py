@@ -109,7 +109,7 @@ class Daemon:
         self._phases.begin(
             [
                 ("receive", self._receive),
-                ("requests", telemetry.take_requests),
+                ("requests", lambda _beat: self._endpoint.take_requests(telemetry.command)),
                 ("plan", self._plan),
                 ("drive", self._drive),
                 ("record", telemetry.record),
@@ -175,8 +175,8 @@ class Daemon:
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
         if timing.delay_ns > timing.period_ns:
-            first_due_ns = beat.due_ns - beat.merged * timing.period_ns
-            self._causes.note_stall(control.stepper, self._phases.blame(first_due_ns))
+            # it was late from when the first of those was due that it stands for
+            self._causes.note_stall(control.stepper, self._phases.blame(beat.due_ns - beat.merged * timing.period_ns))
         else:
             self._phases.on_time()
         if faults := control.new_faults():
@@ -204,7 +204,8 @@ class Daemon:
             log.error("the configuration stays as it was: %s", error)
             return
         self._config = again.config
-        self._telemetry.take_over(again.config)
+        self._telemetry.config = again.config
+        self._endpoint.inbox.priority = again.config.sources.priority
         log.info(
             "configuration read again: %s", f"now in force: {', '.join(again.taken)}" if again.taken else "no news"
         )

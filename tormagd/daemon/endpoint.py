@@ -259,8 +259,8 @@ class Endpoint:
         try:
             request = decode(waiting.data, Request)
         except MessageError as error:
-            told = ErrorReply("bad_request", str(error), "see the message table in the README")
-            return Reply(v=VERSION, id=None, ok=False, error=told)
+            why = ErrorReply("bad_request", str(error), "see the message table in the README")
+            return Reply(v=VERSION, id=None, ok=False, error=why)
         return self._carried_out(request, waiting, answer)
 
     def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:

@@ -74,7 +74,6 @@ class Profiles:
 
     def __init__(self, folder: ProfileFolder | None, believe: Believe, teach: Callable[[Learned], None]) -> None:
         self._folder, self._believe, self._teach = folder, believe, teach
-        self._loop = asyncio.get_running_loop()
         self._serial_number: int | None = None
         self._was_driven = False
         self._writing: asyncio.Future[None] | None = None
@@ -94,7 +93,9 @@ class Profiles:
             self._on_disk, self.digest = None, ""
             if self._folder is not None:
                 self._refusal = ""
-                self._loop.run_in_executor(None, self._folder.read, serial_number).add_done_callback(self._take)
+                asyncio.get_running_loop().run_in_executor(None, self._folder.read, serial_number).add_done_callback(
+                    self._take
+                )
         if self._is_used and self._believe.is_contradicted:
             self._is_used, self._refusal = False, "the device's first slide shows another one"
             log.warning("the profile is dropped: %s", self._refusal)
@@ -119,7 +120,7 @@ class Profiles:
             saved_ns=now_ns,
         )
         self._saved_ns, self._on_disk = now_ns, learned
-        self._writing = self._loop.run_in_executor(None, self._folder.write, profile)
+        self._writing = asyncio.get_running_loop().run_in_executor(None, self._folder.write, profile)
         self._writing.add_done_callback(self._note)
 
     async def finished(self) -> None:
@@ -129,10 +130,9 @@ class Profiles:
 
     def report(self) -> ProfileReport:
         """Whether the device's profile is used, how old it is, and why not."""
-        saved_ns = self._saved_ns
         return ProfileReport(
             is_used=self._is_used,
-            age_s=None if saved_ns is None else round(max(0.0, (time.time_ns() - saved_ns) * 1e-9), 1),
+            age_s=None if self._saved_ns is None else round(max(0.0, (time.time_ns() - self._saved_ns) * 1e-9), 1),
             refusal=self._refusal,
             folder="" if self._folder is None else str(self._folder.folder),
         )

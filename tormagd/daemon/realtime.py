@@ -32,8 +32,7 @@ def prepare(settings: RealTime) -> list[str]:
             refused.append(f"realtime.cpus = {list(settings.cpus)}: {error.strerror}")
     if settings.fifo_priority:
         try:
-            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-            os.sched_setscheduler(0, policy, os.sched_param(settings.fifo_priority))
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(settings.fifo_priority))
         except OSError as error:
             refused.append(f"realtime.fifo_priority = {settings.fifo_priority}: {error.strerror}; see LimitRTPRIO")
     ask_for_slices()

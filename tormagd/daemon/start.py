@@ -28,9 +28,7 @@ def start(options: argparse.Namespace) -> int:
     """Returns the exit code: 0 ended on request, 1 could not run. Raises ConfigError for what is refused."""
     try:
         config = _configured(options)
-        # the daemon's keys where an endpoint demands them
-        is_guarded = any(config.endpoints.is_guarded(name) for name in ENDPOINTS)
-        keys = KeyRing(config.endpoints) if is_guarded else None
+        keys = KeyRing(config.endpoints) if any(map(config.endpoints.is_guarded, ENDPOINTS)) else None
         core = build_core(config)
         backend = choose(config.device, config.rates)
     except ConfigError as error:

@@ -77,7 +77,9 @@ class TelemetryLoop:
         box: BlackBox,
         not_granted: list[str],
     ) -> None:
-        self._config, self._core, self._not_granted = config, core, tuple(not_granted)
+        self.config = config
+        "Another one may take its place, of which only what a loop looks at each time may differ."
+        self._core, self._not_granted = core, tuple(not_granted)
         self._control, self._inference, self._profiles = control, inference, profiles
         self._connection, self._endpoint = connection, endpoint
         self._phases, self._causes, self._box = phases, causes, box
@@ -134,8 +136,7 @@ class TelemetryLoop:
             endpoint.publish_ticks(list(self._ticks))
         self._ticks.clear()
         # before anything is learned of a new device
-        link = self._connection.link
-        identity = None if link is None else link.identity
+        identity = None if self._connection.link is None else self._connection.link.identity
         self._profiles.look(
             None if identity is None else identity.serial_number, self._control.stepper.safety.is_driven
         )
@@ -160,15 +161,9 @@ class TelemetryLoop:
 
     def serve(self, _beat: Beat) -> bool:
         """Answers a few of the requests that waited at the last snapshot; False where there are none."""
-        if not self._answers:
-            return False
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
-
-    def take_requests(self, _beat: Beat) -> None:
-        """Takes the requests that have arrived: `stop` and `disable` are carried out, the rest waits for `serve`."""
-        self._endpoint.take_requests(self._command)
 
     def keep(self, reason: str, after_s: float) -> Path:
         """Has a black box written, with what comes `after_s` later; where it will be. Raises RefusedError."""
@@ -184,7 +179,7 @@ class TelemetryLoop:
         """What a command is decided on now."""
         return conditions(
             time.monotonic(),
-            self._config,
+            self.config,
             self._connection,
             self._control.stepper,
             self._control.output,
@@ -213,18 +208,13 @@ class TelemetryLoop:
         believed = beliefs(planner, stepper, now_s, terms_of(self._core.scene))
         return snapshot(self._ticks[-1], self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed)
 
-    def take_over(self, config: Config) -> None:
-        """Goes on with another configuration, of which only what a loop looks at each time may differ."""
-        self._config = config
-        self._endpoint.inbox.priority = config.sources.priority
-
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
         """Says to systemd how it stands, and feeds its watchdog while plans and device states are fresh."""
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
         is_alive = service.is_alive(
             now_s,
-            self._config.realtime.watchdog_ms * 1e-3,
+            self.config.realtime.watchdog_ms * 1e-3,
             plan.time_s if plan.number else None,
             link,
             None if measurement is None else measurement.received_s,
@@ -256,7 +246,7 @@ class TelemetryLoop:
             if self._status is None:
                 self._status = msgspec.Raw(msgspec.msgpack.encode(self._build_status(self._newest)))
             return self._status
-        return self._describe() if request.command == "describe" else self._command(request)
+        return self._describe() if request.command == "describe" else self.command(request)
 
     def _describe(self) -> Any:
         link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
@@ -264,7 +254,7 @@ class TelemetryLoop:
         description = Description(
             version=__version__,
             build=str(settle()),
-            configuration=msgspec.to_builtins(self._config),
+            configuration=msgspec.to_builtins(self.config),
             scene=msgspec.to_builtins(self._core.scene),
             model=self._core.model,
             profile=self._profiles.report(),
@@ -277,7 +267,8 @@ class TelemetryLoop:
         )
         return msgspec.to_builtins(description)
 
-    def _command(self, request: Request) -> dict[str, Any]:
+    def command(self, request: Request) -> dict[str, Any]:
+        """Carries out what is no question. Raises RefusedError."""
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
             return self._give(request.args.get("source"))
