@@ -186,6 +186,9 @@ def test_a_scene_is_checked_as_the_daemon_does(ctl):
     assert result["least_N"] == pytest.approx(0.157, abs=0.01)
     assert 0.0 < result["core_share"] < result["core_share_allowed"]
     assert result["missed_rms_N"] < 0.001
+    waits_N, comes_s = zip(*result["approaches_s"], strict=True)
+    assert list(waits_N) == sorted(waits_N)
+    assert list(comes_s) == sorted(comes_s, reverse=True)
 
 
 def test_a_decision_is_explained_with_what_was_measured(ctl):

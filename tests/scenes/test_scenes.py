@@ -170,6 +170,8 @@ def test_a_refusal_names_file_key_value_and_what_is_allowed(
         ({"handle__most_mm_s": "400.0"}, ("handle.most_mm_s = 400", "0.46..310", "trained on")),
         ({"force__most_N": "40.0"}, ("force.most_N = 40", "allowed is 0.65..")),
         ({"force__most_N": "0.1"}, ("force.most_N = 0.1", "allowed is 0.65..")),
+        ({"force__standby_N": "0.6"}, ("force.standby_N = 0.6", "allowed is above 0.649")),
+        ({"force__standby_N": "1.0"}, ("force.standby_N = 1", "to 0.949")),
         ({"signal__bandwidth_hz": "100.0"}, ("they miss it by",)),
         ({"solver__name": '"bisection"'}, ("solver.name", "bisection", "newton")),
         ({"solver__step_mT": "5.0"}, ("solver.step_mT", "5.0", "auto")),

@@ -259,6 +259,17 @@ def _slowed(config: Config, scene: Scene) -> Config:
     return msgspec.structs.replace(config, position=msgspec.structs.replace(position, gap_speed_mm_s=asked_mm_s))
 
 
+def approaches_s(core: Core) -> list[tuple[float, float]]:
+    """What a brake may wait at, N, and how long its gap takes from there to the middle of the scene's forces, s: where
+    the scene lets it wait, and with STANDBY_N in three steps. Of a pad there is nothing to tell."""
+    if core.scene.element == "tactile":
+        return []
+    reach, force = core.portrait, core.scene.force
+    waits_N = [max(force.waiting_N, reach.min_N), *(reach.min_N + share * STANDBY_N for share in (1 / 3, 2 / 3, 1.0))]
+    middle_mm = reach.gap_mm_at((waits_N[0] + force.most_N) / 2.0)
+    return [(wait_N, (reach.gap_mm_at(wait_N) - middle_mm) / core.gap_speed_mm_s) for wait_N in waits_N]
+
+
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
     """The smallest difference of force that the device makes and measures, up to this force."""
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))

@@ -9,7 +9,7 @@ from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.process import answer_of
 from tormagd.scenes.measured import Measured, MeasuredScene, is_met, measured, on_first, required
-from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
+from tormagd.scenes.scene import Force, Scene, load_scene, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 30.0
@@ -113,12 +113,25 @@ def check_scene(name: str, config: Path | None) -> Outcome:
             if signal is not None and signal.setpoint_hz is not msgspec.UNSET
             else []
         ),
+        *_waiting(force, derived["approaches_s"]),
         "cost       not measured: docs/guides/scene.md says how"
         if share is None
         else f"cost       {share:.1%} of a processor, {scene.budget.core_share:.0%} are allowed",
     ]
     result = {"scene": scene.name, "core_share": share, "core_share_allowed": scene.budget.core_share} | derived
     return Outcome(result, "\n".join(lines))
+
+
+def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
+    """How soon a force comes from where the brake waits, and from nearer."""
+    if not approaches_s:
+        return []
+    (wait_N, now_s), *nearer = approaches_s
+    others = ", ".join(f"{standby_N:.2f} N {later_s:.2f} s" for standby_N, later_s in nearer)
+    return [
+        f"waiting    at {wait_N:.2f} N: {(wait_N + force.most_N) / 2.0:.2f} N come after {now_s:.2f} s; with "
+        f"force.standby_N, which is felt as drag: {others}"
+    ]
 
 
 def explain_scene(name: str, config: Path | None) -> Outcome:

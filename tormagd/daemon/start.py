@@ -8,7 +8,7 @@ from functools import partial
 import msgspec
 import uvloop
 
-from tormagd.assembly.build import Core, at_rates_of, build_core, least_resolution_N
+from tormagd.assembly.build import Core, approaches_s, at_rates_of, build_core, least_resolution_N
 from tormagd.config import Config, load_config
 from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.daemon import Daemon
@@ -85,6 +85,7 @@ def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> None
             "least_resolution_N": least_resolution_N(core.portrait, core.scene.force.most_N),
             "missed_rms_N": None if core.missed is None else core.missed.rms_N,
             "missed_share": None if core.missed is None else core.missed.share,
+            "approaches_s": approaches_s(core),
         },
         "backends": {name: reason or "loads" for name, reason in installed().items()},
     }
