@@ -1,0 +1,121 @@
+"""Blinded trials: which of two walls was the stiffer one? Randomised, by a seed that the file keeps.
+
+    python trials.py FOLDER OUT.csv [--pairs N] [--seed S]
+
+FOLDER is where the daemon's sockets are; somebody has enabled it, and its scene says withdrawing what it likes. The
+operator pushes the handle into the first wall, draws back, pushes into the second one, and answers 1 or 2. Who asks
+does not know either: the order is drawn, and stands in OUT.csv only after the answer. A pair that is interrupted is
+not written. At the end: how often each difference of stiffness was told, with a 95 % interval (Wilson).
+"""
+
+import argparse
+import csv
+import itertools
+import math
+import random
+import sys
+import threading
+from collections.abc import Callable
+
+from tormagd_client import Client, ClientError
+
+REFERENCE_N_MM = 0.3
+RATIOS = (1.1, 1.22, 1.5, 2.0)
+"The other wall's stiffness over the reference's: around the just noticeable difference, 22 %."
+WALL_MM = 20.0
+"From where the handle is when a wall is offered."
+PERIOD_S = 0.01
+
+
+class Wall(threading.Thread):
+    """Offers one wall from its own client until it is told to end."""
+
+    def __init__(self, folder: str, stiffness_N_mm: float) -> None:
+        super().__init__(daemon=True)
+        self._folder, self._stiffness_N_mm = folder, stiffness_N_mm
+        self._ended = threading.Event()
+        self.error: ClientError | None = None
+
+    def run(self) -> None:
+        """See Thread.run."""
+        try:
+            with Client.local(self._folder, wait_s=2.0, source="trials") as client:
+                start_mm = None
+                while not self._ended.wait(PERIOD_S):
+                    for state in client.telemetry():
+                        start_mm = state.handle_mm if start_mm is None else start_mm
+                    if start_mm is not None:
+                        contact = {"handle_mm": start_mm + WALL_MM, "stiffness_N_mm": self._stiffness_N_mm}
+                        client.publish(0.0, 200.0, contact=contact, withdraw_cf=0.0)
+        except ClientError as error:
+            self.error = error
+
+    def end(self) -> None:
+        """Waits until nothing is published any more. Raises ClientError where it could not be."""
+        self._ended.set()
+        self.join()
+        if self.error is not None:
+            raise self.error
+
+
+def pairs(count: int, seed: int) -> list[tuple[float, bool]]:
+    """So many ratios, each as often as the others, and whether the stiffer wall comes first: in a drawn order."""
+    drawn = random.Random(seed)
+    all_pairs = [pair for pair, _ in zip(itertools.cycle(itertools.product(RATIOS, (True, False))), range(count))]
+    drawn.shuffle(all_pairs)
+    return all_pairs
+
+
+def interval(right: int, count: int) -> tuple[float, float]:
+    """The 95 % interval of a share, Wilson's."""
+    z, share = 1.96, right / count
+    middle, half = share + z * z / (2 * count), z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    return (middle - half) / (1 + z * z / count), (middle + half) / (1 + z * z / count)
+
+
+def offered(folder: str, stiffness_N_mm: float, number: int, say: Callable[[str], str]) -> None:
+    """One wall, until the operator is done with it."""
+    wall = Wall(folder, stiffness_N_mm)
+    wall.start()
+    say(f"  wall {number}: push, draw back to where you began, then press Enter ")
+    wall.end()
+
+
+def run(folder: str, writer: Callable[[list[object]], object], trials: list[tuple[float, bool]], say: Callable[[str], str]) -> dict[float, list[bool]]:
+    """All pairs; for each ratio, whether the stiffer wall was told."""
+    told: dict[float, list[bool]] = {ratio: [] for ratio in RATIOS}
+    for number, (ratio, is_first) in enumerate(trials, start=1):
+        print(f"pair {number} of {len(trials)}")
+        stiffer_N_mm = ratio * REFERENCE_N_MM
+        for place, stiffness_N_mm in enumerate((stiffer_N_mm, REFERENCE_N_MM) if is_first else (REFERENCE_N_MM, stiffer_N_mm), start=1):
+            offered(folder, stiffness_N_mm, place, say)
+        while (answer := say("  which was stiffer, 1 or 2? ").strip()) not in ("1", "2"):
+            pass
+        told[ratio].append((answer == "1") == is_first)
+        writer([number, ratio, 1 if is_first else 2, answer])
+    return told
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder")
+    parser.add_argument("out")
+    parser.add_argument("--pairs", type=int, default=16)
+    parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(1_000_000))
+    options = parser.parse_args()
+    with open(options.out, "x", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow([f"trial (seed {options.seed})", "ratio", "stiffer", "answer"])
+        try:
+            told = run(options.folder, rows.writerow, pairs(options.pairs, options.seed), input)
+        except ClientError as error:
+            sys.exit(str(error))
+    for ratio, answers in told.items():
+        if answers:
+            low, high = interval(sum(answers), len(answers))
+            print(f"{ratio:g} times as stiff: told {sum(answers)} of {len(answers)}, {low:.0%} to {high:.0%}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""The blinded trials: balanced, in a drawn order, and counted as told."""
+
+import runpy
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+names = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "python" / "trials.py"))
+trials = SimpleNamespace(**names)
+
+
+def test_each_pair_is_offered_as_often_as_the_others_in_an_order_of_the_seed() -> None:
+    offered = trials.pairs(16, 1)
+    assert set(Counter(offered).values()) == {2}
+    assert offered == trials.pairs(16, 1) != trials.pairs(16, 2)
+
+
+def test_what_is_told_counts_by_the_order_that_was_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    walls: list[float] = []
+    rows: list[list[object]] = []
+    monkeypatch.setitem(
+        trials.run.__globals__, "offered", lambda folder, stiffness_N_mm, number, say: walls.append(stiffness_N_mm)
+    )
+    answers = iter(["1", "neither", "1"])
+    told = trials.run("folder", rows.append, [(2.0, True), (1.5, False)], lambda question: next(answers))
+    assert walls == pytest.approx([0.6, 0.3, 0.3, 0.45])
+    assert (told[2.0], told[1.5]) == ([True], [False])
+    assert rows == [[1, 2.0, 1, "1"], [2, 1.5, 2, "1"]]
+
+
+def test_the_interval_of_a_share_is_wilsons() -> None:
+    assert trials.interval(8, 10) == pytest.approx((0.490, 0.943), abs=1e-3)
