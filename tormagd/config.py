@@ -35,7 +35,7 @@ class Device(Strict, frozen=True):
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0
     "Oldest device state the controller accepts while it drives; from some milliseconds on it only holds the gap."
-    retract_mm_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 15.0
+    retract_mm_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 15.0
     "What the firmware does without us: how fast a carriage opens, stated here for scenes to be checked against."
 
     def __post_init__(self) -> None:

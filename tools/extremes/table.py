@@ -30,6 +30,7 @@ from tormagd.control.ask.forecast import Forecast
 from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.path import TIMES_S, Path
 from tormagd.control.ask.skill import Skill
+from tormagd.control.ask.way import Way
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.freshness import Freshness
@@ -53,7 +54,7 @@ from tormagd.control.move.pid import Pid
 from tormagd.control.move.reference import Reference, Speeds, follow, target_of
 from tormagd.control.move.watch import Watch
 from tormagd.control.plausible import is_outside, leap_between
-from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint
+from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.sight import Sight
 from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_quality import LinkQuality
@@ -141,9 +142,11 @@ def measured(draw: Draw) -> Measured:
 
 
 def setpoint(draw: Draw) -> TimedSetpoint:
-    """A force of about 1.2 N, in a third of the steps with a preview."""
+    """A force of about 1.2 N, in a third of the steps with a preview, in a quarter with a wall."""
     preview = tuple([draw(1.2) for _ in range(8)]) if draw.steps % 3 == 0 else ()
     made = TimedSetpoint(draw(1.2), draw(draw.now_s), draw(0.1), None, None, preview, draw(0.05) if preview else 0.0)
+    if draw.steps % 4 == 1:
+        made = made.replaced(withdraw_N=draw(0.5), wall=Wall(draw(5.0), draw(0.3), draw(0.5)))
     return made.replaced(displacement_mm=draw(MOBILISED_MM), rate_mm_s=draw(42.0)) if draw.steps % 2 else made
 
 
@@ -286,8 +289,13 @@ def memory(stage: ElementMemory, draw: Draw) -> object:
 # -- ask -----------------------------------------------------------------------------------------------------------
 
 
+def way(stage: Way, draw: Draw) -> object:
+    return stage.update(measured(draw), draw.steps % 2 > 0)
+
+
 def governor(stage: Governor, draw: Draw) -> object:
-    asked = stage.update(draw.now_s, setpoint(draw), UNSEEN, abs(draw.bounded(0.02)))
+    travel = Travel(draw.bounded(6.0), draw.bounded(20.0), draw.steps % 3 > 0)
+    asked = stage.update(draw.now_s, setpoint(draw), UNSEEN, abs(draw.bounded(0.02)), travel)
     stage.foresee()
     return asked
 
@@ -552,6 +560,7 @@ def stages() -> list[Stage]:
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT, PLAN_S),
         Stage("believe/memory", lambda: planner().believe.memory, memory, MEASUREMENT, PLAN_S),
+        Stage("ask/way", lambda: Way(-1), way, MEASUREMENT, PLAN_S),
         Stage("ask/governor", lambda: planner().governor, governor, OWN, PLAN_S),
         Stage("ask/forecast", Forecast, forecast, SETPOINT),
         Stage("ask/path", lambda: Path(made.portrait, 38.0), path),

@@ -100,9 +100,9 @@ class Governor:
         """Return what is asked of `device` at `now_s`.
 
         `setpoint` is None without a publisher. `travel` is the handle's. `lag_s` is the carriages' lag: what is known
-        ahead is looked at this
-        much further on. A setpoint that jumps is followed at once, within the scene's and the device's bounds. Decay to
-        F_min without a valid setpoint, and takeover by a new publisher, go at the scene's release rate.
+        ahead is looked at this much further on. A setpoint that jumps is followed at once, within the scene's and the
+        device's bounds. Decay to F_min without a valid setpoint, and takeover by a new publisher, go at the scene's
+        release rate; so does what one wall asks for beside the next.
 
         Raises DomainError for a number that is not finite or beyond LARGEST, and for a preview without `preview_dt_s` >
         0.
@@ -127,19 +127,18 @@ class Governor:
         heard_N = min(max(setpoint.force_N, self._min_N), self._max_N)
         self._hear(setpoint, heard_N, force_N, device)
         bounds = min(max(self._min_N, lowest_N), highest_N), min(max(self._max_N, lowest_N), highest_N)
-        governed_N, foresight = force_N, 1.0
+        foresight = 1.0
         if setpoint.wall is not None or (setpoint.withdraw_N is not None and not travel.is_pushing):
             self._foreseen(setpoint.stamp_s, heard_N, age_s)
             path_N = self._against(setpoint.wall, travel, dt_s, force_N, bounds, device, lag_s)
-            governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
         elif setpoint.preview_N:
             path_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
-            governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
         else:
             foresight = self._foreseen(setpoint.stamp_s, heard_N, age_s)
             path_N = self._continued(max(age_s, 0.0), dt_s, force_N, foresight, bounds, device, lag_s)
         if self.blend_N != 0.0 and setpoint.wall is None:
             path_N = [within(each_N + self.blend_N, bounds) for each_N in path_N]
+        governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
         if abs(governed_N - force_N) > OUTRUN_N:
             limits = (*limits, Limit.RATE)
         if self.is_passing and self._passes(path_N[0], dt_s):
@@ -176,6 +175,7 @@ class Governor:
             wall = setpoint.wall
             self.blend_N += before_N - (setpoint.force_N if wall is None else wall.force_N(travel.place_mm))
         self.wall = setpoint.wall
+        # one that withdraws is let go at once
         left_N = max(abs(self.blend_N) - self._release_N_s * dt_s, 0.0) if travel.is_pushing else 0.0
         self.blend_N = math.copysign(left_N, self.blend_N)
         return self.blend_N
@@ -327,10 +327,14 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         and -_LARGEST <= setpoint.valid_for_s <= _LARGEST
         and -_LARGEST <= (setpoint.displacement_mm or 0.0) <= _LARGEST
         and -_LARGEST <= (setpoint.rate_mm_s or 0.0) <= _LARGEST
+        and -_LARGEST <= (setpoint.withdraw_N or 0.0) <= _LARGEST
     ):
-        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s"):
+        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N"):
             require_number(name, getattr(setpoint, name) or 0.0)
         require_number("age_s", age_s)
+    if setpoint.wall is not None:
+        for name in ("place_mm", "stiffness_N_mm", "friction_N"):
+            require_number(name, getattr(setpoint.wall, name))
     if not setpoint.preview_N:
         return
     if not 0.0 < setpoint.preview_dt_s <= _LARGEST:
