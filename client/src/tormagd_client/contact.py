@@ -1,0 +1,105 @@
+"""The wall that a robot's tip touches, estimated from its place and its force: what a setpoint's `contact` says.
+
+    F = f + k max(x - x0, 0)     x tip's place on the handle's way, mm; F force, N; f friction, k stiffness, x0 the wall
+
+A line through the points of the way in, by recursive least squares that forget. The variances are the residuals'.
+"""
+
+import math
+
+from tormagd_client.messages import MAX_STIFFNESS_N_MM, Contact
+
+SETTLES = 20
+"Samples of a point: a running mean takes the noise of place and force off."
+STEP_MM = 0.2
+"A point for so much of the way: a tip that rests teaches nothing, and makes nothing forgotten."
+KEPT, LEAST = 0.98, 6
+"Of the points before, at each new one; and so many points a line takes."
+TOUCHES_N = 0.1
+"More than friction by this is a wall."
+OFF, STRIKES = 5.0, 3
+"Deviations from the line, and so many points in a row: the wall is another one."
+MOST_SHARE, MOST_MM = 0.2, 0.5
+"Standard deviations of stiffness and place, from which on there is no wall to tell."
+
+
+class ContactEstimator:
+    """Takes samples of 20 mN and 0.2 mm of noise, some hundred a second. A wall that has moved is learned anew."""
+
+    def __init__(self) -> None:
+        self._mean_mm = self._mean_N = 0.0
+        self._samples = self._strikes = self._free = 0
+        self._point_mm = math.inf
+        self.friction_N = 0.0
+        "On the way in, before the wall."
+        self._begin()
+
+    @property
+    def contact(self) -> Contact | None:
+        """The wall; None while it is not known well enough: then send forces."""
+        slope_N_mm, place_mm, slope_sd, place_sd_mm, _ = self._line()
+        if not (slope_sd <= MOST_SHARE * slope_N_mm and place_sd_mm <= MOST_MM):
+            return None
+        stiffness_N_mm = min(slope_N_mm, MAX_STIFFNESS_N_MM)
+        return Contact(handle_mm=place_mm, stiffness_N_mm=stiffness_N_mm, friction_N=max(self.friction_N, 0.0))
+
+    def update(self, tip_mm: float, force_N: float, way: float) -> None:
+        """One sample. `tip_mm` counts as the handle's place does, `force_N` resists the way in, and `way` is above 0
+        while the tip goes in or is held: out of the wall, friction is another one."""
+        if way <= 0.0:
+            self._samples, self._point_mm = 0, math.inf
+            return
+        self._samples = min(self._samples + 1, SETTLES)
+        self._mean_mm += (tip_mm - self._mean_mm) / self._samples
+        self._mean_N += (force_N - self._mean_N) / self._samples
+        if self._samples == SETTLES and abs(self._mean_mm - self._point_mm) > STEP_MM:
+            self._point_mm = self._mean_mm
+            self._take(self._mean_mm, self._mean_N)
+
+    def _begin(self) -> None:
+        self._weight = self._at_mm = self._at_N = 0.0
+        self._mm2 = self._mm_N = self._N2 = 0.0
+        "Weighted means, and sums of squares around them."
+
+    def _take(self, place_mm: float, force_N: float) -> None:
+        if self._is_off(place_mm, force_N):
+            return
+        if self._free < LEAST or force_N - self.friction_N < TOUCHES_N:
+            self._free += 1
+            self.friction_N += (force_N - self.friction_N) / min(self._free, SETTLES)
+            return
+        for name in ("_weight", "_mm2", "_mm_N", "_N2"):
+            setattr(self, name, KEPT * getattr(self, name))
+        self._weight += 1.0
+        off_mm, off_N = place_mm - self._at_mm, force_N - self._at_N
+        self._at_mm += off_mm / self._weight
+        self._at_N += off_N / self._weight
+        self._mm2 += off_mm * (place_mm - self._at_mm)
+        self._mm_N += off_mm * (force_N - self._at_N)
+        self._N2 += off_N * (force_N - self._at_N)
+
+    def _is_off(self, place_mm: float, force_N: float) -> bool:
+        """Whether a point is none of the wall's. Forgets a wall with which one after the other does not agree."""
+        slope_N_mm, wall_mm, _, _, sd_N = self._line()
+        is_off = False
+        if slope_N_mm > 0.0:
+            felt_N = force_N - self.friction_N
+            off_mm = place_mm - wall_mm - max(felt_N, 0.0) / slope_N_mm
+            most_mm = max(max(OFF * sd_N, TOUCHES_N) / slope_N_mm, STEP_MM)
+            # before the wall nothing is felt
+            is_off = off_mm > most_mm or (felt_N > TOUCHES_N and off_mm < -most_mm)
+        self._strikes = self._strikes + 1 if is_off else 0
+        if self._strikes == STRIKES:
+            self._strikes = 0
+            self._begin()
+        return is_off
+
+    def _line(self) -> tuple[float, float, float, float, float]:
+        """Slope, the wall's place, the standard deviations of both, and of a point from the line."""
+        if self._weight < LEAST * KEPT**LEAST or self._mm_N <= 0.0:
+            return 0.0, 0.0, math.inf, math.inf, math.inf
+        slope_N_mm = self._mm_N / self._mm2
+        sd_N = math.sqrt(max(self._N2 - slope_N_mm * self._mm_N, 0.0) / (self._weight - 2.0))
+        before_mm = (self._at_N - self.friction_N) / slope_N_mm
+        place_sd_mm = sd_N / slope_N_mm * math.sqrt(1.0 / self._weight + before_mm * before_mm / self._mm2)
+        return slope_N_mm, self._at_mm - before_mm, sd_N / math.sqrt(self._mm2), place_sd_mm, sd_N
