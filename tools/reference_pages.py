@@ -10,7 +10,7 @@ import itertools
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -136,6 +136,8 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
 def _allowed(hint: Any) -> str:
     inner, *metas = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
     elements = [each for each in get_args(inner) if each is not ...]
+    if get_origin(inner) is Literal:
+        return ", ".join(map(str, elements))
     if getattr(inner, "__origin__", None) is tuple:
         return f"list of: {_allowed(elements[0])}"
     bounds = [

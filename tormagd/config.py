@@ -62,7 +62,7 @@ class Handle(Strict, frozen=True):
     """The handle of the brake."""
 
     push_sign: Literal[1, -1] = 1
-    "1 where pushing on moves the handle to greater places of its encoder, as in `handle_mm`; else -1."
+    "1 where pushing on moves the handle to greater places of its encoder, else -1."
 
 
 class Rates(Strict, frozen=True):
@@ -74,6 +74,8 @@ class Rates(Strict, frozen=True):
     "Plans that are made at the least; a setpoint is planned for in the next tick. Below 83 the thesis was faster."
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
     "Messages: as often as an eye sees, and no load."
+    motion_hz: Annotated[int, Meta(ge=1, le=4_000)] = 500
+    "Of the topic `motion`, for whoever subscribes; no more than `control_hz`."
     of_scene: bool = False
     "Whether the daemon runs at the rates that its scene needs, in place of these two; control at 500 Hz at the least."
 

@@ -16,7 +16,18 @@ import pytest
 import zmq
 
 from tormagd.ctl.main import main
-from tormagd_client.messages import VERSION, Setpoint, Telemetry, Tick, decode, encode
+from tormagd_client.messages import (
+    MOTION_TOPIC,
+    VERDICT_TOPIC,
+    VERSION,
+    Motion,
+    Setpoint,
+    Telemetry,
+    Tick,
+    Verdict,
+    decode,
+    encode,
+)
 
 COLUMNS = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "left_duty", "right_duty")
 
@@ -48,6 +59,9 @@ def telemetry(seq: int, t_ns: int, **changes: Any) -> Telemetry:
     }
     return Telemetry(**(known | changes))
 
+
+MOTION = Motion(v=VERSION, t_ns=7, device_s=0.5, handle_mm=3.0, handle_mm_s=-20.0)
+VERDICT = Verdict(v=VERSION, t_ns=8, source="me", seq=3, outcome="cannot", arrives_ms=None, why=("F_MAX",))
 
 LINK: dict[str, Any] = {
     "state": "RUNNING",
@@ -224,6 +238,8 @@ class FakeDaemon(threading.Thread):
                 continue
             t_ns = start_ns + seq * 20_000_000
             telemetry_out.send(encode(telemetry(seq, t_ns)))
+            telemetry_out.send_multipart([MOTION_TOPIC, encode(MOTION)])
+            telemetry_out.send_multipart([VERDICT_TOPIC, encode(VERDICT)])
             rows = [(t_ns + k * 1_000_000, 1.5, 1.5, 1.5 + 0.1 * math.sin(k), 35.0, 36.0, 0.1, -0.1) for k in range(20)]
             recording.send(msgpack.packb({"v": VERSION, "columns": COLUMNS, "rows": rows}))
             for data in self.rubbish:

@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from itertools import repeat
 from typing import Any
 
@@ -12,6 +12,7 @@ import pytest
 from tormagd_client import Client, ClientError, InFaultError, RefusedError, SettingError, UnreachableError
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import ConfigError, Curve, Endpoints, in_folder
+from tormagd_client.messages import Contact, Motion
 
 PATIENCE_S = 20.0
 
@@ -30,12 +31,16 @@ class Blocking:
         return lambda *arguments, **named: self._runner.run(getattr(self._client, name)(*arguments, **named))
 
     def telemetry(self, wait_s: float) -> list[Any]:
-        async def first() -> list[Any]:
-            async for message in self._client.telemetry():
-                return [message]
-            return []
+        return self._first(self._client.telemetry(), wait_s)
 
-        return self._runner.run(asyncio.wait_for(first(), wait_s))
+    def motions(self, wait_s: float) -> list[Any]:
+        return self._first(self._client.motions(), wait_s)
+
+    def verdicts(self, wait_s: float) -> list[Any]:
+        return self._first(self._client.verdicts(), wait_s)
+
+    def _first(self, heard: AsyncIterator[Any], wait_s: float) -> list[Any]:
+        return [self._runner.run(asyncio.wait_for(anext(heard), wait_s))]
 
     def close(self) -> None:
         self._client.close()
@@ -164,9 +169,30 @@ def test_a_daemon_that_has_gone_takes_no_setpoints(run_dir, fake_daemon, kind):
     client.close()
 
 
-def test_telemetry_is_typed(client):
+def test_a_law_of_the_handles_way_is_published_as_a_contact_or_what_has_its_names(client, fake_daemon):
+    wall = Contact(handle_mm=12.0, stiffness_N_mm=0.5)
+    client.publish(0.4, withdraw_cf=0.1, contact=wall)
+    client.publish(0.4, contact={"handle_mm": 12.0, "stiffness_N_mm": 0.5, "friction_N": 0.1})
+    with pytest.raises(ValueError, match=r"contact\.stiffness_N_mm = -1\.0: allowed is 0\.\.100"):
+        client.publish(0.4, contact={"handle_mm": 12.0, "stiffness_N_mm": -1.0})
+    with pytest.raises(ValueError, match=r"contact = \{'place': 12\.0\}: .*place"):
+        client.publish(0.4, contact={"place": 12.0})
+    until_s = time.monotonic() + PATIENCE_S
+    while len(fake_daemon.setpoints) < 2 and time.monotonic() < until_s:
+        client.request("status")
+    first, second = fake_daemon.setpoints
+    assert (first.withdraw_cf, first.contact, second.withdraw_cf) == (0.1, wall, None)
+    assert second.contact == Contact(handle_mm=12.0, stiffness_N_mm=0.5, friction_N=0.1)
+
+
+def test_telemetry_is_typed_and_each_topic_has_its_own(client):
     newest = client.telemetry(PATIENCE_S)
     assert (newest[0].operating_state, newest[0].measured_jp) == ("ENABLED", (35.0, 35.0))
+    assert client.motions(PATIENCE_S)[0] == Motion(v=1, t_ns=7, device_s=0.5, handle_mm=3.0, handle_mm_s=-20.0)
+    (verdict, *_) = client.verdicts(PATIENCE_S)
+    assert (verdict.source, verdict.seq, verdict.outcome, verdict.arrives_ms) == ("me", 3, "cannot", None)
+    for _ in range(3):
+        assert client.telemetry(PATIENCE_S)[0].seq >= newest[0].seq
 
 
 @pytest.mark.parametrize("call", [lambda it: it.request("status"), lambda it: it.publish(1.0)])

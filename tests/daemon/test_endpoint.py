@@ -18,7 +18,19 @@ from tormagd.daemon.endpoint import DRAIN, SETPOINT_BURST, Endpoint
 from tormagd.daemon.requests import WAITING_PER_CLIENT
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.endpoints import Endpoints
-from tormagd_client.messages import VERSION, Reply, Request, Telemetry, Tick, decode, encode
+from tormagd_client.messages import (
+    MOTION_TOPIC,
+    TELEMETRY_TOPIC,
+    VERDICT_TOPIC,
+    VERSION,
+    Motion,
+    Reply,
+    Request,
+    Telemetry,
+    Tick,
+    decode,
+    encode,
+)
 
 PATIENCE_MS = 10_000
 MOST = 3
@@ -249,6 +261,34 @@ def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
     for _ in range(5_000):
         rig.endpoint.publish_ticks(rows, ("a", "b"))
     assert msgpack.unpackb(subscriber.recv()) == {"v": VERSION, "columns": ["a"], "rows": [list(range(30))] * 100}
+
+
+def test_a_topic_has_listeners_only_where_it_was_asked_for_by_its_name(rig: Rig) -> None:
+    listeners, motion = rig.endpoint.listeners, Motion(v=1, t_ns=2, device_s=0.5, handle_mm=-3.0, handle_mm_s=20.0)
+
+    def tell() -> None:
+        rig.endpoint.publish_topic(MOTION_TOPIC, motion)
+        rig.tell()
+
+    everything, snapshots, motions = (rig.connect(zmq.SUB, "telemetry") for _ in range(3))
+    everything.subscribe(b"")
+    rig.until(lambda: everything.poll(5) > 0, rig.tell)
+    assert not listeners.has(MOTION_TOPIC)
+    snapshots.subscribe(TELEMETRY_TOPIC)
+    motions.subscribe(MOTION_TOPIC)
+    rig.until(lambda: motions.poll(5) > 0 and snapshots.poll(5) > 0, tell)
+    assert listeners.has(MOTION_TOPIC)
+    assert not listeners.has(VERDICT_TOPIC)
+    topic, data = motions.recv_multipart()
+    assert (topic, decode(data, Motion)) == (MOTION_TOPIC, motion)
+    while snapshots.poll(5):
+        assert decode(snapshots.recv_multipart()[0], Telemetry) == TELEMETRY
+    motions.unsubscribe(MOTION_TOPIC)
+    rig.until(lambda: not listeners.has(MOTION_TOPIC), tell)
+    motions.subscribe(VERDICT_TOPIC)
+    rig.until(lambda: listeners.has(VERDICT_TOPIC), tell)
+    motions.close()
+    rig.until(lambda: not listeners.has(VERDICT_TOPIC), tell)
 
 
 # -- commands ------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.records import TimedSetpoint
+from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
 from tormagd.daemon.source_clock import AHEAD_S, SETTLED_S
@@ -89,6 +89,48 @@ def test_a_setpoint_is_put_on_the_control_clock(publishing: Publishing) -> None:
     newest = publishing.newest
     found = newest.stamp_s, newest.force_N, newest.valid_for_s, newest.rate_mm_s
     assert found == (pytest.approx(6.98), 1.5, 0.05, 30.0)
+
+
+def test_a_law_of_the_handles_way_is_taken_and_refused_by_name_for_a_pad(publishing: Publishing) -> None:
+    law = {"withdraw_cf": 0.2, "contact": {"handle_mm": -12.5, "stiffness_N_mm": 0.5, "friction_N": 0.1}}
+    assert publishing.send(1, **law)
+    assert (publishing.newest.withdraw_N, publishing.newest.wall) == (0.2, Wall(-12.5, 0.5, 0.1))
+    assert publishing.send(2, contact={"handle_mm": 3.0, "stiffness_N_mm": 2.0})
+    assert (publishing.newest.withdraw_N, publishing.newest.wall) == (None, Wall(3.0, 2.0))
+    publishing.inbox.has_way = False
+    for number, (name, value) in enumerate(law.items()):
+        assert not publishing.send(3 + number, **{name: value})
+        assert publishing.inbox.last_refusal == f"{name}: allowed is servo_cf alone, as the scene's element is a pad"
+    assert publishing.counters() == (2, 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("handle_mm", 10_001.0, "-10000..10000"),
+        ("handle_mm", float("nan"), "-10000..10000"),
+        ("stiffness_N_mm", -0.1, "0..100"),
+        ("stiffness_N_mm", 101.0, "0..100"),
+        ("friction_N", -0.1, "0..1000"),
+        ("friction_N", float("inf"), "0..1000"),
+    ],
+)
+def test_a_contact_out_of_range_is_refused_by_name(
+    publishing: Publishing, name: str, value: float, allowed: str
+) -> None:
+    assert not publishing.send(1, contact={"handle_mm": 1.0, "stiffness_N_mm": 0.5} | {name: value})
+    assert f"contact.{name} = {value!r}: allowed is {allowed}" in str(publishing.inbox.last_refusal)
+    assert publishing.inbox.newest is None
+
+
+def test_who_is_followed_and_who_was_passed_over_is_told_with_its_number(publishing: Publishing) -> None:
+    assert publishing.inbox.passed_over() is None
+    publishing.send(4)
+    publishing.send(7, 1.0, "b")
+    publishing.send(5)
+    assert (publishing.inbox.newest_is(), publishing.inbox.passed_over()) == (("a", 5), ("b", 7))
+    publishing.inbox.give("b", publishing.now_s)
+    assert (publishing.inbox.newest_is(), publishing.inbox.passed_over()) == (("b", 7), None)
 
 
 def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over(publishing: Publishing) -> None:

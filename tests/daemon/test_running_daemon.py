@@ -31,7 +31,7 @@ from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
 from tormagd_client import Client, RefusedError, UnreachableError
 from tormagd_client.endpoints import in_folder
-from tormagd_client.messages import Description
+from tormagd_client.messages import VERDICT_TOPIC, Description, Motion
 from tormagd_client.wire import Pending
 
 PATIENCE_TICKS = 20_000
@@ -413,6 +413,56 @@ def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(armed: Runnin
     armed.until(lambda status: "STALE" in status["limits"], "STALE shown")
     status = armed.until(lambda status: status["governed_cf"] < status["least_N"] + 0.01, "decayed")
     assert status["operating_state"] == "ENABLED"
+
+
+def test_the_handles_motion_is_told_to_who_listens(running: Running) -> None:
+    running.start(Rates(motion_hz=250))
+    running.arm()
+    client = running.client
+    assert client.motions() == []
+    assert client.telemetry() == []
+    running.until(lambda _status: bool(client.motions(1e-3)), "somebody listens")
+    found: list[Motion] = []
+    for _ in range(100):
+        running.tick(4)
+        found += client.motions(1e-3)
+    assert 95 <= len(found) <= 101
+    times_s = [each.device_s for each in found]
+    assert times_s == sorted(set(times_s))
+    assert found[-1].t_ns - found[0].t_ns == pytest.approx((times_s[-1] - times_s[0]) * 1e9, abs=2e6)
+    assert all(0.0 <= time.time_ns() - each.t_ns < 5e8 for each in found)
+    travelled_mm = sum(each.handle_mm_s for each in found[1:]) * 4e-3
+    assert travelled_mm == pytest.approx(found[-1].handle_mm - found[0].handle_mm, abs=1.0)
+    newest = client.telemetry()[-1]
+    assert newest.handle_mm == pytest.approx(found[-1].handle_mm, abs=2.0)
+    assert newest.handle_mm_s is not None
+
+
+def test_every_setpoint_gets_its_verdict_and_telemetry_has_the_newest(armed: Running) -> None:
+    client, console = armed.client, armed.publisher("console")
+    assert armed.command("status")["verdict"] is None
+    assert client.verdicts() == []
+    armed.until(lambda _status: armed.daemon._endpoint.listeners.has(VERDICT_TOPIC), "somebody listens")
+    armed.ask(1.6)
+    armed.tick()
+    (first,) = client.verdicts(0.1)
+    assert (first.source, first.outcome, first.why) == ("test", "arrives", ())
+    assert 20.0 < (first.arrives_ms or 0.0) < 2_000.0
+    status = armed.until(lambda status: status["verdict"]["outcome"] == "rendered", "rendered")
+    assert (status["verdict"]["seq"], status["verdict"]["arrives_ms"]) == (first.seq, 0.0)
+    assert abs(status["measured_cf"] - 1.6) < 0.06
+    armed.ask(1.2, by=console)
+    armed.ask(1.6)
+    armed.tick()
+    told = {each.source: (each.outcome, each.why) for each in client.verdicts(0.1)}
+    assert told == {"console": ("cannot", ("OTHER_SOURCE",)), "test": ("rendered", ())}
+    armed.ask(0.1)
+    armed.tick()
+    (low,) = client.verdicts(0.1)
+    assert (low.outcome, low.arrives_ms, low.why) == ("cannot", None, ("F_MIN",))
+    armed.command("pause")
+    status = armed.until(lambda status: status["verdict"]["outcome"] == "cannot", "held")
+    assert status["verdict"]["why"] == ["PAUSED"]
 
 
 def test_what_may_not_be_done_yet_is_refused_and_stop_opens_and_latches(armed: Running) -> None:

@@ -19,6 +19,7 @@ from tormagd_client.messages import (
     Explained,
     LatenessReport,
     LinkReport,
+    Motion,
     OutputReport,
     PeerReport,
     PeersReport,
@@ -33,6 +34,7 @@ from tormagd_client.messages import (
     Telemetry,
     Tick,
     TickRecord,
+    Verdict,
     WayReport,
 )
 
@@ -41,11 +43,14 @@ PAGE = (ROOT / "docs/messages.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TELEMETRY = (
     "v t_ns seq operating_state is_homed is_busy setpoint_cf governed_cf measured_cf predicted_cf field_mT gap_mm "
-    "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick belief search_age_ms"
+    "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick belief search_age_ms "
+    "handle_mm handle_mm_s verdict"
 )
 V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
+    Motion: "v t_ns device_s handle_mm handle_mm_s",
+    Verdict: "v t_ns source seq outcome arrives_ms why",
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver roller_radius_mm uptime_s least_N "
     "most_N trim device profile least_gap_mm link setpoints peers "
     "rates phases_us late_ticks_by fault_details limit_details newest_stall not_granted way "
@@ -93,7 +98,7 @@ def test_no_key_of_this_version_goes(kind: type[msgspec.Struct]) -> None:
 
 
 def test_every_struct_that_leaves_the_daemon_is_pinned() -> None:
-    taken_in = {messages.Setpoint, messages.Request, messages.Reply, messages.ErrorReply}
+    taken_in = {messages.Setpoint, messages.Contact, messages.Request, messages.Reply, messages.ErrorReply}
     made_here = {
         each
         for each in vars(messages).values()

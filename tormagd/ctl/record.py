@@ -19,7 +19,7 @@ from tormagd.recording.writer import RecordingWriter
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
-from tormagd_client.messages import MessageError, Telemetry, decode
+from tormagd_client.messages import TELEMETRY_TOPIC, MessageError, Telemetry, decode
 from tormagd_client.printable import printable
 from tormagd_client.wire import keys_of
 
@@ -44,7 +44,7 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
     keys = keys_of(endpoints.curve)
     context = zmq.Context()
     try:
-        telemetry = listening(context, endpoints.telemetry, keys)
+        telemetry = listening(context, endpoints.telemetry, keys, TELEMETRY_TOPIC)
         ticks = listening(context, endpoints.recording, keys)
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
             if not _any_ready((telemetry, ticks), wait_s, is_interrupted):

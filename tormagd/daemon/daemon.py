@@ -113,6 +113,7 @@ class Daemon:
                 ("plan", self._plan),
                 ("drive", self._drive),
                 ("record", telemetry.record),
+                ("topics", telemetry.topics.publish),
                 ("telemetry", telemetry.publish),
             ],
             [

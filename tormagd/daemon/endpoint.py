@@ -16,6 +16,7 @@ from tormagd.daemon.admission import MAY, Admission
 from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.arrivals import Arrivals, is_readable
 from tormagd.daemon.inbox import SetpointInbox
+from tormagd.daemon.listeners import Listeners
 from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.daemon.tally import Peer, Tally
@@ -27,11 +28,13 @@ from tormagd_client.messages import (
     VERSION,
     ErrorReply,
     MessageError,
+    Motion,
     PeersReport,
     Reply,
     Request,
     Telemetry,
     TickRecord,
+    Verdict,
     decode,
     encode,
     encode_ticks,
@@ -100,6 +103,7 @@ class Endpoint:
             name: Allowance(SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST) for name in ("telemetry", "recording")
         }
         self._drops = Tally(PEERS, "%d messages were not read, the newest at %s", self.admission.name)
+        self.listeners = Listeners()
 
     def take_setpoints(self) -> bool:
         """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
@@ -127,6 +131,12 @@ class Endpoint:
     def publish(self, telemetry: Telemetry) -> None:
         """Sends one telemetry message to whoever listens."""
         self._send(self._telemetry, "telemetry", encode(telemetry))
+
+    def publish_topic(self, topic: bytes, message: Motion | Verdict) -> None:
+        """Sends one message to whoever listens to this topic."""
+        with contextlib.suppress(zmq.Again):
+            self._telemetry.send(topic, zmq.NOBLOCK | zmq.SNDMORE)
+            self._telemetry.send(encode(message), zmq.NOBLOCK)
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
         """Sends the control ticks since the last time, a row each."""
@@ -213,11 +223,12 @@ class Endpoint:
             if not is_readable(to):
                 return
             frame = to.recv(zmq.NOBLOCK, copy=False)
-            try:
+            peer: Peer | None = None  # of what libzmq says for one that has gone
+            with contextlib.suppress(zmq.ZMQError):
                 peer = self._sender(frame, name)
-            except zmq.ZMQError:
-                continue  # what libzmq says for one that has gone
-            if not allowance.grants(peer, now_s):
+            if name == "telemetry":
+                self.listeners.hear(frame.bytes, peer)
+            if peer is not None and not allowance.grants(peer, now_s):
                 self._drops.add(name, peer, TOO_MUCH)
                 self.admission.cut_off(name, peer.address)
 

@@ -123,6 +123,15 @@ class SetpointInbox:
         self._pass(name, "an operator's choice", is_given=True)
         self.newest = self._timed(source, now_s)
 
+    def newest_is(self) -> tuple[str, int]:
+        """Source and number of `newest`, which there has to be."""
+        return self.hold.source, self._sources[self.hold.source].setpoint.seq
+
+    def passed_over(self) -> tuple[str, int] | None:
+        """The same of what was refused last, because another source holds the brake; None where nothing was."""
+        other = self._sources.get(self._other)
+        return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
+
     def withdraw(self, reason: str) -> None:
         """Forgets the newest setpoint: nothing can be planned for it. It counts as refused, too."""
         if self.newest is not None:

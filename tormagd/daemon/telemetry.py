@@ -8,7 +8,7 @@ from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import SafetyState
-from tormagd_client.messages import VERSION, BeliefReport, Telemetry, Tick, TickRecord
+from tormagd_client.messages import VERSION, BeliefReport, Telemetry, Tick, TickRecord, Verdict
 
 
 def tick_record(
@@ -111,8 +111,10 @@ def snapshot(
     is_busy: bool,
     age_s: float | None,
     belief: dict[str, BeliefReport],
+    handle: tuple[float, float] | None = None,
+    verdict: Verdict | None = None,
 ) -> Telemetry:
-    """The telemetry of the newest tick."""
+    """The telemetry of the newest tick. `handle` is its place and rate, positive pushing on."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
     return Telemetry(
@@ -139,4 +141,7 @@ def snapshot(
         tick=Tick(lateness_us=tick.lateness_us, exec_us=tick.exec_us),
         belief=belief,
         search_age_ms=tick.search_age_s * 1e3,
+        handle_mm=None if handle is None else handle[0],
+        handle_mm_s=None if handle is None else handle[1],
+        verdict=verdict,
     )

@@ -28,6 +28,7 @@ from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.service import READY, Service, notify, status_line
 from tormagd.daemon.telemetry import snapshot, tick_record
+from tormagd.daemon.topics import Topics
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
@@ -91,6 +92,7 @@ class TelemetryLoop:
         self._started_s = time.monotonic()
         self._ticks: deque[TickRecord] = deque(maxlen=MOST_TICKS)
         self._way = Way()
+        self.topics = Topics(config, core, control, inference, endpoint)
         self._service = Service()
         self._status: msgspec.Raw | None = None
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // config.rates.telemetry_hz
@@ -206,7 +208,8 @@ class TelemetryLoop:
         age_s = None if stamp is None else now_s - stamp.stamp_s
         planner, stepper = self._inference.planner, self._control.stepper
         believed = beliefs(planner, stepper, now_s, terms_of(self._core.scene))
-        return snapshot(self._ticks[-1], self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed)
+        told = self.topics.handle(), self.topics.verdict()
+        return snapshot(self._ticks[-1], self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed, *told)
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
         """Says to systemd how it stands, and feeds its watchdog while plans and device states are fresh."""

@@ -42,12 +42,14 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
                 raise ValueError(f"rows[{number}].{TIME_COLUMN} = {time_ns!r}: allowed is 0..2^63-1 ns since 1970")
 
 
-def listening(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
+def listening(
+    context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
+) -> "zmq.Socket[bytes]":
     """Hears what is published at `address`, telemetry or ticks. Raises SettingError as `connect`."""
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
-    socket.subscribe(b"")
+    socket.subscribe(topic)
     connect(socket, address, keys)
     return socket
 

@@ -12,11 +12,22 @@ import zmq.asyncio
 from tormagd_client.blocking import RETRY_S
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import RefusedError
-from tormagd_client.messages import Description, Status, Telemetry, decode
+from tormagd_client.messages import (
+    MOTION_TOPIC,
+    TELEMETRY_TOPIC,
+    VERDICT_TOPIC,
+    Description,
+    Motion,
+    Status,
+    Telemetry,
+    Verdict,
+    decode,
+)
 from tormagd_client.wire import (
     NOT_YET,
     SUBSCRIBED,
     Connections,
+    Told,
     answered,
     asked,
     understood,
@@ -71,11 +82,22 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
             raise self._untaken()
         await setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
-    async def telemetry(self) -> AsyncIterator[Telemetry]:
+    def telemetry(self) -> AsyncIterator[Telemetry]:
         """Every message from now on, without an end. Raises MessageError for what is none."""
-        socket = self._socket(zmq.SUB, self._endpoints.telemetry)
+        return self._heard(TELEMETRY_TOPIC, Telemetry)
+
+    def motions(self) -> AsyncIterator[Motion]:
+        """The handle's motion, `rates.motion_hz` times a second; as `telemetry`."""
+        return self._heard(MOTION_TOPIC, Motion)
+
+    def verdicts(self) -> AsyncIterator[Verdict]:
+        """What becomes of every setpoint, whoever sent it; as `telemetry`."""
+        return self._heard(VERDICT_TOPIC, Verdict)
+
+    async def _heard(self, topic: bytes, kind: type[Told]) -> AsyncIterator[Told]:
+        socket = self._listening(topic)
         while True:
-            yield decode((await socket.recv_multipart())[-1], Telemetry)
+            yield decode((await socket.recv_multipart())[-1], kind)
 
     async def __aenter__(self) -> Self:
         return self

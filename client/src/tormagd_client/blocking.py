@@ -9,12 +9,23 @@ from typing import Any, Self
 import zmq
 
 from tormagd_client.errors import RefusedError
-from tormagd_client.messages import Description, Status, Telemetry, decode
+from tormagd_client.messages import (
+    MOTION_TOPIC,
+    TELEMETRY_TOPIC,
+    VERDICT_TOPIC,
+    Description,
+    Motion,
+    Status,
+    Telemetry,
+    Verdict,
+    decode,
+)
 from tormagd_client.wire import (
     NOT_YET,
     SUBSCRIBED,
     Connections,
     Pending,
+    Told,
     answered,
     asked,
     understood,
@@ -78,7 +89,8 @@ class Client(Connections["zmq.Socket[bytes]"]):
                 time.sleep(RETRY_S)
 
     def publish(self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any) -> None:
-        """Ask for a force at the roller. `stamp_ns` (now) is when it is meant; `fields` as in `messages.Setpoint`.
+        """Ask for a force at the roller. `stamp_ns` (now) is when it is meant; `fields` as in `messages.Setpoint`, a
+        `contact` as what has its names, too.
 
         Waits until the daemon takes setpoints: the first time, and where it has gone since. Raises ValueError naming
         what is not allowed, and UnreachableError where nobody takes setpoints within `wait_s`.
@@ -98,10 +110,21 @@ class Client(Connections["zmq.Socket[bytes]"]):
     def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
         """What has arrived since the last call, the oldest first; waits up to `wait_s` for the first. Listens from the
         first call on. Raises MessageError for what is none."""
-        socket = self._socket(zmq.SUB, self._endpoints.telemetry)
-        arrived: list[Telemetry] = []
+        return self._arrived(TELEMETRY_TOPIC, Telemetry, wait_s)
+
+    def motions(self, wait_s: float = 0.0) -> list[Motion]:
+        """The handle's motion, `rates.motion_hz` times a second; as `telemetry`."""
+        return self._arrived(MOTION_TOPIC, Motion, wait_s)
+
+    def verdicts(self, wait_s: float = 0.0) -> list[Verdict]:
+        """What becomes of every setpoint, whoever sent it; as `telemetry`."""
+        return self._arrived(VERDICT_TOPIC, Verdict, wait_s)
+
+    def _arrived(self, topic: bytes, kind: type[Told], wait_s: float) -> list[Told]:
+        socket = self._listening(topic)
+        arrived: list[Told] = []
         while socket.poll(0 if arrived else round(wait_s * 1e3)):
-            arrived.append(decode(socket.recv_multipart()[-1], Telemetry))
+            arrived.append(decode(socket.recv_multipart()[-1], kind))
         return arrived
 
     def __enter__(self) -> Self:

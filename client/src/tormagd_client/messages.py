@@ -16,6 +16,8 @@ import msgspec
 from tormagd_client.printable import require
 
 VERSION = 1
+TELEMETRY_TOPIC, MOTION_TOPIC, VERDICT_TOPIC = b"\xde", b"motion", b"verdict"
+"What to subscribe to at the telemetry socket: its snapshots are maps of more than 15 fields, which begin so."
 MAX_MESSAGE_BYTES = 16_384  # a setpoint with the longest preview is under 3 kB; libzmq drops what is larger
 MAX_SOURCE_CHARACTERS = 64
 MAX_PREVIEW_SAMPLES = 256
@@ -116,12 +118,36 @@ class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
     acts: bool
 
 
+class Motion(msgspec.Struct, frozen=True, kw_only=True):
+    """The handle, on the topic `motion`: positive pushing on. `t_ns` is when it was read, CLOCK_REALTIME; `device_s`
+    the same by the device's own clock."""
+
+    v: int
+    t_ns: int
+    device_s: float
+    handle_mm: float
+    handle_mm_s: float
+
+
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+    """What becomes of one setpoint: it is `rendered`, `arrives` in `arrives_ms`, or `cannot`, and `why`."""
+
+    v: int
+    t_ns: int
+    source: str
+    seq: int
+    outcome: str
+    arrives_ms: float | None
+    why: tuple[str, ...]
+
+
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME.
 
     `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion; `belief` is what is
     believed of the device, by name. `search_age_ms` is how long ago the search for `field_mT` began, where it runs
-    beside the plans. A value that is not known (no device, no setpoint) is null.
+    beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest setpoint's. A value
+    that is not known (no device, no setpoint) is null.
     """
 
     v: int
@@ -147,6 +173,9 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     tick: Tick
     belief: dict[str, BeliefReport] = {}
     search_age_ms: float = 0.0
+    handle_mm: float | None = None
+    handle_mm_s: float | None = None
+    verdict: Verdict | None = None
 
 
 class Explained(msgspec.Struct, frozen=True):
@@ -528,7 +557,7 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     error: ErrorReply | None = None
 
 
-M = TypeVar("M", Setpoint, Telemetry, Request, Reply)
+M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Request, Reply)
 
 
 def decode(data: bytes, message_type: type[M]) -> M:
@@ -547,7 +576,7 @@ def decode(data: bytes, message_type: type[M]) -> M:
         raise MessageError(str(error)) from error
 
 
-def encode(message: Setpoint | Telemetry | Request | Reply) -> bytes:
+def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -> bytes:
     """The msgpack map of `message`."""
     return _ENCODER.encode(message)
 

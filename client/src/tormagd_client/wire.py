@@ -2,7 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
@@ -15,18 +15,23 @@ from tormagd_client.errors import InFaultError, RefusedError, SettingError, Unre
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
+    Contact,
     Description,
     MessageError,
+    Motion,
     Reply,
     Request,
     Setpoint,
     Status,
+    Telemetry,
+    Verdict,
     decode,
     encode,
 )
 from tormagd_client.printable import printable
 
 T = TypeVar("T", Status, Description)
+Told = TypeVar("Told", Telemetry, Motion, Verdict)
 SocketT = TypeVar("SocketT", bound="zmq.Socket[Any]")
 
 FAULT_CODES = ("fault", "device_latched")
@@ -92,14 +97,15 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
         ) from error
 
 
-def opened(socket: SocketT, address: str, keys: Keys | None) -> SocketT:
-    """A client's socket, blocking or of asyncio, with its bounds, connected. Raises SettingError as `connect` does."""
+def opened(socket: SocketT, address: str, keys: Keys | None, topic: bytes = b"") -> SocketT:
+    """A client's socket, blocking or of asyncio, with its bounds, connected. `topic` is what a subscriber listens to.
+    Raises SettingError as `connect` does."""
     is_setpoints = socket.type == zmq.XPUB
     socket.setsockopt(zmq.LINGER, 200 if is_setpoints else 0)
     socket.setsockopt(zmq.IMMEDIATE, 1 if is_setpoints else 0)  # or it is not told who goes
     socket.setsockopt(zmq.MAXMSGSIZE, 16 * MAX_MESSAGE_BYTES)
     if socket.type == zmq.SUB:
-        socket.subscribe(b"")
+        socket.subscribe(topic)
     connect(socket, address, keys)
     return socket
 
@@ -159,6 +165,14 @@ def _printable(value: Any) -> Any:
     return [_printable(inner) for inner in value] if isinstance(value, list) else value
 
 
+def _contact(fields: Mapping[str, float]) -> Contact:
+    """Raises ValueError for names that are none, or missing, and for what is not allowed."""
+    try:
+        return Contact(**fields)
+    except TypeError as error:
+        raise ValueError(f"contact = {dict(fields)!r}: {error}") from error
+
+
 class Numbering:
     """Numbers the setpoints of one publisher, from 0. Its session is above every earlier one of the same source."""
 
@@ -166,8 +180,17 @@ class Numbering:
         self.source, self.session = source, time.time_ns()
         self.sent = 0
 
-    def setpoint(self, force_N: float, valid_for_ms: float, stamp_ns: int | None = None, **fields: Any) -> bytes:
-        """The next one. `stamp_ns`: when the force is meant, now by default; `fields` as in `messages.Setpoint`.
+    def setpoint(
+        self,
+        force_N: float,
+        valid_for_ms: float,
+        stamp_ns: int | None = None,
+        *,
+        withdraw_cf: float | None = None,
+        contact: Contact | Mapping[str, float] | None = None,
+        **fields: Any,
+    ) -> bytes:
+        """The next one. `stamp_ns`: when the force is meant, now by default; the others as in `messages.Setpoint`.
 
         Raises ValueError naming what is not allowed.
         """
@@ -179,6 +202,8 @@ class Numbering:
             stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
             servo_cf=force_N,
             valid_for_ms=valid_for_ms,
+            withdraw_cf=withdraw_cf,
+            contact=contact if contact is None or isinstance(contact, Contact) else _contact(contact),
             **fields,
         )
         self.sent += 1
@@ -200,7 +225,7 @@ class Connections(Generic[SocketT]):
         self._numbering = Numbering(source)
         self._context = type(self)._made()
         self._ids = itertools.count(1)
-        self._sockets: dict[int, SocketT] = {}
+        self._sockets: dict[tuple[int, bytes], SocketT] = {}
         self._is_taken = False
 
     @classmethod
@@ -214,10 +239,13 @@ class Connections(Generic[SocketT]):
             socket.close()
         self._context.term()
 
-    def _socket(self, kind: int, address: str) -> SocketT:
-        if kind not in self._sockets:
-            self._sockets[kind] = opened(self._context.socket(kind), address, self._keys)
-        return self._sockets[kind]
+    def _socket(self, kind: int, address: str, topic: bytes = b"") -> SocketT:
+        if (kind, topic) not in self._sockets:
+            self._sockets[kind, topic] = opened(self._context.socket(kind), address, self._keys, topic)
+        return self._sockets[kind, topic]
+
+    def _listening(self, topic: bytes) -> SocketT:
+        return self._socket(zmq.SUB, self._endpoints.telemetry, topic)
 
     def _pending(self, command: str) -> Pending:
         return Pending(next(self._ids), command)

@@ -1,0 +1,52 @@
+"""Who listens to a topic, by the words that XPUB passes on."""
+
+import random
+
+from tormagd.daemon.listeners import PEERS, TOPICS, Listeners
+from tormagd.daemon.tally import Peer
+from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC
+
+ON, OFF = b"\x01", b"\x00"
+GONE = ""
+
+
+def test_subscribers_to_everything_or_to_something_else_are_none() -> None:
+    listeners = Listeners()
+    for word in (ON, ON + b"mot", ON + b"\xde", b"", b"motion", ON + b"x" * 10_000):
+        listeners.hear(word, "a")
+    assert not any(map(listeners.has, TOPICS))
+
+
+def test_who_came_and_went_is_counted_for_each_topic() -> None:
+    listeners = Listeners()
+    for peer in ("a", "b"):
+        listeners.hear(ON + MOTION_TOPIC, peer)
+    listeners.hear(ON + VERDICT_TOPIC + b" of one", "a")
+    listeners.hear(OFF + MOTION_TOPIC, "a")
+    assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (True, True)
+    listeners.hear(OFF + MOTION_TOPIC, GONE)
+    assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (False, True)
+    listeners.hear(OFF + VERDICT_TOPIC + b" of one", "a")
+    assert not listeners.has(VERDICT_TOPIC)
+
+
+def test_nobody_takes_away_what_another_asked_for() -> None:
+    listeners = Listeners()
+    listeners.hear(ON + MOTION_TOPIC, "a")
+    for _ in range(100):
+        listeners.hear(OFF + MOTION_TOPIC, "b")
+    assert listeners.has(MOTION_TOPIC)
+
+
+def test_however_many_come_and_go_what_is_kept_is_bounded_and_none_is_left() -> None:
+    listeners, draw = Listeners(), random.Random(1)
+    here: list[int] = []
+    for number in range(2_000):
+        if here and draw.random() < 0.5:
+            here.pop()
+            listeners.hear(OFF + MOTION_TOPIC, GONE)
+        else:
+            here.append(number)
+            listeners.hear(ON + MOTION_TOPIC, f"peer {number}")
+        assert listeners.has(MOTION_TOPIC) == bool(here)
+        assert len(listeners._asked[MOTION_TOPIC]) <= PEERS + 1

@@ -1,0 +1,47 @@
+"""Who listens to a topic of the telemetry socket: nothing is built for nobody.
+
+Whoever subscribes to everything hears a topic as long as somebody else asks for it by its name.
+"""
+
+from collections import Counter
+
+from tormagd.daemon.tally import OTHERS, Peer
+from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC
+
+TOPICS = MOTION_TOPIC, VERDICT_TOPIC
+PEERS = 16
+"Peers that are counted apart: none takes away what another asked for."
+
+
+class Listeners:
+    """Counts the subscriptions to each topic by its name."""
+
+    def __init__(self) -> None:
+        self._asked: dict[bytes, Counter[Peer | None]] = {topic: Counter() for topic in TOPICS}
+        self._gone = dict.fromkeys(TOPICS, 0)
+
+    def has(self, topic: bytes) -> bool:
+        """Whether somebody listens to it."""
+        return bool(self._asked[topic])
+
+    def hear(self, word: bytes, peer: Peer | None) -> None:
+        """Takes what XPUB tells: 1 or 0, and what is subscribed to, or not any more. `peer` is None where libzmq says it
+        of one that has gone."""
+        for topic in TOPICS:
+            if word.startswith(topic, 1):
+                self._count(topic, self._asked[topic], peer, is_subscription=word[0] == 1)
+
+    def _count(
+        self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool
+    ) -> None:
+        if peer not in asked and (len(asked) >= PEERS or not is_subscription):
+            peer = None if peer is None else Peer(OTHERS)
+        if is_subscription:
+            asked[peer] += 1
+        elif peer is None:
+            self._gone[topic] += 1
+        elif asked[peer] > 0:
+            asked[peer] -= 1
+        if asked.total() <= self._gone[topic]:
+            asked.clear()
+            self._gone[topic] = 0

@@ -1,0 +1,103 @@
+"""Topics of the telemetry socket: the handle's motion, and what becomes of every setpoint; for whoever subscribes."""
+
+import time
+
+from tormagd.assembly.build import Core
+from tormagd.config import Config
+from tormagd.control.records import Measured
+from tormagd.daemon.beat import Beat
+from tormagd.daemon.control_loop import ControlLoop
+from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.inference_loop import InferenceLoop
+from tormagd.daemon.verdict import CANNOT, Carriages, Judged, judged
+from tormagd.safety.codes import Limit
+from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, VERSION, Motion, Verdict
+
+NS = 1_000_000_000
+
+
+class Topics:
+    """A phase of every beat, which says what is new to whoever listens; and what a snapshot says of the same."""
+
+    def __init__(
+        self, config: Config, core: Core, control: ControlLoop, inference: InferenceLoop, endpoint: Endpoint
+    ) -> None:
+        self._core, self._control, self._inference, self._endpoint = core, control, inference, endpoint
+        self._push_sign = float(config.handle.push_sign)
+        self._period_ns = NS // min(config.rates.motion_hz, config.rates.control_hz)
+        self._due_ns, self._sensed_s = 0, 0.0
+        self._judged: object = None
+        self._passed_over: tuple[str, int] | None = None
+
+    def publish(self, beat: Beat) -> bool:
+        """Says what is new; False where nothing is, or nobody listens."""
+        listeners = self._endpoint.listeners
+        is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
+        return (listeners.has(MOTION_TOPIC) and self._publish_motion(beat)) or is_said
+
+    def handle(self) -> tuple[float, float] | None:
+        """The handle's place and rate, positive pushing on; None without a device."""
+        measured = self._control.stepper.measured
+        return None if measured is None else self._travel(measured)
+
+    def verdict(self) -> Verdict | None:
+        """Of the newest setpoint, as things are now; None without one."""
+        inbox = self._endpoint.inbox
+        return None if inbox.newest is None else self._verdict(*inbox.newest_is(), self._judge())
+
+    def _publish_motion(self, beat: Beat) -> bool:
+        measured = self._control.stepper.measured
+        if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
+            return False
+        # what was missed is not made up for
+        self._due_ns = self._period_ns + (beat.due_ns if beat.due_ns - self._due_ns > self._period_ns else self._due_ns)
+        self._sensed_s = measured.sensed_s
+        heard_ns = time.time_ns() - round(NS * (time.monotonic() - measured.sensed_s))
+        place_mm, rate_mm_s = self._travel(measured)
+        message = Motion(
+            v=VERSION, t_ns=heard_ns, device_s=measured.handle_time_s, handle_mm=place_mm, handle_mm_s=rate_mm_s
+        )
+        self._endpoint.publish_topic(MOTION_TOPIC, message)
+        return True
+
+    def _publish_verdicts(self) -> bool:
+        inbox, is_said = self._endpoint.inbox, False
+        # a setpoint is a new object, even where its source begins its numbers anew
+        if inbox.newest is not None and inbox.newest is not self._judged:
+            self._judged, is_said = inbox.newest, True
+            self._endpoint.publish_topic(VERDICT_TOPIC, self._verdict(*inbox.newest_is(), self._judge()))
+        other = inbox.passed_over()
+        if other is not None and other != self._passed_over:
+            self._passed_over, is_said = other, True
+            refused = Judged(CANNOT, None, (str(Limit.OTHER_SOURCE),))
+            self._endpoint.publish_topic(VERDICT_TOPIC, self._verdict(*other, refused))
+        return is_said
+
+    def _judge(self) -> Judged:
+        planner, stepper, core = self._inference.planner, self._control.stepper, self._core
+        measured, believe = stepper.measured, planner.believe
+        return judged(
+            planner.planned,
+            stepper.safety.operating_state,
+            measured.gap_mm if measured is not None and measured.is_homed else None,
+            core.portrait,
+            believe.device,
+            Carriages(core.gap_speed_mm_s, believe.carriages.lag_s, core.scene.force.tolerance_rms_N),
+        )
+
+    def _travel(self, measured: Measured) -> tuple[float, float]:
+        handle = measured.handle
+        onward = self._push_sign * handle.turn.direction
+        return self._push_sign * measured.handle_mm, onward * handle.quick_mm_s
+
+    @staticmethod
+    def _verdict(source: str, seq: int, found: Judged) -> Verdict:
+        return Verdict(
+            v=VERSION,
+            t_ns=time.time_ns(),
+            source=source,
+            seq=seq,
+            outcome=found.outcome,
+            arrives_ms=found.arrives_ms,
+            why=found.why,
+        )

@@ -1,0 +1,68 @@
+"""What becomes of a setpoint: it is rendered, it arrives in some time, or it cannot, and why. Pure."""
+
+from typing import NamedTuple
+
+from tormagd.control.aim.portrait import Portrait
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.records import Plan
+from tormagd.safety.codes import Limit
+from tormagd.safety.operating_state import OperatingState
+
+RENDERED, ARRIVES, CANNOT = "rendered", "arrives", "cannot"
+HOLDING = frozenset({Limit.RANGE, Limit.STANDBY, Limit.F_MIN, Limit.F_MAX})
+"Limits that keep a force from coming, as CEILING and MODEL_RANGE may; the others only make it late."
+FORGOTTEN = frozenset({Limit.STALE, Limit.OTHER_SOURCE})
+"Why a setpoint is not followed any more."
+FIELD = "field_mT"
+"Of what a plan was held outside of, by the features' names."
+
+
+class Judged(NamedTuple):
+    """`arrives_ms` is 0 where the force is rendered, and None where it cannot be. `why` names limits or the state."""
+
+    outcome: str
+    arrives_ms: float | None
+    why: tuple[str, ...] = ()
+
+
+class Carriages(NamedTuple):
+    """How fast the gap moves, how late its motion begins, and what the scene tolerates."""
+
+    gap_speed_mm_s: float
+    lag_s: float
+    tolerance_N: float
+
+
+def judged(
+    plan: Plan,
+    state: OperatingState,
+    gap_mm: float | None,
+    portrait: Portrait,
+    device: DeviceFit,
+    carriages: Carriages,
+) -> Judged:
+    """What becomes of the setpoint that was planned for. `gap_mm` is the measured one, None without a homed device."""
+    asked_N = plan.setpoint_N
+    if state is not OperatingState.ENABLED or gap_mm is None:
+        return Judged(CANNOT, None, (str(state),))
+    if asked_N is None:
+        return Judged(CANNOT, None, tuple(str(limit) for limit in plan.limits if limit in FORGOTTEN))
+    aim_mm = portrait.gap_mm_at(device.model_N(asked_N))
+    # where nothing holds it, the plan's gap differs from the portrait's by the element's memory and the handle's rate
+    if Limit.CEILING not in plan.limits and Limit.MODEL_RANGE not in plan.limits:
+        gap_mm -= plan.gap_mm - portrait.gap_mm_at(device.model_N(plan.governed_N))
+    if abs(device.force_N(portrait.force_N_at(gap_mm)) - asked_N) <= carriages.tolerance_N:
+        return Judged(RENDERED, 0.0)
+    if why := tuple(str(limit) for limit in plan.limits if _holds(limit, plan, aim_mm)):
+        return Judged(CANNOT, None, why)
+    arrives_s = abs(aim_mm - gap_mm) / carriages.gap_speed_mm_s + carriages.lag_s
+    return Judged(ARRIVES, round(1e3 * arrives_s, 1))
+
+
+def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
+    """Whether it keeps the gap from where it should go, and not only from somewhere on the way."""
+    if limit is Limit.CEILING:
+        return aim_mm < plan.min_gap_mm
+    if limit is Limit.MODEL_RANGE:
+        return any(each.quantity == FIELD for each in plan.outside)
+    return limit in HOLDING
