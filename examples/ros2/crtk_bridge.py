@@ -10,12 +10,22 @@ from crtk_msgs.msg import OperatingState, StringStamped
 from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
-from translation import command_of, fill_force, fill_header, fill_joints, fill_operating_state, setpoint_of
+from translation import (
+    command_of,
+    fill_force,
+    fill_handle,
+    fill_header,
+    fill_joints,
+    fill_operating_state,
+    setpoint_of,
+)
 
 from tormagd_client import Client, ClientError
 
 LOOK_S = 0.02
 "As often as the daemon tells what it does."
+HANDLE_S = 0.004
+"As often as the handle's motion is looked for."
 
 
 class CrtkBridge(Node):
@@ -31,7 +41,9 @@ class CrtkBridge(Node):
         self._setpoint = self.create_publisher(WrenchStamped, "setpoint_cf", 10)
         self._joints = self.create_publisher(JointState, "measured_js", 10)
         self._state = self.create_publisher(OperatingState, "operating_state", 10)
+        self._handle = self.create_publisher(JointState, "handle/measured_js", 10)
         self._timer = self.create_timer(LOOK_S, self._on_timer)
+        self._handle_timer = self.create_timer(HANDLE_S, self._on_handle_timer)
 
     def _on_servo_cf(self, message: WrenchStamped) -> None:
         try:
@@ -51,6 +63,10 @@ class CrtkBridge(Node):
             self._setpoint.publish(fill_header(fill_force(WrenchStamped(), state.setpoint_cf), state))
             self._joints.publish(fill_header(fill_joints(JointState(), state), state))
             self._state.publish(fill_header(fill_operating_state(OperatingState(), state), state))
+
+    def _on_handle_timer(self) -> None:
+        for motion in self._client.motions():
+            self._handle.publish(fill_header(fill_handle(JointState(), motion), motion))
 
 
 def main() -> None:

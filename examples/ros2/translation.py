@@ -3,7 +3,7 @@ lies along z."""
 
 from typing import Any
 
-from tormagd_client.messages import Telemetry
+from tormagd_client.messages import Motion, Telemetry
 
 COMMANDS = ("home", "enable", "disable", "pause", "resume")
 "What of CRTK's `state_command` this device can: it homes anew, and cannot be unhomed."
@@ -22,8 +22,8 @@ def setpoint_of(message: Any) -> dict[str, Any]:
     return {"force_N": message.wrench.force.z, "stamp_ns": stamp.sec * 10**9 + stamp.nanosec or None}
 
 
-def fill_header(message: Any, state: Telemetry) -> Any:
-    """The message, stamped with the time of the telemetry."""
+def fill_header(message: Any, state: Telemetry | Motion) -> Any:
+    """The message, stamped with the time of what is told."""
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(state.t_ns, 10**9)
     return message
 
@@ -38,6 +38,13 @@ def fill_joints(message: Any, state: Telemetry) -> Any:
     """A sensor_msgs/JointState with the places of both carriages, in metres; empty until they are homed."""
     if state.measured_jp is not None:
         message.name, message.position = ["left", "right"], [place_mm * 1e-3 for place_mm in state.measured_jp]
+    return message
+
+
+def fill_handle(message: Any, motion: Motion) -> Any:
+    """A sensor_msgs/JointState with the handle's place and rate, in metres, positive pushing on."""
+    message.name = ["handle"]
+    message.position, message.velocity = [motion.handle_mm * 1e-3], [motion.handle_mm_s * 1e-3]
     return message
 
 

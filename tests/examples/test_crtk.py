@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from tormagd_client.messages import Setpoint, Telemetry, Tick, decode
+from tormagd_client.messages import Motion, Setpoint, Telemetry, Tick, decode
 from tormagd_client.wire import Numbering
 
 PATH = Path(__file__).parents[2] / "examples" / "ros2" / "translation.py"
@@ -77,6 +77,13 @@ def test_telemetry_becomes_crtk_with_its_units_and_its_time():
     assert (joints.name, joints.position) == (["left", "right"], [0.03, 0.029])
     state = translation.fill_operating_state(SimpleNamespace(), STATE)
     assert (state.state, state.is_homed, state.is_busy) == ("ENABLED", True, False)
+
+
+def test_the_handle_is_a_joint_of_its_own_with_the_time_at_which_it_was_read():
+    motion = Motion(v=1, t_ns=1_800_000_000_000_000_007, device_s=3.0, handle_mm=-12.0, handle_mm_s=40.0)
+    handle = translation.fill_header(translation.fill_handle(wrench(), motion), motion)
+    assert (handle.name, handle.position, handle.velocity) == (["handle"], [-0.012], [0.04])
+    assert (handle.header.stamp.sec, handle.header.stamp.nanosec) == (1_800_000_000, 7)
 
 
 def test_what_is_not_known_is_not_a_number():

@@ -1,13 +1,13 @@
 """The simulated patient and its network, in virtual time, and its process before a daemon that is played."""
 
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tormagd.simulation.patient import FORCE, LAW, WAY, Delay, Felt, Patient, main, run, setpoint_of
+from tormagd_client.messages import Motion
 
 STEP_S = 2e-3
 
@@ -125,12 +125,9 @@ class Played:
         self.now_s = 0.0
         self.published: list[tuple[Any, ...]] = []
 
-    def telemetry(self) -> list[Any]:
-        unplaced = SimpleNamespace(t_ns=0)
-        return [
-            unplaced,
-            SimpleNamespace(t_ns=0, device_s=0.0, handle_mm=20.0 * max(self.now_s - 0.5, 0.0), handle_mm_s=20.0),
-        ]
+    def motions(self) -> list[Any]:
+        place_mm = 20.0 * max(self.now_s - 0.5, 0.0)
+        return [Motion(v=1, t_ns=0, device_s=0.0, handle_mm=place_mm, handle_mm_s=20.0)]
 
     def publish(self, force_N: float, valid_for_ms: float, stamp_ns: int, **fields: Any) -> None:
         self.published.append((self.now_s, force_N, stamp_ns, fields))
@@ -166,4 +163,4 @@ def test_a_wrong_call_says_what_is_right(capsys: pytest.CaptureFixture[str], tmp
         main([str(tmp_path), "--loss", "0.9"])
     assert "a loss of 0 to 0.5" in capsys.readouterr().err
     assert main([str(tmp_path), "--seconds", "0.01"]) == 1
-    assert "no handle_mm" in capsys.readouterr().err
+    assert "told no motion" in capsys.readouterr().err

@@ -151,12 +151,6 @@ class Delay(Generic[T]):
         return found
 
 
-def places_mm(client: Any) -> list[float]:
-    """The handle's places that have come; what says none is passed over."""
-    heard: list[Any] = client.telemetry()
-    return [message.handle_mm for message in heard if getattr(message, "handle_mm", None) is not None]
-
-
 def run(
     client: Any,
     patient: Patient,
@@ -171,8 +165,8 @@ def run(
     began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
     newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0
     while not is_over(now_s := clock_s()):
-        for place_mm in places_mm(client):
-            there.send(now_s, place_mm)
+        for motion in client.motions():
+            there.send(now_s, motion.handle_mm)
         newest = max([newest, *there.arrived(now_s)])
         if newest[0] > -math.inf:
             back.send(now_s, setpoint_of(patient.update(now_s, newest[1]), mode))
@@ -224,7 +218,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{command.prog}: {error}", file=sys.stderr)
             return 1
     if not published:
-        print(f"{command.prog}: the daemon said no handle_mm, or not in time: nothing was published", file=sys.stderr)
+        print(
+            f"{command.prog}: the daemon told no motion of a handle in time: nothing was published",
+            file=sys.stderr,
+        )
     return 0 if published else 1
 
 
