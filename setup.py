@@ -35,7 +35,7 @@ COMPILED = {
     "tormagd/control/believe": (
         *("strength", "slow_friction", "sensor_zero", "freshness", "sensor", "carriage_lag", "handle", "memory", "believe"),
     ),
-    "tormagd/control/ask": ("skill", "forecast", "path", "governor"),
+    "tormagd/control/ask": ("skill", "forecast", "path", "way", "governor"),
     "tormagd/control/aim": ("portrait", "floors", "aim"),
     "tormagd/control/move": ("motor", "pid", "reference", "homing", "opening", "watch", "actuator", "carriages"),
     "tormagd/assembly": ("conditions",),

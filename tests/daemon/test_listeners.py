@@ -7,34 +7,35 @@ from tormagd.daemon.tally import Peer
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC
 
 ON, OFF = b"\x01", b"\x00"
-GONE = ""
+GONE = None
+A, B = Peer("a"), Peer("b")
 
 
 def test_subscribers_to_everything_or_to_something_else_are_none() -> None:
     listeners = Listeners()
     for word in (ON, ON + b"mot", ON + b"\xde", b"", b"motion", ON + b"x" * 10_000):
-        listeners.hear(word, "a")
+        listeners.hear(word, A)
     assert not any(map(listeners.has, TOPICS))
 
 
 def test_who_came_and_went_is_counted_for_each_topic() -> None:
     listeners = Listeners()
-    for peer in ("a", "b"):
+    for peer in (A, B):
         listeners.hear(ON + MOTION_TOPIC, peer)
-    listeners.hear(ON + VERDICT_TOPIC + b" of one", "a")
-    listeners.hear(OFF + MOTION_TOPIC, "a")
+    listeners.hear(ON + VERDICT_TOPIC + b" of one", A)
+    listeners.hear(OFF + MOTION_TOPIC, A)
     assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (True, True)
     listeners.hear(OFF + MOTION_TOPIC, GONE)
     assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (False, True)
-    listeners.hear(OFF + VERDICT_TOPIC + b" of one", "a")
+    listeners.hear(OFF + VERDICT_TOPIC + b" of one", A)
     assert not listeners.has(VERDICT_TOPIC)
 
 
 def test_nobody_takes_away_what_another_asked_for() -> None:
     listeners = Listeners()
-    listeners.hear(ON + MOTION_TOPIC, "a")
+    listeners.hear(ON + MOTION_TOPIC, A)
     for _ in range(100):
-        listeners.hear(OFF + MOTION_TOPIC, "b")
+        listeners.hear(OFF + MOTION_TOPIC, B)
     assert listeners.has(MOTION_TOPIC)
 
 
@@ -47,6 +48,6 @@ def test_however_many_come_and_go_what_is_kept_is_bounded_and_none_is_left() -> 
             listeners.hear(OFF + MOTION_TOPIC, GONE)
         else:
             here.append(number)
-            listeners.hear(ON + MOTION_TOPIC, f"peer {number}")
+            listeners.hear(ON + MOTION_TOPIC, Peer(f"peer {number}"))
         assert listeners.has(MOTION_TOPIC) == bool(here)
         assert len(listeners._asked[MOTION_TOPIC]) <= PEERS + 1

@@ -31,7 +31,7 @@ from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
 from tormagd_client import Client, RefusedError, UnreachableError
 from tormagd_client.endpoints import in_folder
-from tormagd_client.messages import VERDICT_TOPIC, Description, Motion
+from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, Description, Motion
 from tormagd_client.wire import Pending
 
 PATIENCE_TICKS = 20_000
@@ -436,6 +436,21 @@ def test_the_handles_motion_is_told_to_who_listens(running: Running) -> None:
     newest = client.telemetry()[-1]
     assert newest.handle_mm == pytest.approx(found[-1].handle_mm, abs=2.0)
     assert newest.handle_mm_s is not None
+
+
+def test_when_the_last_listener_has_gone_no_motion_is_sent(running: Running) -> None:
+    running.start()
+    listeners, listener = running.daemon._endpoint.listeners, running.publisher("listener")
+    listener.motions()
+    for is_there in (True, False):
+        for _ in range(PATIENCE_TICKS // LOOK_TICKS):
+            running.tick(LOOK_TICKS)
+            if listeners.has(MOTION_TOPIC) == is_there:
+                break
+            time.sleep(1e-3)
+        assert listeners.has(MOTION_TOPIC) == is_there
+        listener.close()
+    running.clients.remove(listener)
 
 
 def test_every_setpoint_gets_its_verdict_and_telemetry_has_the_newest(armed: Running) -> None:

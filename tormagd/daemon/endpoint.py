@@ -134,9 +134,7 @@ class Endpoint:
 
     def publish_topic(self, topic: bytes, message: Motion | Verdict) -> None:
         """Sends one message to whoever listens to this topic."""
-        with contextlib.suppress(zmq.Again):
-            self._telemetry.send(topic, zmq.NOBLOCK | zmq.SNDMORE)
-            self._telemetry.send(encode(message), zmq.NOBLOCK)
+        self._send(self._telemetry, "telemetry", topic, encode(message))
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
         """Sends the control ticks since the last time, a row each."""
@@ -213,11 +211,11 @@ class Endpoint:
             raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
         return made
 
-    def _send(self, to: "zmq.Socket[bytes]", name: str, data: bytes) -> None:
+    def _send(self, to: "zmq.Socket[bytes]", name: str, *parts: bytes) -> None:
         """Sends to all subscribers, and cuts off who says more than subscribers need to."""
         # drops for a subscriber that does not keep up; it never blocks
         with contextlib.suppress(zmq.Again):
-            to.send(data, zmq.NOBLOCK)
+            to.send_multipart(parts, zmq.NOBLOCK)
         now_s, allowance = time.monotonic(), self._subscriptions[name]
         for _ in range(DRAIN):
             if not is_readable(to):
