@@ -25,15 +25,13 @@ class Listeners:
         return bool(self._asked[topic])
 
     def hear(self, word: bytes, peer: Peer | None) -> None:
-        """Takes what XPUB tells: 1 or 0, and what is subscribed to, or not any more. `peer` is None where libzmq says it
-        of one that has gone."""
+        """Takes what XPUB tells: 1 or 0, and what is subscribed to, or not any more. `peer` is None where libzmq says
+        it of one that has gone."""
         for topic in TOPICS:
             if word.startswith(topic, 1):
                 self._count(topic, self._asked[topic], peer, is_subscription=word[0] == 1)
 
-    def _count(
-        self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool
-    ) -> None:
+    def _count(self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
         if peer not in asked and (len(asked) >= PEERS or not is_subscription):
             peer = None if peer is None else Peer(OTHERS)
         if is_subscription:
