@@ -16,7 +16,6 @@ from rendering.following import VALID_S, armed
 from rendering.hands import Legs, WaitingHand
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Rates
-from tormagd.control.ask.governor import EARLY_N
 from tormagd.control.ask.path import FLATTEST_N_MM, TIMES_S, nearest_path_mm
 from tormagd.control.records import TimedSetpoint, Travel, Wall
 from tormagd.lab.arrays import Array
@@ -42,7 +41,7 @@ LEARNING_N, LEARNS_FOR_S = 1.2, 1.6
 RESTS_S = 0.8
 ONSET_N, COUNTED_N = 0.2, 0.3
 "Over the waiting level: where a wall is felt, and what it has to reach in order to count."
-HELD_N = 0.1
+HELD_N = EARLY_N = 0.1
 PULLS_N = 0.05
 GRID_MM = 0.05
 MASS_KG = 0.15

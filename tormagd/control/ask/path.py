@@ -65,7 +65,7 @@ class Path:
         bound.
 
         The gap follows its carriages with the time constant SPEEDING_UP_S plus `lag_s`. So the carriages are sent ahead
-        of the path by its speed times this time.
+        of the path by its speed times this time; with `most_N`, `wanted_N` has to be of so much later already.
         """
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
@@ -74,7 +74,7 @@ class Path:
         for place, force_N in enumerate(wanted_N):
             gap_mm, slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
             slope_N_mm = max(slope_N_mm, FLATTEST_N_MM)
-            if place:
+            if place and most_N is None:
                 wanted_mm[place - 1] += late_s * CHANGES_PER_S[place - 1] * (gap_mm - wanted_mm[place - 1])
             wanted_mm.append(gap_mm)
             weights.append(LASTS_S[place] * slope_N_mm * slope_N_mm)
