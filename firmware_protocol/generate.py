@@ -26,7 +26,7 @@ def markdown_tables(schema: Schema) -> str:
         lines += [
             f"### {message.name}",
             "",
-            f"{message.sender} to {message.receiver}, function {message.function}, CAN identifier "
+            f"{message.sender} to {message.receiver}, function {message.function}, CAN "
             f"0x{message.frame_id:03X}, length {message.length}. {message.comment}",
             "",
             "| bytes | signal | type | step | range | meaning |",
@@ -41,8 +41,10 @@ def _markdown_row(signal: SignalSource) -> str:
     first, last = signal.start // 8, (signal.start + signal.length) // 8 - 1
     place = f"{first}" if first == last else f"{first}-{last}"
     wire_type = f"{'i' if signal.signed else 'u'}{signal.length}"
-    step = f"{signal.scale:.10g} {signal.unit}".rstrip()
+    step = f"{signal.scale:.10g} {signal.unit}".rstrip() if signal.unit or signal.scale != 1 else ""
     span = f"{signal.minimum:.10g} .. {signal.maximum:.10g}{', wraps' if signal.kind == 'Wrapping' else ''}"
+    if not step and signal.maximum - signal.minimum == 2**signal.length - 1:
+        span = ""  # all that the type holds
     values = ", ".join(f"{value} {name}" for value, name in signal.choices.items())
     return f"| {place} | `{signal.name}` | {wire_type} | {step} | {values or span} | {signal.comment} |"
 

@@ -40,35 +40,27 @@ not edit. Synthetic throughout: {workload}. One process, one thread, garbage col
 ({environment}).
 
 A solve gets a state of the handle, a force and the last field, and answers with a field. The *solver error* is the
-distance to the network's own nearest root, found by bisection that shares no code with the searches. The *plant error*
-is the distance to the field at which the simulated element gives the force: no search can be better than its network.
-*Force* is the plant's force at the answer less the force asked.
+distance to the network's own nearest root, found by bisection. The *plant error* is the distance to the field at which
+the simulated element gives the force: no search can be better than its network. *Force* is the plant's at the answer
+less the force asked.
 
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
 
-- `thesis-linear`: row by row in torch, 1 mT, stops within the network's mean error of the force (the thesis's rule).
-  `linear-argmin` looks at every row; `vectorised-argmin` asks the whole network for the whole grid at once. The daemon
-  runs the first as `thesis`.
+- `thesis-linear`, the daemon's `thesis`: row by row in torch, 1 mT, stops within the network's mean error of the force
+  (the thesis's rule). `linear-argmin` looks at every row; `vectorised-argmin` asks for the whole grid at once.
 - `torch`: the network over the grid in torch, the k nearest, then interpolation. `nearest`: the same in NumPy, from the
-  curve of this state of the handle, and without torch.
+  curve of this state of the handle.
 - `newton`: Newton's method from the last field, the whole range its bracket. It wants a force that rises with the
-  field, as the brake's does, and is what every scene runs that names no other. It is {speedup[thesis-linear]:.0f} times
-  as fast as the thesis's search on the same network,
-  {speedup[linear-argmin]:.0f} times as fast as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as
-  `vectorised-argmin`.
+  field, as the brake's does. It is {speedup[thesis-linear]:.0f} times as fast as the thesis's search on the same network,
+  {speedup[linear-argmin]:.0f} times as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as `vectorised-argmin`.
 
 Times are from several rounds over all variants; p99 still holds whatever else ran. *Pareto* marks the variants that no
 faster one equals in plant error, to an encoder count of the gap (about 0.02 mT). Solver errors under 1e-6 mT are drawn
-there. The plant has no hysteresis or relaxation, and the networks were trained for this page; [how good the shipped
-ones are](guides/insert.md#the-shipped-models).
+there. The networks were trained for this page; [how good the shipped ones are](guides/insert.md#the-shipped-models).
 
 ## All searches on {usual} units, and the Pareto variants of every size
 
-{table}
-## Scenes
-
-{scenes}
-"""
+{table}"""
 
 
 def write(result: dict[str, Any]) -> None:
@@ -82,14 +74,10 @@ def page(result: dict[str, Any]) -> str:
     """docs/inverse_trade.md."""
     shown = [row for row in result["variants"] if row["pareto"] or row["hidden"] == USUAL_HIDDEN]
     stars = [row | {"pareto": "*" if row["pareto"] else ""} for row in shown]
-    alike: dict[str, list[str]] = {}
-    for scene, row in result["chosen"].items():
-        alike.setdefault(row["name"], []).append(scene)
     texts = {
         "environment": ", ".join(f"{name} {value}" for name, value in result["environment"].items()),
         "usual": USUAL_HIDDEN,
         "table": table(COLUMNS, [[form.format(**row) for form in COLUMNS.values()] for row in stars]),
-        "scenes": "\n".join(f"- `{name}`: {', '.join(scenes)}" for name, scenes in alike.items()),
     }
     return TEXT.format(**(result | texts))
 
