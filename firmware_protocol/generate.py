@@ -29,8 +29,8 @@ def markdown_tables(schema: Schema) -> str:
             f"{message.sender} to {message.receiver}, function {message.function}, CAN "
             f"0x{message.frame_id:03X}, length {message.length}. {message.comment}",
             "",
-            "| bytes | signal | type | step | range | meaning |",
-            "| --- | --- | --- | --- | --- | --- |",
+            "| bytes | signal | type | values | meaning |",
+            "| --- | --- | --- | --- | --- |",
             *(_markdown_row(signal) for signal in message.signals),
             "",
         ]
@@ -41,12 +41,15 @@ def _markdown_row(signal: SignalSource) -> str:
     first, last = signal.start // 8, (signal.start + signal.length) // 8 - 1
     place = f"{first}" if first == last else f"{first}-{last}"
     wire_type = f"{'i' if signal.signed else 'u'}{signal.length}"
-    step = f"{signal.scale:.10g} {signal.unit}".rstrip() if signal.unit or signal.scale != 1 else ""
-    span = f"{signal.minimum:.10g} .. {signal.maximum:.10g}{', wraps' if signal.kind == 'Wrapping' else ''}"
-    if not step and signal.maximum - signal.minimum == 2**signal.length - 1:
-        span = ""  # all that the type holds
-    values = ", ".join(f"{value} {name}" for value, name in signal.choices.items())
-    return f"| {place} | `{signal.name}` | {wire_type} | {step} | {values or span} | {signal.comment} |"
+    if signal.choices:
+        values = ", ".join(f"{value} {name}" for value, name in signal.choices.items())
+    elif signal.scale == 1 and not signal.unit and signal.maximum - signal.minimum == 2**signal.length - 1:
+        values = ""  # all that the type holds
+    else:
+        step = f"{signal.scale:.10g} {signal.unit}".rstrip()
+        wraps = ", wraps" if signal.kind == "Wrapping" else ""
+        values = f"{signal.minimum:.10g} .. {signal.maximum:.10g}, step {step}{wraps}"
+    return f"| {place} | `{signal.name}` | {wire_type} | {values} | {signal.comment} |"
 
 
 def generated_files(room: Path) -> dict[Path, str]:

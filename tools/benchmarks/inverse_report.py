@@ -51,8 +51,9 @@ less the force asked.
 - `torch`: the network over the grid in torch, the k nearest, then interpolation. `nearest`: the same in NumPy, from the
   curve of this state of the handle.
 - `newton`: Newton's method from the last field, the whole range its bracket. It wants a force that rises with the
-  field, as the brake's does. It is {speedup[thesis-linear]:.0f} times as fast as the thesis's search on the same network,
-  {speedup[linear-argmin]:.0f} times as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as `vectorised-argmin`.
+  field, as the brake's does. On the same network it is {speedup[thesis-linear]:.0f} times as fast as the thesis's
+  search, {speedup[linear-argmin]:.0f} times as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as
+  `vectorised-argmin`.
 
 Times are from several rounds over all variants; p99 still holds whatever else ran. *Pareto* marks the variants that no
 faster one equals in plant error, to an encoder count of the gap (about 0.02 mT). Solver errors under 1e-6 mT are drawn
