@@ -41,6 +41,12 @@ EARLY_TICKS = 20
 LATER_MS, WORSE, WORSE_N = 40.0, 1.1, 0.015
 "What has to hold of 95 %: onset and RMS against the bound's."
 SWINGS_MM_S = 5.0
+DRAWN = {
+    "force": "Forces are sent",
+    "way": "Another force is sent for withdrawing",
+    "law": "The wall is sent",
+    "law_standby": "The wall is sent, and the brake waits nearer",
+}
 FORCE_JND = 0.10
 
 
@@ -229,21 +235,22 @@ def shown(result: Json) -> str:
 def draw(picture: Path) -> None:
     """What was there and what was felt, of one wall in four ways."""
     figure, axes = subplots((11.0, 7.0), 2, 2, sharex=True, sharey=True)
-    for axis, mode in zip(axes.flat, ("force", "way", "law", "law_standby"), strict=True):
+    figure.suptitle("A wall of 0.25 N/mm, pushed at 30 mm/s over 100 ms, sample 2", fontsize=13)
+    for axis, (mode, title) in zip(axes.flat, DRAWN.items(), strict=True):
         case = Case("sample_2", 0.3, 0.25, 30.0, 100.0, mode)
         run, bound = rendered(case), ideal(case)
         wall_N = case.wall_N_mm * np.maximum(run.depth_mm, 0.0)
-        axis.fill_between(
-            run.time_s, (1.0 - FORCE_JND) * wall_N, (1.0 + FORCE_JND) * wall_N, alpha=0.3, label="the wall, +- 10 %"
-        )
-        axis.plot(bound.time_s, bound.kinetic_N, "--", label="carriages of this speed")
-        axis.plot(run.time_s, run.kinetic_N, label="felt while it slides")
-        axis.plot(run.time_s, run.force_N, ":", label="on the handle")
-        axis.set_title(f"{mode}: wall 0.25 N/mm, 30 mm/s, round trip 100 ms")
-        axis.set_ylabel("N")
-    axes[0, 0].legend()
+        low_N, high_N = (1.0 - FORCE_JND) * wall_N, (1.0 + FORCE_JND) * wall_N
+        axis.fill_between(run.time_s, low_N, high_N, color="#c9d6df", label="the wall, +- 10 %")
+        axis.plot(bound.time_s, bound.kinetic_N, "--", color="#2a6f97", label="what carriages of this speed could do")
+        axis.plot(run.time_s, run.kinetic_N, color="#d1495b", label="what resists a hand that moves")
+        axis.plot(run.time_s, run.force_N, ":", color="#222222", label="what the hand feels: < 0 holds it back")
+        axis.set_title(title, loc="left", fontsize=10.5)
+        axis.set_ylabel("force, N")
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0, 1].legend(frameon=False, fontsize=8.5)
     for axis in axes[1]:
-        axis.set_xlabel("s")
+        axis.set_xlabel("time, s")
     figure.savefig(picture)
 
 
