@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -31,7 +32,7 @@ from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
 from tormagd_client import Client, RefusedError, UnreachableError
 from tormagd_client.endpoints import in_folder
-from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, Description, Motion
+from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, Description, Motion, Verdict
 from tormagd_client.wire import Pending
 
 PATIENCE_TICKS = 20_000
@@ -283,6 +284,17 @@ def test_requests_are_answered_with_the_newest_snapshot_however_few_ticks_it_sta
     assert numbers == sorted(set(numbers))  # one answer in a period
 
 
+def test_however_seldom_telemetry_is_told_every_tick_is_recorded(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running.start(Rates(telemetry_hz=5))
+    endpoint, numbers = running.daemon._endpoint, list[int]()
+    monkeypatch.setattr(endpoint, "publish_ticks", lambda rows: numbers.extend(row.tick for row in rows))
+    monkeypatch.setattr(endpoint.admission, "connections", lambda: Counter(recording=1))
+    running.tick(450)
+    assert numbers == [*range(numbers[0], numbers[0] + 400)]
+
+
 def test_a_daemon_describes_what_it_runs(alone: Running) -> None:
     described = msgspec.convert(alone.command("describe"), Description)
     assert described.scene["name"] == alone.core.scene.name
@@ -453,6 +465,14 @@ def test_when_the_last_listener_has_gone_no_motion_is_sent(running: Running) -> 
     running.clients.remove(listener)
 
 
+def verdicts(client: Client, count: int) -> list[Verdict]:
+    """So many as are sent, however long they take."""
+    found: list[Verdict] = []
+    while len(found) < count:
+        found += client.verdicts(1.0)
+    return found
+
+
 def test_every_setpoint_gets_its_verdict_and_telemetry_has_the_newest(armed: Running) -> None:
     client, console = armed.client, armed.publisher("console")
     assert armed.command("status")["verdict"] is None
@@ -460,7 +480,7 @@ def test_every_setpoint_gets_its_verdict_and_telemetry_has_the_newest(armed: Run
     armed.until(lambda _status: armed.daemon._endpoint.listeners.has(VERDICT_TOPIC), "somebody listens")
     armed.ask(1.6)
     armed.tick()
-    (first,) = client.verdicts(0.1)
+    (first,) = verdicts(client, 1)
     assert (first.source, first.outcome, first.why) == ("test", "arrives", ())
     assert 20.0 < (first.arrives_ms or 0.0) < 2_000.0
     status = armed.until(lambda status: status["verdict"]["outcome"] == "rendered", "rendered")
@@ -469,11 +489,11 @@ def test_every_setpoint_gets_its_verdict_and_telemetry_has_the_newest(armed: Run
     armed.ask(1.2, by=console)
     armed.ask(1.6)
     armed.tick()
-    told = {each.source: (each.outcome, each.why) for each in client.verdicts(0.1)}
+    told = {each.source: (each.outcome, each.why) for each in verdicts(client, 2)}
     assert told == {"console": ("cannot", ("OTHER_SOURCE",)), "test": ("rendered", ())}
     armed.ask(0.1)
     armed.tick()
-    (low,) = client.verdicts(0.1)
+    (low,) = verdicts(client, 1)
     assert (low.outcome, low.arrives_ms, low.why) == ("cannot", None, ("F_MIN",))
     armed.command("pause")
     status = armed.until(lambda status: status["verdict"]["outcome"] == "cannot", "held")

@@ -3,7 +3,6 @@
 import logging
 import math
 import time
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -90,7 +89,7 @@ class TelemetryLoop:
             self._groups.append(inference.beside.timing)
         self._newest: Telemetry
         self._started_s = time.monotonic()
-        self._ticks: deque[TickRecord] = deque(maxlen=MOST_TICKS)
+        self._ticks: list[TickRecord] = []
         self._way = Way()
         self.topics = Topics(config, core, control, inference, endpoint)
         self._service = Service()
@@ -118,6 +117,8 @@ class TelemetryLoop:
             timing.exec_us,
             timing.runs,
         )
+        if len(self._ticks) == MOST_TICKS:  # telemetry is slow: the recording does not wait for it
+            self._publish_ticks()
         self._ticks.append(record)
         self._box.ticked(record, control.stepper, self._inference.planner)
 
@@ -134,9 +135,7 @@ class TelemetryLoop:
         if connections["telemetry"] or self._answers:
             self._newest = self._snapshot(start_ns * 1e-9)
             endpoint.publish(self._newest)
-        if connections["recording"]:
-            endpoint.publish_ticks(list(self._ticks))
-        self._ticks.clear()
+        self._publish_ticks()
         # before anything is learned of a new device
         identity = None if self._connection.link is None else self._connection.link.identity
         self._profiles.look(
@@ -144,6 +143,11 @@ class TelemetryLoop:
         )
         self.timing.record(beat.due_ns, start_ns, time.monotonic_ns())
         return True
+
+    def _publish_ticks(self) -> None:
+        if self._endpoint.admission.connections()["recording"]:
+            self._endpoint.publish_ticks(self._ticks)
+        self._ticks = []
 
     def tell(self, _beat: Beat) -> bool:
         """Every TELL_S: log, service and black box. False where it has been done."""
