@@ -23,7 +23,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import clarabel
 import numpy as np
 from scipy import sparse
 
@@ -463,6 +462,8 @@ def _least_squares(
     below = sparse.vstack([limit for limit, _ in limits], format="csc")
     below.resize(below.shape[0], matrix.shape[1])
     bounds = np.concatenate([bound for _, bound in limits])
+    import clarabel  # only the bound takes it, and who shows a touch has no need of it
+
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     # where the rounds go a little way only, the limits leave little room, and it takes ten times as many as at first
