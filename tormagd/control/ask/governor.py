@@ -4,7 +4,7 @@ now       what the setpoint asks for at the handle's place and way, within what 
 ahead     its wall, as the handle moves; its preview; without one its slope, and the forecast as far as that is trusted
 path      where what comes is known: the forces along the gap's path that misses least of them, but before a wall none
           that is EARLY_N over what is felt there
-blend     from one wall to the next, at the scene's release rate
+blend     from one wall to the next or to none, at the scene's release rate beside what the handle's motion makes of it
 decay     without a setpoint, or with one that is too old: to F_min at the scene's release rate
 takeover  from one publisher's force to the next one's, at the same rate
 """
@@ -67,10 +67,13 @@ class Governor:
     "Where the carriages were sent, as a force; None where it is not known what comes."
     expected_N: float | None
     "The force by now along the path of a preview or to a wall, behind the carriages' lag."
-    wall: Wall | None
-    "Of the setpoint that the force follows."
+    law_N: float | None
+    "What was asked for at `law_mm` by a wall, or on the way from one; None where neither is."
+    law_mm: float
     blend_N: float
-    "What is left of the difference of the walls before to this one."
+    "What is left of the difference to another wall, or to none."
+    was_pushing: bool
+    "The handle, at the last plan."
 
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
@@ -120,9 +123,10 @@ class Governor:
             return self._decay(dt_s, lowest_N, age_s, stale)
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
         # what comes is told from what is asked: the least that the device makes is learned, and so it varies
-        asked_N = setpoint.asked_N(travel) + self._blended(setpoint, travel, dt_s)
+        asked_N = setpoint.asked_N(travel)
         allowed_N = min(max(asked_N, self._min_N), self._max_N)
-        force_N, limits = self._within_reach(asked_N, allowed_N, lowest_N, highest_N)
+        blended_N = self._blended(setpoint, travel, allowed_N, dt_s)
+        force_N, limits = self._within_reach(asked_N, blended_N, lowest_N, highest_N)
         if setpoint.is_contested:
             limits = (*limits, Limit.OTHER_SOURCE)
         heard_N = min(max(setpoint.force_N, self._min_N), self._max_N)
@@ -140,7 +144,7 @@ class Governor:
         if self.blend_N != 0.0 and setpoint.wall is None:
             path_N = [within(each_N + self.blend_N, bounds) for each_N in path_N]
         governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
-        if abs(governed_N - force_N) > OUTRUN_N:
+        if self.blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N:
             limits = (*limits, Limit.RATE)
         if self.is_passing and self._passes(path_N[0], dt_s):
             governed_N = self.asked_N + math.copysign(self._release_N_s * dt_s, path_N[0] - self.asked_N)
@@ -167,19 +171,24 @@ class Governor:
             self.slope_N_s = low_pass(self.slope_N_s, slope_N_s, spacing_s, SLOPE_FILTER_S)
         self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
 
-    def _blended(self, setpoint: TimedSetpoint, travel: Travel, dt_s: float) -> float:
-        """What is added to the law of this setpoint, so that the force goes over to it along a ramp."""
-        if setpoint.holder != self.holder or self.stamp_s == -math.inf:
-            self.blend_N = 0.0  # a takeover has a ramp of its own
-        elif setpoint.wall != self.wall:
-            before_N = self.last_N if self.wall is None else self.wall.force_N(travel.place_mm)
-            wall = setpoint.wall
-            self.blend_N += before_N - (setpoint.force_N if wall is None else wall.force_N(travel.place_mm))
-        self.wall = setpoint.wall
-        # one that withdraws is let go at once
-        left_N = max(abs(self.blend_N) - self._release_N_s * dt_s, 0.0) if travel.is_pushing else 0.0
-        self.blend_N = math.copysign(left_N, self.blend_N)
-        return self.blend_N
+    def _blended(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, dt_s: float) -> float:
+        """The force on the way from what another law asked for to `allowed_N`. Updates `blend_N`."""
+        wall, place_mm = setpoint.wall, travel.place_mm
+        before_N = self.law_N
+        if before_N is None and wall is not None and self.stamp_s != -math.inf and self.was_pushing:
+            before_N = self.last_N
+        # a takeover has a ramp of its own, and one that withdraws is let go at once
+        is_ramped = before_N is not None and travel.is_pushing and setpoint.holder == self.holder
+        blended_N = allowed_N
+        if is_ramped and before_N is not None:
+            moved_N = 0.0 if wall is None else wall.stiffness_N_mm * abs(place_mm - self.law_mm)
+            most_N = self._release_N_s * dt_s + moved_N
+            blended_N = within(allowed_N, (before_N - most_N, before_N + most_N))
+        self.blend_N = blended_N - allowed_N
+        is_over = wall is None and self.blend_N == 0.0
+        self.law_N = None if is_over or not travel.is_pushing else blended_N
+        self.law_mm, self.was_pushing = place_mm, travel.is_pushing
+        return blended_N
 
     def _against(
         self,
@@ -197,11 +206,15 @@ class Governor:
             self.sent_N, self.expected_N = None, None
             return [force_N] * len(PATH_S)
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
+        allowed = self._min_N, self._max_N
         wanted_N = [
-            within(wall.force_N(place_mm + rate_mm_s * (lag_s + SPEEDING_UP_S + after_s)) + added_N, bounds)
+            within(
+                within(wall.force_N(place_mm + rate_mm_s * (lag_s + SPEEDING_UP_S + after_s)), allowed) + added_N,
+                bounds,
+            )
             for after_s in TIMES_S
         ]
-        over_N = within(wall.friction_N + added_N, bounds) - wall.friction_N + EARLY_N
+        over_N = within(within(wall.friction_N, allowed) + added_N, bounds) - wall.friction_N + EARLY_N
         most_N = [wall.force_N(place_mm + rate_mm_s * after_s) + over_N for after_s in PATH_S]
         return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
@@ -296,11 +309,11 @@ class Governor:
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
     ) -> tuple[float, tuple[Limit, ...]]:
-        """Of what is asked, what the scene allows of it and the device gives: never over the scene's greatest, unless
-        the open gap itself makes more."""
-        limits: tuple[Limit, ...] = ()
-        if allowed_N != asked_N:
-            limits = (Limit.STANDBY,) if self._least_N <= asked_N < allowed_N else (Limit.RANGE,)
+        """Of what the scene allows, what the device gives: never over the scene's greatest, unless the open gap itself
+        makes more. Its limits are those of `asked_N`, too."""
+        limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._max_N else (Limit.RANGE,)
+        if asked_N < self._min_N and self._least_N < self._min_N:
+            limits = (*limits, Limit.STANDBY)
         if allowed_N < lowest_N:
             return lowest_N, (*limits, Limit.F_MIN)
         if allowed_N > highest_N:
@@ -318,7 +331,7 @@ class Governor:
         """No setpoint is followed."""
         self.stamp_s, self.slope_N_s, self.last_N = -math.inf, 0.0, 0.0
         self.sent_N, self.expected_N = None, None
-        self.wall, self.blend_N = None, 0.0
+        self.law_N, self.law_mm, self.blend_N, self.was_pushing = None, 0.0, 0.0, True
         self.forecast.forget()
 
 

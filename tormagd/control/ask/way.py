@@ -1,7 +1,7 @@
 """Whether the handle pushes on or withdraws.
 
 withdrawing   it has turned back, and either the hand pulls: the force that holds it has changed its sign; or it has
-              come back by SLID_MM
+              come back by SLID_MM. Or the force has turned by UNSEEN_N, and the encoder shows nothing
 
 A held handle that trembles turns back by what bristles give, but its hand goes on pushing: its way stays.
 """
@@ -12,6 +12,8 @@ from tormagd.control.records import AT_REST, Measured, Travel
 
 PULLS_N: Final = 0.1
 "More than noise and drift of a force sensor."
+UNSEEN_N: Final = 0.5
+"Bristles give more than the encoder's reversal before a hand pulls so hard: the encoder stands still."
 SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, 5 N/mm at 1.5 N either way."
 
@@ -22,6 +24,8 @@ class Way:
 
     travel: Travel = AT_REST
     "At the newest measurement; at rest while there is none."
+    changed_mm: float = 0.0
+    "The encoder's place where the way last changed."
 
     def __init__(self, push_sign: int) -> None:
         """`push_sign` is 1 where a handle that pushes on moves to greater places of its encoder, else -1."""
@@ -33,13 +37,18 @@ class Way:
         if measured is None:
             self.travel = Travel(before.place_mm, 0.0, before.is_pushing)
             return self.travel
-        turn = measured.handle.turn
+        turn, place_mm = measured.handle.turn, measured.handle_mm
         # how far it is against the way that it is known to go, and which force resists that
         onward = self._push_sign * turn.direction
         is_pushing = before.is_pushing
-        if (onward > 0.0) != is_pushing:
-            is_pulled = is_sensor_believed and measured.force_N > PULLS_N
-            if is_pulled or turn.displacement_mm(measured.handle_mm) > SLID_MM:
-                is_pushing = not is_pushing
-        self.travel = Travel(self._push_sign * measured.handle_mm, onward * measured.handle.quick_mm_s, is_pushing)
+        has_turned = (onward > 0.0) != is_pushing
+        if is_sensor_believed and measured.force_N > PULLS_N:
+            is_pushing = onward > 0.0
+        elif is_sensor_believed and measured.force_N < -UNSEEN_N:
+            is_pushing = onward < 0.0
+        elif has_turned and min(turn.displacement_mm(place_mm), abs(place_mm - self.changed_mm)) > SLID_MM:
+            is_pushing = not is_pushing
+        if is_pushing != before.is_pushing:
+            self.changed_mm = place_mm
+        self.travel = Travel(self._push_sign * place_mm, onward * measured.handle.quick_mm_s, is_pushing)
         return self.travel
