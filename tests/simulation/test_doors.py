@@ -163,6 +163,7 @@ def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, 
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [
         "t_ns", "force_N", "gap_mm", "left_mm", "right_mm", "handle_mm", "handle_mm_s", "temperature_C",
+        "kinetic_N",
     ]  # fmt: skip
     assert len(rows) > 20
     assert all(int(after["t_ns"]) > int(before["t_ns"]) for before, after in itertools.pairwise(rows))

@@ -19,7 +19,7 @@ SLIP_S = 5e-3
 knows, and the device must not take its own sleep for the host's silence: that would come on top of a stall of the host,
 which it survives for no longer than 50 ms."""
 TRUTH_PERIOD_S = 1e-3
-TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C\n"
+TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C,kinetic_N\n"
 
 
 class PacedDevice(Protocol):
@@ -98,5 +98,5 @@ def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: T
 def _truth_row(truth: Truth, t_ns: int) -> str:
     return (
         f"{t_ns},{truth.force_N:.5f},{truth.gap_mm:.5f},{truth.left_mm:.5f},{truth.right_mm:.5f},"
-        f"{truth.handle_mm:.4f},{truth.handle_mm_s:.3f},{truth.temperature_C:.3f}\n"
+        f"{truth.handle_mm:.4f},{truth.handle_mm_s:.3f},{truth.temperature_C:.3f},{truth.kinetic_N:.5f}\n"
     )
