@@ -13,8 +13,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from machines.host import Host, HostWatch, processor_s
@@ -32,6 +33,7 @@ from tormagd.safety.codes import FAULTS, Fault
 from tormagd_client import Client, ClientError, UnreachableError
 from tormagd_client.messages import MessageError, Telemetry
 
+Found = TypeVar("Found")
 RUN_DIR = Path("run/demo")
 RECORDING = RUN_DIR / "pulse.mcap"
 ADDRESS = "ipc://run/demo/{}"
@@ -137,19 +139,6 @@ class Aborted(NamedTuple):
     spacing_s: float
 
 
-class Course(NamedTuple):
-    """What the processes left behind: the daemon's status before and after, and when the pulse was played."""
-
-    start_s: float
-    end_s: float
-    start_ns: int
-    before: dict[str, Any]
-    after: dict[str, Any]
-    limits: dict[str, float]
-    exit_codes: dict[str, int]
-    core_share: float
-
-
 def profile(duration_s: float = PULSE_S) -> tuple[Array, Array]:
     """Times, s, and forces, N, of the pulse behind its approach."""
     return with_approach(*pulse_profile(duration_s, LEAST_N, MOST_N, RATE_HZ), START_N, RAMP_S, HOLD_S)
@@ -163,10 +152,13 @@ def scored(time_s: Array, asked_N: Array, rendered_N: Array) -> Tracking:
 
 def show(times_s: Array, forces_N: Array, scene: str = "pulse", plant: str = "sample_1") -> Shown | Aborted:
     """Starts the processes, plays the profile with a live view, ends them in order."""
+    return staged(lambda watched: play(watched, times_s, forces_N, scene, plant))
+
+
+def staged(played: Callable[[HostWatch], Found]) -> Found | Aborted:
+    """A show in an empty folder, and the host watched meanwhile; `played` may raise ShowError."""
     shutil.rmtree(RUN_DIR, ignore_errors=True)
     RUN_DIR.mkdir(parents=True)
-    rows, formats = np.column_stack([times_s, forces_N]), ("%.4f", "%.5f")
-    np.savetxt(RUN_DIR / "pulse.csv", rows, formats, delimiter=",", header="t_s,force_N", comments="")
     with (
         (RUN_DIR / "bare_timer.log").open("w") as log,
         HostWatch(DAEMON_FIFO + 1, log) as watched,
@@ -174,9 +166,7 @@ def show(times_s: Array, forces_N: Array, scene: str = "pulse", plant: str = "sa
     ):
         began_s = time.monotonic()
         try:
-            course = play(watched, float(times_s[-1]), scene, plant)
-            watched.end()
-            return judged(course, watched.between(course.start_s, course.end_s), times_s, forces_N)
+            return played(watched)
         except ShowError as error:
             watched.end()
             until_s, spacing_s = early_end(began_s, error.time_s)
@@ -184,79 +174,112 @@ def show(times_s: Array, forces_N: Array, scene: str = "pulse", plant: str = "sa
             return Aborted(error, host, spacing_s)
 
 
-def play(watched: HostWatch, duration_s: float, scene: str, plant: str) -> Course:
-    """One show from the first process to the last. Raises ShowError."""
-    codes: dict[str, int] = {}
-    truth = str(RUN_DIR / "truth.csv")
+class Rig(NamedTuple):
+    """An enabled device, its daemon and who records it; `power_on_s` is the device's, CLOCK_MONOTONIC."""
+
+    simulator: "subprocess.Popen[str]"
+    daemon: "subprocess.Popen[str]"
+    recorder: "subprocess.Popen[str]"
+    client: Client
+    power_on_s: float
+
+    def end(self) -> dict[str, int]:
+        """Ends them in order; their exit codes."""
+        return {
+            "recorder": end(self.recorder, signal.SIGINT),
+            "tormagd": end(self.daemon),
+            "simulator": end(self.simulator),
+        }
+
+
+def start(stack: contextlib.ExitStack, name: str, *arguments: str, is_read: bool = False) -> "subprocess.Popen[str]":
+    """A process that ends with the stack; what it says is in a log of this name."""
+    return begun(stack, RUN_DIR / f"{name}.log", *arguments, is_read=is_read)
+
+
+def enabled(stack: contextlib.ExitStack, watched: HostWatch, scene: str, *device: str) -> Rig:
+    """Starts device, daemon and recorder, homes and enables. `device`: more of its options. Raises ShowError."""
+    options = ("--pty", "--seed", "1", "--truth", str(RUN_DIR / "truth.csv"), *device)
+    simulator = start(stack, "simulator", *own_machine(DEVICE_FIFO, "tormagd.simulation", *options), is_read=True)
+    port, power_on_s = first_line(simulator), time.monotonic()
+    if not port:
+        raise ended("simulator")
+    watched.wait_for("simulated device", simulator.pid)
+    config = RUN_DIR / "tormagd.toml"
+    config.write_text(CONFIG.format(port=port, scene=scene))
+    daemon = start(stack, "tormagd", "-m", "tormagd.daemon.main", "--config", str(config))
+    watched.wait_for("daemon", daemon.pid)
+    # from the first tick on: it also says how a show went that ended early
+    recorder = start(stack, "recorder", *CTL, "record", str(RECORDING))
+    client = stack.enter_context(Client.local(ADDRESS.format("").removeprefix("ipc://").rstrip("/"), ANSWER_S))
+    if not is_linked(client, daemon, PATIENCE_S):
+        if daemon.poll() is not None:
+            raise ended("tormagd")
+        cause = f"the daemon did not reach its device within {PATIENCE_S:.0f} s"
+        raise ShowError(cause, f"look at the logs in {RUN_DIR}", is_of_time=True)
+    arm(client)
+    return Rig(simulator, daemon, recorder, client, power_on_s)
+
+
+def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant: str) -> Shown:
+    """One show from the first process to the last, and its figures, from the device's own truth and the daemon's
+    recording. Raises ShowError."""
+    rows, formats = np.column_stack([times_s, forces_N]), ("%.4f", "%.5f")
+    np.savetxt(RUN_DIR / "pulse.csv", rows, formats, delimiter=",", header="t_s,force_N", comments="")
     with contextlib.ExitStack() as stack:
-
-        def start(name: str, *arguments: str, is_read: bool = False) -> "subprocess.Popen[str]":
-            return begun(stack, RUN_DIR / f"{name}.log", *arguments, is_read=is_read)
-
-        options = ("--pty", "--plant", plant, "--seed", "1", "--truth", truth)
-        simulator = start("simulator", *own_machine(DEVICE_FIFO, "tormagd.simulation", *options), is_read=True)
-        port = first_line(simulator)
-        if not port:
-            raise ended("simulator")
-        watched.wait_for("simulated device", simulator.pid)
-        config = RUN_DIR / "tormagd.toml"
-        config.write_text(CONFIG.format(port=port, scene=scene))
-        daemon = start("tormagd", "-m", "tormagd.daemon.main", "--config", str(config))
-        watched.wait_for("daemon", daemon.pid)
-        # from the first tick on: it also says how a show went that ended early
-        recorder = start("recorder", *CTL, "record", str(RECORDING))
-        client = stack.enter_context(Client.local(ADDRESS.format("").removeprefix("ipc://").rstrip("/"), ANSWER_S))
-        if not is_linked(client, daemon, PATIENCE_S):
-            if daemon.poll() is not None:
-                raise ended("tormagd")
-            cause = f"the daemon did not reach its device within {PATIENCE_S:.0f} s"
-            raise ShowError(cause, f"look at the logs in {RUN_DIR}", is_of_time=True)
-        arm(client)
-        before, start_s, before_s = status(client), time.monotonic(), processor_s(daemon.pid)
+        rig = enabled(stack, watched, scene, "--plant", plant)
+        client, pid = rig.client, rig.daemon.pid
+        before, start_s, before_s = status(client), time.monotonic(), processor_s(pid)
         robot = own_machine(PUBLISHER_FIFO, *CTL[1:], "send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ))
-        publisher = start("publisher", *robot, is_read=True)
-        limits = watch(publisher, daemon, client, duration_s)
+        publisher = start(stack, "publisher", *robot, is_read=True)
+        limits = watch(lambda: publisher.poll() is not None, rig.daemon, client, float(times_s[-1]))
         printed, _ = publisher.communicate(timeout=PATIENCE_S)
         after, end_s = status(client), time.monotonic()
-        core_share = (processor_s(daemon.pid) - before_s) / (end_s - start_s)
+        core_share = (processor_s(pid) - before_s) / (end_s - start_s)
         raise_fault(after)
-        codes["publisher"] = publisher.returncode
-        codes["recorder"] = end(recorder, signal.SIGINT)
-        codes["tormagd"] = end(daemon)
-        codes["simulator"] = end(simulator)
+        exit_codes = {"publisher": publisher.returncode, **rig.end()}
     answer = json.loads(printed)
     if not answer["ok"]:
         raise ShowError(f"the publisher: {answer['error']['message']}", answer["error"]["hint"], is_of_time=True)
-    return Course(start_s, end_s, answer["result"]["start_ns"], before, after, limits, codes, core_share)
-
-
-def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown:
-    """The show's figures, from the device's own truth and the daemon's recording. Raises ShowError."""
+    watched.end()
+    truth = told_truth()
     try:
-        truth = np.genfromtxt(RUN_DIR / "truth.csv", delimiter=",", names=True)
-        spacings_s = np.diff(ticks_s(read_recording(RECORDING).ticks, course.start_s, course.end_s))
-    except (OSError, ValueError) as error:
-        raise ShowError(f"what was recorded cannot be read: {error}", f"look at the logs in {RUN_DIR}") from error
-    axis = (truth["t_ns"] - course.start_ns) * 1e-9
+        spacings_s = np.diff(ticks_s(read_recording(RECORDING).ticks, start_s, end_s))
+    except RecordingError as error:
+        raise unreadable(error) from error
+    axis = (truth["t_ns"] - answer["result"]["start_ns"]) * 1e-9
     inside = (axis >= times_s[0]) & (axis <= times_s[-1])
     if len(spacings_s) == 0 or not inside.any():
         raise ShowError("nothing was recorded", f"look at the logs in {RUN_DIR}")
-    first, last = course.before["rates"]["control"], course.after["rates"]["control"]
+    first, last = before["rates"]["control"], after["rates"]["control"]
     runs, merged = last["runs"] - first["runs"], last["merged"] - first["merged"]
     return Shown(
         time_s=axis[inside],
         asked_N=np.interp(axis[inside], times_s, forces_N),
         rendered_N=truth["force_N"][inside],
         gap_mm=truth["gap_mm"][inside],
-        status=course.after,
-        limits=course.limits,
-        exit_codes=course.exit_codes,
+        status=after,
+        limits=limits,
+        exit_codes=exit_codes,
         kept=runs / max(runs + merged, 1),
         spacing_s=float(np.quantile(spacings_s, FASTEST)),
         worst_stall_ms=float(spacings_s.max()) * 1e3,
-        host=host,
-        core_share=course.core_share,
+        host=watched.between(start_s, end_s),
+        core_share=core_share,
     )
+
+
+def told_truth() -> Any:
+    """What the device wrote of itself: a row for each millisecond of its time. Raises ShowError."""
+    try:
+        return np.genfromtxt(RUN_DIR / "truth.csv", delimiter=",", names=True)
+    except (OSError, ValueError) as error:
+        raise unreadable(error) from error
+
+
+def unreadable(error: Exception) -> ShowError:
+    """Where nothing can be said of a show."""
+    return ShowError(f"what was recorded cannot be read: {error}", f"look at the logs in {RUN_DIR}")
 
 
 def ticks_s(ticks: Columns, start_s: float, end_s: float) -> Array:
@@ -327,15 +350,16 @@ def raise_fault(state: dict[str, Any]) -> None:
 
 
 def watch(
-    publisher: "subprocess.Popen[str]", daemon: "subprocess.Popen[str]", client: Client, duration_s: float
+    is_done: Callable[[], bool], daemon: "subprocess.Popen[str]", client: Client, duration_s: float
 ) -> dict[str, float]:
-    """The live view; the share of telemetry messages in which each limit was held. Raises ShowError."""
+    """The live view until the publisher is done; the share of telemetry messages in which each limit was held. Raises
+    ShowError."""
     is_terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     held: Counter[str] = Counter()
     seen = 0
     start_s = shown_s = time.monotonic()
     until_s = start_s + duration_s + PATIENCE_S
-    while publisher.poll() is None and time.monotonic() < until_s:
+    while not is_done() and time.monotonic() < until_s:
         if daemon.poll() is not None:
             raise ended("tormagd")
         try:
@@ -357,7 +381,7 @@ def watch(
             print(f"\r\x1b[K{line}" if is_terminal else line, end="" if is_terminal else "\n", flush=True)
     if is_terminal:
         print()
-    if publisher.poll() is None:
+    if not is_done():
         raise ShowError(
             f"the publisher was not done {PATIENCE_S:.0f} s after the pulse's end",
             f"look at the logs in {RUN_DIR}",
