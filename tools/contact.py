@@ -22,7 +22,19 @@ from pathlib import Path
 
 import numpy as np
 from rendering.device_draws import SAMPLES, SECOND
-from rendering.touching import COUNTED_N, FREE_MM, HELD_N, MASS_KG, ONSET_N, Case, Touch, core_of, ideal, rendered
+from rendering.touching import (
+    COUNTED_N,
+    FREE_MM,
+    HELD_N,
+    MASS_KG,
+    ONSET_N,
+    Case,
+    Touch,
+    core_of,
+    ideal,
+    reached_ms,
+    rendered,
+)
 from tqdm import tqdm
 
 from tormagd.lab.arrays import Json, Mask, rms
@@ -98,9 +110,7 @@ def judged(case: Case) -> Json:
         "rms_bound_N": rms_N(bound, case.wall_N_mm, waiting_N),
         "felt_1_2_N_ms": reached_ms(run, case.wall_N_mm, 1.2),
         "felt_stiffness_ratio": felt_stiffness_ratio(run, case.wall_N_mm),
-        "free_drag_N": float(
-            run.force_N[(run.depth_mm < -2.0) & (run.depth_mm > -0.5 * FREE_MM) & pushing(run)].mean()
-        ),
+        "free_drag_N": free_drag_N(run),
         "standby_N": None if not force.standby_N else force.standby_N,
         "withdrawal_held_ms": held_ms(run, waiting_N),
         "withdrawal_bound_ms": held_ms(bound, waiting_N),
@@ -125,15 +135,6 @@ def pushing(touch: Touch) -> Mask:
     """The rows before the hand turns."""
     found: Mask = touch.time_s < touch.time_s[-1] / 2.0
     return found
-
-
-def reached_ms(touch: Touch, wall_N_mm: float, force_N: float) -> float | None:
-    """From when the wall's force at the handle's place reaches it to when the kinetic force does; None where either
-    never does."""
-    there, felt = wall_N_mm * touch.depth_mm >= force_N, touch.kinetic_N >= force_N
-    if not (there.any() and felt.any()):
-        return None
-    return 1e3 * float(touch.time_s[felt.argmax()] - touch.time_s[there.argmax()])
 
 
 def onset_lag_ms(touch: Touch, wall_N_mm: float, waiting_N: float) -> float | None:

@@ -49,7 +49,7 @@ MASS_KG = 0.15
 
 class Case(NamedTuple):
     """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without; jitter
-    and loss are the network's."""
+    and loss are the network's. `is_known`: a law tells the wall before it was met."""
 
     device: str
     hand_N_mm: float
@@ -59,6 +59,7 @@ class Case(NamedTuple):
     mode: str
     jitter_ms: float = 0.0
     loss: float = 0.0
+    is_known: bool = True
 
 
 class Touch(NamedTuple):
@@ -75,6 +76,15 @@ class Touch(NamedTuple):
     limits: tuple[str, ...]
 
 
+def reached_ms(touch: Touch, wall_N_mm: float, force_N: float) -> float | None:
+    """From when the wall's force at the handle's place reaches it to when the kinetic force does; None where either
+    never does."""
+    there, felt = wall_N_mm * touch.depth_mm >= force_N, touch.kinetic_N >= force_N
+    if not (there.any() and felt.any()):
+        return None
+    return 1e3 * float(touch.time_s[felt.argmax()] - touch.time_s[there.argmax()])
+
+
 class Link:
     """A patient behind the network, and the newest setpoint that has come from there."""
 
@@ -83,6 +93,7 @@ class Link:
         self._there: Delay[float] = Delay(one_way_s, jitter_s, case.loss, BURST, seed=1)
         self._back: Delay[TimedSetpoint] = Delay(one_way_s, jitter_s, case.loss, BURST, seed=2)
         self._wall, self._withdraw_N, self._mode = wall, withdraw_N, case.mode
+        self._is_known = case.is_known
         self._tip: tuple[float, float] | None = None
         self._newest: TimedSetpoint | None = None
         self._ticks = 0
@@ -103,7 +114,8 @@ class Link:
 
     def _setpoint(self, now_s: float, tip_mm: float) -> TimedSetpoint:
         withdraw_N = None if self._mode.startswith("force") else self._withdraw_N
-        wall = self._wall if self._mode.startswith("law") else None
+        self._is_known = self._is_known or tip_mm > self._wall.place_mm
+        wall = self._wall if self._mode.startswith("law") and self._is_known else None
         return TimedSetpoint(self._wall.force_N(tip_mm), now_s, VALID_S, withdraw_N=withdraw_N, wall=wall)
 
 
