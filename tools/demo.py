@@ -1,12 +1,12 @@
-"""`make run`: a measured human pulse through the whole path, on simulated hardware, in real time.
+"""`make run`: what a hand feels of a wall, then a measured human pulse, through the whole path, in real time.
 
     publisher --ZeroMQ--> tormagd --serial, a pty--> virtual firmware --> plant
 
-Each part is a process of its own, as it would be beside a console; `rendering/show.py` starts them and watches, this
-one judges and sums up. What is called rendered is the plant's friction force at the roller, never the controller's
-prediction. A show that the host disturbed is told as that, and started again; the same pulse in virtual time needs no
-host. At the end the ordered loops are shown, for some seconds each: the search in torch, and the thesis's own; they
-decide nothing.
+Hardware is simulated. Each part is a process of its own, as it would be beside a console; `rendering/show.py` starts
+them and watches, `rendering/live_touch.py` has the hand, which decides nothing, this one judges the pulse and sums up.
+What is called rendered is the plant's friction force at the roller, never the controller's prediction. A show that the
+host disturbed is told as that, and started again; the same pulse in virtual time needs no host. At the end the ordered
+loops are shown, for some seconds each: the search in torch, and the thesis's own; they decide nothing.
 """
 
 import argparse
@@ -15,12 +15,14 @@ import contextlib
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from rendering.following import Case, Rehearsals, Tracking, rehearse
+from rendering.live_touch import FELT_N, PUSH_MM_S, ROUND_TRIP_MS, Wall, felt, figures, lateness
 from rendering.show import (
     LEAST_N,
     MOST_N,
@@ -32,10 +34,12 @@ from rendering.show import (
     profile,
     scored,
     show,
+    staged,
 )
+from rendering.touching import Touch
 
 from tormagd.config import Config
-from tormagd.lab.arrays import Array
+from tormagd.lab.arrays import Array, Json
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.endpoints import ConfigError
 
@@ -75,6 +79,10 @@ def main() -> int:
     times_s, forces_N = profile()
     config = Config(scene="pulse")
     scene = load_scene(config.scene)
+    print("A hand pushes into two walls and draws back; it feels the brake of a simulated device, through the daemon.")
+    with folder("touch"):
+        touched = staged(felt)
+    print("", *touch_told(scene, touched)[1], "", sep="\n")
     print("A measured human pulse (photoplethysmogram, heartpy) as a force, through the daemon and a simulated device.")
     for number in range(1, SHOWS + 1):
         shown = show(times_s, forces_N)
@@ -86,7 +94,7 @@ def main() -> int:
     rehearsals = rehearse_all(config, times_s, forces_N)
     print("The same pulse, its field searched as it was ordered, in real time:")
     ordered = show_ordered()
-    return conclude(scene, shown, rehearsals, ordered, verdict, sentence, time.monotonic() - started_s)
+    return conclude(scene, touched, shown, rehearsals, ordered, verdict, sentence, time.monotonic() - started_s)
 
 
 def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
@@ -167,19 +175,27 @@ def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> Rehearsals:
     return done
 
 
+@contextlib.contextmanager
+def folder(name: str) -> Iterator[None]:
+    """A show's own, beside the demonstration's."""
+    path = Path("run") / name
+    path.mkdir(parents=True, exist_ok=True)
+    with contextlib.chdir(path):
+        yield
+
+
 def show_ordered() -> dict[str, Shown | Aborted]:
     """Each ordered loop live, in a folder of its own beside the demonstration's."""
     done: dict[str, Shown | Aborted] = {}
     for label, name in ORDERED.items():
-        folder = Path("run") / name
-        folder.mkdir(parents=True, exist_ok=True)
-        with contextlib.chdir(folder):
+        with folder(name):
             done[label] = show(*profile(ORDERED_PULSE_S), str(SCENES / f"{name}.toml"))
     return done
 
 
 def conclude(
     scene: Scene,
+    touched: dict[Wall, Touch] | Aborted,
     shown: Shown | Aborted,
     rehearsals: Rehearsals,
     ordered: dict[str, Shown | Aborted],
@@ -192,6 +208,7 @@ def conclude(
     print_forces(shown, rehearsals)
     print_ordered(shown, ordered)
     summary: dict[str, Any] = {
+        "touch": touch_told(scene, touched)[0],
         "virtual_time": {case.label: found.since(PULSE_START_S)._asdict() for case, found in rehearsals.items()},
         "host": shown.host._asdict(),
         "verdict": verdict.name,
@@ -199,11 +216,15 @@ def conclude(
         "seconds": round(seconds, 1),
     }
     written = [f"figures {RUN_DIR / 'summary.json'}"]
+    from rendering.pictures import show_picture, touch_picture
+
+    if isinstance(touched, dict):
+        picture = RUN_DIR / "touch.png"
+        touch_picture(picture, touched, touch_told(scene, touched)[1])
+        written = [f"picture {picture}", *written]
     if isinstance(shown, Shown):
         print_timing(shown)
         met = checks(scene, shown) | in_virtual_time
-        from rendering.pictures import show_picture
-
         picture = RUN_DIR / "pulse.png"
         show_picture(picture, scene, shown, rehearsals, force_table(shown, rehearsals))
         written = [f"recording {RECORDING}", f"picture {picture}", *written]
@@ -238,6 +259,23 @@ def virtual_time_checks(scene: Scene, rehearsals: Rehearsals) -> dict[str, bool]
         "every case in virtual time done": len(rehearsals) == len(CASES),
         f"RMS error <= {most_N:g} N in virtual time": first is not None and first.since(PULSE_START_S).rms_N <= most_N,
     }
+
+
+def touch_told(scene: Scene, touched: dict[Wall, Touch] | Aborted) -> tuple[Json, list[str]]:
+    """What the hand felt of each wall, as figures and as lines; or what ended its show early."""
+    if isinstance(touched, Aborted):
+        _, sentence = judge(scene, touched)
+        return {"ended_early": sentence}, [sentence]
+    found = {wall: figures(wall, run) for wall, run in touched.items()}
+    lines = [
+        f"walls met at {PUSH_MM_S:g} mm/s over a round trip of {ROUND_TRIP_MS:g} ms, as the hand felt them:",
+        f"  {'':15s} {'there':>7s} {'felt':>7s} {f'{FELT_N:g} N felt':>11s}  by ideal carriages",
+    ]
+    for wall, told in found.items():
+        late, bound = (lateness(told[key]) for key in ("felt_later_ms", "bound_later_ms"))
+        name = f"{wall.name}, {wall.stiffness_N_mm:g} N/mm"
+        lines.append(f"  {name:15s} {told['wall_N']:5.2f} N {told['felt_N']:5.2f} N {late:>11s}  {bound}")
+    return {wall.name: told for wall, told in found.items()}, lines
 
 
 def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:

@@ -1,5 +1,6 @@
 """What `make run` says: its verdict on made-up shows, its live line, and its table, which is the README's sample."""
 
+import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,13 +10,18 @@ import demo
 import numpy as np
 import pytest
 from machines.host import Host
-from rendering import show
+from rendering import live_touch, show
 from rendering.following import Case, Followed, rehearse
+from rendering.pictures import touch_picture
+from rendering.touching import Case as Touching, Touch, ideal, reached_ms
 
-from tormagd.config import Config
+from tormagd.assembly.build import at_rates_of, build_core
+from tormagd.config import Config, Rates
 from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.safety.codes import FAULTS, Fault, Limit
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation import patient
+from tormagd.simulation.hand import FeltHand, parse_hand
 from tormagd_client.messages import VERSION, Telemetry, Tick
 
 README = Path(__file__).parents[2] / "README.md"
@@ -170,18 +176,21 @@ def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_cod
     found, sentence = demo.judge(SCENE, show_)
     assert found is verdict
     ordered = {"torch": show_, "thesis": aborted("PLAN_FAILED", QUIET)}  # which decide nothing
-    assert demo.conclude(SCENE, show_, rehearsals(), ordered, found, sentence, 60.0) == exit_code
+    assert demo.conclude(SCENE, touched(), show_, rehearsals(), ordered, found, sentence, 60.0) == exit_code
     printed = capsys.readouterr().out
     assert "ended early: PLAN_FAILED" in printed
     assert [case.label for case in demo.CASES if f"virtual time, {case.label}" not in printed] == []
     assert ("no verdict after 3 shows" in printed) == (exit_code == 3)
-    assert (tmp_path / "summary.json").is_file()
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert list(summary["touch"]) == [wall.name for wall in live_touch.WALLS]
 
 
 def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     for verdict in (demo.Verdict.MET, demo.Verdict.HOST):
-        assert demo.conclude(SCENE, shown(), dict(list(rehearsals().items())[1:]), {}, verdict, "", 60.0) == 1
+        assert (
+            demo.conclude(SCENE, touched(), shown(), dict(list(rehearsals().items())[1:]), {}, verdict, "", 60.0) == 1
+        )
     assert "MISSED every case in virtual time done" in capsys.readouterr().out
 
 
@@ -191,3 +200,111 @@ def test_every_case_of_the_demo_is_played(case: Case) -> None:
     done = rehearse(Config(scene="pulse"), case, times_s, 1.5 + 0.1 * np.sin(2.0 * np.pi * times_s))
     assert np.isfinite(done.rendered_N).all()
     assert len(done.rendered_N) > 250
+
+
+# -- the hand that feels a wall ----------------------------------------------------------------------------------------
+
+
+def truth(push: int, wall: live_touch.Wall, most_mm: float, late_ms: int, waiting_N: float = 0.9) -> np.ndarray:
+    """A device's rows of a hand that goes 0.02 mm further each millisecond, and rests; what it feels comes late."""
+    first, lasts = round(1e3 * live_touch.begins_s(push)), round(2e3 * live_touch.HALF_S)
+    rows = np.zeros(first + lasts, [(name, float) for name in ("handle_mm", "handle_mm_s", "kinetic_N", "force_N")])
+    pushed_mm = np.minimum(0.02 * np.arange(lasts), wall.place_mm + most_mm)
+    wall_N = wall.stiffness_N_mm * np.maximum(pushed_mm - wall.place_mm, 0.0)
+    rows["handle_mm"] = 1.5
+    rows["handle_mm"][first:] += pushed_mm
+    rows["kinetic_N"] = waiting_N
+    rows["kinetic_N"][first + late_ms :] = np.maximum(wall_N[: lasts - late_ms], waiting_N)
+    rows["force_N"] = rows["kinetic_N"]
+    return rows
+
+
+STIFF = tuple(wall._replace(stiffness_N_mm=5.0 * wall.stiffness_N_mm) for wall in live_touch.WALLS)
+
+
+def touched(late_ms: int = 150) -> dict[live_touch.Wall, Touch]:
+    """Both walls pressed 4 mm in, felt late."""
+    return {wall: live_touch.touch_of(truth(push, wall, 4.0, late_ms), push, wall) for push, wall in enumerate(STIFF)}
+
+
+BOUND_MS = live_touch.bound_ms
+
+
+@pytest.fixture(autouse=True)
+def _bound(monkeypatch) -> None:
+    monkeypatch.setattr(live_touch, "bound_ms", lambda wall: 100.0)
+
+
+def test_a_patient_begins_before_the_push_that_is_his() -> None:
+    stroke_s = 2.0 * live_touch.HALF_S
+    assert [live_touch.next_push(now_s) for now_s in (0.0, 9.0, 9.9, 10.0)] == [0, 0, 1, 1]
+    assert live_touch.next_push(10.0 + stroke_s - live_touch.REST_S + live_touch.STAYS_S) == 1
+    assert live_touch.begins_s(2) - live_touch.begins_s(1) == pytest.approx(stroke_s)
+
+
+def test_the_hands_word_is_one_that_the_simulated_device_takes_and_begins_when_the_pushes_do() -> None:
+    hand = parse_hand(live_touch.HAND)
+    assert isinstance(hand, FeltHand)
+    begins_s = live_touch.begins_s(1)
+    assert hand.position_mm(begins_s) == pytest.approx(0.0, abs=1e-6)
+    assert hand.position_mm(begins_s + 0.1) == pytest.approx(0.1 * live_touch.PUSH_MM_S)
+    assert hand.position_mm(begins_s + live_touch.HALF_S - 1e-3) == live_touch.REACH_MM
+
+
+def test_a_patients_word_is_one_that_it_takes() -> None:
+    for wall in live_touch.WALLS:
+        words = live_touch.patient_of(wall)
+        options = patient.parser().parse_args(words[words.index("tormagd.simulation.patient") + 1 :])
+        assert (options.wall_mm, options.stiffness_N_mm, options.mode) == (wall.place_mm, wall.stiffness_N_mm, "law")
+        assert options.delay_ms == live_touch.ROUND_TRIP_MS / 2.0
+
+
+def test_a_push_is_found_in_what_the_device_wrote_and_told_as_late_as_it_was() -> None:
+    for wall, run in touched().items():
+        assert (run.time_s[0], run.depth_mm[0]) == (0.0, pytest.approx(-wall.place_mm))
+        told = live_touch.figures(wall, run)
+        assert told["felt_later_ms"] == pytest.approx(150.0)
+        assert told["wall_N"] == pytest.approx(told["felt_N"]) == 4.0 * wall.stiffness_N_mm
+
+
+def test_the_hands_lines_are_those_of_the_readme_and_its_picture_is_drawn(tmp_path) -> None:
+    _, lines = demo.touch_told(SCENE, touched())
+    (sample,) = re.findall(r"```\n(walls met .*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    figure = re.compile(r"-?\d+\.\d\d N|\d+ ms (late|early)|\d\.\d+ N/mm| +")
+    assert [figure.sub("", line) for line in lines] == [figure.sub("", line) for line in sample.splitlines()]
+    touch_picture(tmp_path / "touch.png", touched(), lines)
+    assert (tmp_path / "touch.png").stat().st_size > 10_000
+
+
+def test_ideal_carriages_do_not_know_a_wall_before_it_was_met() -> None:
+    stiff = live_touch.WALLS[1]
+    case = Touching("sample_1", live_touch.HAND_N_MM, stiff.stiffness_N_mm, live_touch.PUSH_MM_S, 120.0, "law_standby")
+    known_ms = reached_ms(ideal(case), stiff.stiffness_N_mm, live_touch.FELT_N)
+    unknown_ms = BOUND_MS(stiff)
+    assert known_ms is not None
+    assert unknown_ms is not None
+    assert unknown_ms > known_ms + live_touch.ROUND_TRIP_MS
+
+
+def test_the_scene_of_the_hand_is_one_that_its_daemon_takes() -> None:
+    scene = load_scene(str(live_touch.SCENE))
+    config = at_rates_of(scene, Config(scene=str(live_touch.SCENE), rates=Rates(of_scene=True)))
+    assert build_core(config, scene).portrait.min_N < scene.force.waiting_N < live_touch.FELT_N
+
+
+def test_a_wall_that_is_never_felt_is_told_as_that() -> None:
+    assert [live_touch.lateness(later_ms) for later_ms in (None, 0.0, 12.4, -3.0)] == [
+        "never",
+        "0 ms late",
+        "12 ms late",
+        "3 ms early",
+    ]
+
+
+def test_a_fault_of_the_hands_show_is_told_as_the_pulses_and_decides_nothing(monkeypatch, tmp_path) -> None:
+    early = aborted("MEASUREMENT_STALE", STALLED)
+    sentence = demo.judge(SCENE, early)[1]
+    assert demo.touch_told(SCENE, early) == ({"ended_early": sentence}, [sentence])
+    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
+    assert demo.conclude(SCENE, early, shown(), rehearsals(), {}, demo.Verdict.MET, "", 60.0) == 0
+    assert not (tmp_path / "touch.png").exists()
