@@ -162,7 +162,7 @@ def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: floa
     """The fastest the plant can do, s: the rise from 10 to 90 %, and from rest to rest. Bang-bang: the latest switch
     that still comes to rest at the target, by bisection."""
     low, high = 0.0, 4.0
-    for _ in range(30):
+    for _ in range(16):  # to less than a tick of the plant
         middle = (low + high) / 2.0
         gap, _ = bang_bang(parameters, start_mm, distance_mm, middle)
         if abs(gap[-1] - start_mm) < abs(distance_mm):

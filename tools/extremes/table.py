@@ -60,7 +60,7 @@ from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.link_statistics import DeviceClock
 from tormagd.hardware.measurement import Measurement
-from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
+from tormagd.inverse.choice import RUNTIME_SOLVERS, Choice, build, named
 from tormagd.model.displacement import MOBILISED_MM, Turn
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
@@ -471,6 +471,11 @@ def curve(_: object, draw: Draw) -> object:
     return [made.force_N(field_mT), *made.force_and_slope(field_mT), made.confidence(field_mT, draw.bounded(0.1))]
 
 
+def coarse(solver: str) -> Choice:
+    """A search by its name, on few fields: a number travels through one as through a thousand, row by row."""
+    return named(solver)._replace(step_mT=10.0)
+
+
 def search(stage: Any, draw: Draw) -> object:
     found = stage.solve(core().element.nominal.only, draw(1.2), draw(200.0) if draw.steps % 2 else None)
     return [found.field_mT, found.predicted_force_N, found.confidence]
@@ -581,7 +586,7 @@ def stages() -> list[Stage]:
         Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT, PLAN_S),
         Stage("model/force_curve", lambda: None, curve),
         *[
-            Stage(f"inverse: {name}", partial(build, named(name), range_mT, model, rises=True), search)
+            Stage(f"inverse: {name}", partial(build, coarse(name), range_mT, model, rises=True), search)
             for name in RUNTIME_SOLVERS
         ],
         Stage("inverse: portrait", lambda: PortraitSearch(made.portrait, element.field), search),

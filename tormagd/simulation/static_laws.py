@@ -4,7 +4,7 @@ They are formulas over arrays, asked once, when a device is made; what a tick ne
 """
 
 import math
-from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 
@@ -39,19 +39,19 @@ def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
 
 def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
     """Attraction between the magnets over the gap, N: the closed form in air times the factor for the iron shaft."""
-    width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
-    magnet = CuboidMagnet(width_mm * 1e-3, depth_mm * 1e-3, thickness_mm * 1e-3, plant.magnets.remanence_T)
-    return plant.assumed.attraction_factor * attraction_N(gap_mm, magnet)
+    return plant.assumed.attraction_factor * attraction_N(gap_mm, _magnet(plant))
 
 
 def moment_over_gap(plant: PlantParameters) -> Curve:
     """`radial_moment_Tm` over every gap the device can reach, mm to T m."""
-    return _over_gap(lambda gap_mm: radial_moment_Tm(gap_mm, plant), plant)
+    ends_mm = _reached_mm(plant)
+    return Curve(radial_moment_Tm(_gaps_mm(*ends_mm), plant).tolist(), *ends_mm)
 
 
 def pull_over_gap(plant: PlantParameters) -> Curve:
     """`pull_of_magnets_N` over every gap the device can reach, mm to N."""
-    return _over_gap(lambda gap_mm: pull_of_magnets_N(gap_mm, plant), plant)
+    ends_mm = _reached_mm(plant)
+    return Curve((plant.assumed.attraction_factor * _attraction_N(_magnet(plant), *ends_mm)).tolist(), *ends_mm)
 
 
 def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: float) -> Curve:
@@ -64,16 +64,28 @@ def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: f
         relative_permeability=plant.elastomer.relative_permeability,
         friction_coefficient=plant.elastomer.kinetic_friction,
     )
-    return _tabulated(
-        lambda moment_Tm: brake_force_N(moment_Tm, elastomer, TORMAG), weakest_Tm, strongest_Tm, MOMENT_POINTS
-    )
+    return Curve(_brake_force_N(elastomer, weakest_Tm, strongest_Tm).tolist(), weakest_Tm, strongest_Tm)
 
 
-def _over_gap(law: Callable[[FloatArray], FloatArray], plant: PlantParameters) -> Curve:
-    start_mm, end_mm = 2.0 * plant.closed_stop_mm, 2.0 * plant.open_stop_mm
-    return _tabulated(law, start_mm, end_mm, math.ceil((end_mm - start_mm) / GRID_MM) + 1)
+def _magnet(plant: PlantParameters) -> CuboidMagnet:
+    width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
+    return CuboidMagnet(width_mm * 1e-3, depth_mm * 1e-3, thickness_mm * 1e-3, plant.magnets.remanence_T)
 
 
-def _tabulated(law: Callable[[FloatArray], FloatArray], start: float, end: float, points: int) -> Curve:
-    values: list[float] = law(np.linspace(start, end, points)).tolist()
-    return Curve(values, start, end)
+def _reached_mm(plant: PlantParameters) -> tuple[float, float]:
+    return 2.0 * plant.closed_stop_mm, 2.0 * plant.open_stop_mm
+
+
+def _gaps_mm(start_mm: float, end_mm: float) -> FloatArray:
+    return np.linspace(start_mm, end_mm, math.ceil((end_mm - start_mm) / GRID_MM) + 1)
+
+
+# the two that take longer than all else of a device: who makes many mostly makes them of the same parts
+@lru_cache(maxsize=8)
+def _attraction_N(magnet: CuboidMagnet, start_mm: float, end_mm: float) -> FloatArray:
+    return attraction_N(_gaps_mm(start_mm, end_mm), magnet)
+
+
+@lru_cache(maxsize=8)
+def _brake_force_N(elastomer: Elastomer, weakest_Tm: float, strongest_Tm: float) -> FloatArray:
+    return brake_force_N(np.linspace(weakest_Tm, strongest_Tm, MOMENT_POINTS), elastomer, TORMAG)
