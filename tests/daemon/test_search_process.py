@@ -119,12 +119,11 @@ def answered(process: SearchProcess, until: int = -1) -> Answer | None:
 
 
 def test_a_search_that_is_gone_answers_no_more_and_one_that_cannot_start_is_refused(
-    core: Core, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    core: Core, process: SearchProcess, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     elsewhere = msgspec.structs.replace(core.scene.insert, model="none.safetensors")
     with pytest.raises(ConfigError, match=r"solver\.name = 'thesis': its process did not start"):
         SearchProcess(core._replace(models=tmp_path, scene=msgspec.structs.replace(core.scene, insert=elsewhere)))
-    process = SearchProcess(core)
     process.close()
     for _ in range(3):
         process.ask(Question(7.0, 2.0, 42.0, 1.5, 300.0))

@@ -187,8 +187,9 @@ class Bench:
     def home(self) -> None:
         self.hello()
         self.command(Home)
-        for _ in range(100):
-            self.drive(0.0, 0.0, DriveMode.OFF, 50)
+        for _ in range(500):
+            self.drive(0.0, 0.0, DriveMode.OFF)
+            self.tick(9)
             if self.twins.mode is not DeviceMode.HOMING:
                 break
 
@@ -328,12 +329,16 @@ def told() -> Twins:
     bench.drive(-1.0, -1.0, count=600)  # OVERCURRENT, then RETRACT_FAILED: a stall
     # RETRACT_FAILED: a motor without current, at once; at a travelling one only after 8 s; not creeping at a stalling
     # current: 0.05 mm in 0.3 s is progress enough
-    for current_A, drift_mm_s, ticks in ((0.01, 0.0, 700), (0.025, 0.0, 8300), (3.5, 0.18, 700)):
+    for current_A, drift_mm_s, ticks, tick_s in (
+        (0.01, 0.0, 700, TICK_S),
+        (0.025, 0.0, 830, 10.0 * TICK_S),
+        (3.5, 0.18, 700, TICK_S),
+    ):
         bench.restart()
         bench.drive(-1.0, -1.0, count=50)
         carriages.held, carriages.current_A, carriages.drift_mm_s = True, current_A, drift_mm_s
         bench.command(Retract)
-        bench.tick(ticks)
+        bench.tick(ticks, tick_s)
     for drift_mm_s in (-5.0, 3.0):  # UNCOMMANDED_MOTION: inward, and outward from rest
         bench.restart()
         bench.tick(150)

@@ -126,7 +126,10 @@ SUBJECTS = {
     "nearest": Subject(lambda model: NearestFieldSearch(field_grid(REACHED_MT, 2.0)), 5e-3),
     "torch": Subject(lambda model: NearestFieldSearch(GRID_MT, 8, ordered.batch(model, GRID_MT)), 5e-3),
     "newton": Subject(lambda model: RisingSearch(REACHED_MT), ACCURACY_MT, needs_rising=True),
-    "thesis": Subject(lambda model: ordered.RowByRow(GRID_MT, 0.01, ordered.row(model)), 5.0, False),
+    # a pass of torch for each row: few rows
+    "thesis": Subject(
+        lambda model: ordered.RowByRow(field_grid(REACHED_MT, 5.0), 0.01, ordered.row(model)), 5.0, False
+    ),
     "every row": Subject(lambda model: ordered.RowByRow(GRID_MT, 0.0, by_curve), 0.51, False),
 }
 ANY_SHAPE = [name for name, subject in SUBJECTS.items() if not subject.needs_rising]
