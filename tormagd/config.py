@@ -5,7 +5,7 @@ orderings are refused with the key's path, the value and what is allowed.
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -61,8 +61,11 @@ class Sources(Strict, frozen=True):
 class Handle(Strict, frozen=True):
     """The handle of the brake."""
 
-    push_sign: Literal[1, -1] = 1
+    push_sign: Annotated[int, Meta(ge=-1, le=1)] = 1
     "1 where pushing on moves the handle to greater places of its encoder, else -1."
+
+    def __post_init__(self) -> None:
+        require(self.push_sign != 0, "handle.push_sign", self.push_sign, "1 or -1")
 
 
 class Rates(Strict, frozen=True):

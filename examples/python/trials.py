@@ -34,7 +34,9 @@ class Wall(threading.Thread):
         super().__init__(daemon=True)
         self._folder, self._stiffness_N_mm = folder, stiffness_N_mm
         self._ended = threading.Event()
-        self.error: ClientError | None = None
+        self.error: Exception | None = None
+        self.is_felt = False
+        "The brake was enabled, and followed this wall, at some time."
 
     def run(self) -> None:
         """See Thread.run."""
@@ -44,14 +46,16 @@ class Wall(threading.Thread):
                 while not self._ended.wait(PERIOD_S):
                     for state in client.telemetry():
                         start_mm = state.handle_mm if start_mm is None else start_mm
+                        said = state.verdict
+                        self.is_felt |= state.operating_state == "ENABLED" and said is not None and said.source == "trials"
                     if start_mm is not None:
                         contact = {"handle_mm": start_mm + WALL_MM, "stiffness_N_mm": self._stiffness_N_mm}
                         client.publish(0.0, 200.0, contact=contact, withdraw_cf=0.0)
-        except ClientError as error:
+        except (ClientError, ValueError) as error:
             self.error = error
 
     def end(self) -> None:
-        """Waits until nothing is published any more. Raises ClientError where it could not be."""
+        """Waits until nothing is published any more. Raises ClientError or ValueError where it could not be."""
         self._ended.set()
         self.join()
         if self.error is not None:
@@ -73,26 +77,31 @@ def interval(right: int, count: int) -> tuple[float, float]:
     return (middle - half) / (1 + z * z / count), (middle + half) / (1 + z * z / count)
 
 
-def offered(folder: str, stiffness_N_mm: float, number: int, say: Callable[[str], str]) -> None:
-    """One wall, until the operator is done with it."""
+def offered(folder: str, stiffness_N_mm: float, number: int, say: Callable[[str], str]) -> bool:
+    """One wall, until the operator is done with it; whether there was one to feel."""
     wall = Wall(folder, stiffness_N_mm)
     wall.start()
     say(f"  wall {number}: push, draw back to where you began, then press Enter ")
     wall.end()
+    return wall.is_felt
 
 
-def run(folder: str, writer: Callable[[list[object]], object], trials: list[tuple[float, bool]], say: Callable[[str], str]) -> dict[float, list[bool]]:
-    """All pairs; for each ratio, whether the stiffer wall was told."""
+def run(
+    folder: str, write: Callable[[list[object]], object], trials: list[tuple[float, bool]], say: Callable[[str], str]
+) -> dict[float, list[bool]]:
+    """All pairs; for each ratio, whether the stiffer wall was told. A pair of which a wall was missing is void."""
     told: dict[float, list[bool]] = {ratio: [] for ratio in RATIOS}
     for number, (ratio, is_first) in enumerate(trials, start=1):
         print(f"pair {number} of {len(trials)}")
-        stiffer_N_mm = ratio * REFERENCE_N_MM
-        for place, stiffness_N_mm in enumerate((stiffer_N_mm, REFERENCE_N_MM) if is_first else (REFERENCE_N_MM, stiffer_N_mm), start=1):
-            offered(folder, stiffness_N_mm, place, say)
+        walls_N_mm = [ratio * REFERENCE_N_MM, REFERENCE_N_MM][:: 1 if is_first else -1]
+        there = [offered(folder, each_N_mm, place, say) for place, each_N_mm in enumerate(walls_N_mm, start=1)]
+        if not all(there):
+            print("  void: the brake was not enabled, or another source holds it: tormagctl status")
+            continue
         while (answer := say("  which was stiffer, 1 or 2? ").strip()) not in ("1", "2"):
             pass
         told[ratio].append((answer == "1") == is_first)
-        writer([number, ratio, 1 if is_first else 2, answer])
+        write([number, ratio, 1 if is_first else 2, answer])
     return told
 
 
@@ -104,13 +113,13 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=16)
     parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(1_000_000))
     options = parser.parse_args()
-    with open(options.out, "x", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow([f"trial (seed {options.seed})", "ratio", "stiffer", "answer"])
-        try:
+    try:
+        with open(options.out, "x", newline="", encoding="utf-8") as file:
+            rows = csv.writer(file)
+            rows.writerow([f"trial (seed {options.seed})", "ratio", "stiffer", "answer"])
             told = run(options.folder, rows.writerow, pairs(options.pairs, options.seed), input)
-        except ClientError as error:
-            sys.exit(str(error))
+    except (ClientError, OSError, ValueError, EOFError) as error:
+        sys.exit(f"ended early: {error}")
     for ratio, answers in told.items():
         if answers:
             low, high = interval(sum(answers), len(answers))

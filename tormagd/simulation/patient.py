@@ -58,10 +58,12 @@ class Patient:
         beat_mm: float = 0.0,
         beat_hz: float = 1.2,
     ) -> None:
-        if not (lag_s > 0.0 and 0.0 < stiffness_N_mm < math.inf and 0.0 <= friction_N < buckling_N):
+        is_wall = not math.isnan(wall_mm) and 0.0 < stiffness_N_mm < math.inf
+        if not (lag_s > 0.0 and is_wall and 0.0 <= friction_N < buckling_N):
             raise ValueError(
-                f"lag_s = {lag_s}, stiffness_N_mm = {stiffness_N_mm}, friction_N = {friction_N}, buckling_N = "
-                f"{buckling_N}: allowed are a lag and a stiffness above 0, and a friction from 0 to under buckling_N"
+                f"lag_s = {lag_s}, wall_mm = {wall_mm}, stiffness_N_mm = {stiffness_N_mm}, friction_N = {friction_N}, "
+                f"buckling_N = {buckling_N}: allowed are a lag and a stiffness above 0, and a friction from 0 to under "
+                "buckling_N"
             )
         self._lag_s, self._friction_N, self._stiffness_N_mm = lag_s, friction_N, stiffness_N_mm
         self._wall_mm, self._beat_mm, self._beat_hz = wall_mm, beat_mm, beat_hz
@@ -208,12 +210,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         command.error(str(error))
     ends_s = time.monotonic() + options.seconds
-    with (
-        interrupted_by(signal.SIGTERM, signal.SIGINT) as is_stopped,
-        Client.local(options.folder, 5.0, "patient") as client,
-    ):
+    with interrupted_by(signal.SIGTERM, signal.SIGINT) as is_stopped:
         try:
-            published = run(client, patient, options.mode, there, back, lambda now_s: is_stopped() or now_s >= ends_s)
+            with Client.local(options.folder, 5.0, "patient") as client:
+                ends = lambda now_s: is_stopped() or now_s >= ends_s  # noqa: E731 it is asked in every period
+                published = run(client, patient, options.mode, there, back, ends)
         except (ClientError, ValueError) as error:
             print(f"{command.prog}: {error}", file=sys.stderr)
             return 1

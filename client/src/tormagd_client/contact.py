@@ -7,7 +7,7 @@ A line through the points of the way in, by recursive least squares that forget.
 
 import math
 
-from tormagd_client.messages import MAX_STIFFNESS_N_MM, Contact
+from tormagd_client.messages import MAX_PLACE_MM, MAX_STIFFNESS_N_MM, Contact
 
 SETTLES = 20
 "Samples of a point: a running mean takes the noise of place and force off."
@@ -38,14 +38,19 @@ class ContactEstimator:
     def contact(self) -> Contact | None:
         """The wall; None while it is not known well enough: then send forces."""
         slope_N_mm, place_mm, slope_sd, place_sd_mm, _ = self._line()
-        if not (slope_sd <= MOST_SHARE * slope_N_mm and place_sd_mm <= MOST_MM):
+        is_known = slope_sd <= MOST_SHARE * slope_N_mm and place_sd_mm <= MOST_MM
+        if not (is_known and abs(place_mm) <= MAX_PLACE_MM):
             return None
         stiffness_N_mm = min(slope_N_mm, MAX_STIFFNESS_N_MM)
         return Contact(handle_mm=place_mm, stiffness_N_mm=stiffness_N_mm, friction_N=max(self.friction_N, 0.0))
 
     def update(self, tip_mm: float, force_N: float, way: float) -> None:
         """One sample. `tip_mm` counts as the handle's place does, `force_N` resists the way in, and `way` is above 0
-        while the tip goes in or is held: out of the wall, friction is another one."""
+        while the tip goes in or is held: out of the wall, friction is another one. Raises ValueError for a number that
+        is not finite."""
+        for name, value in (("tip_mm", tip_mm), ("force_N", force_N), ("way", way)):
+            if not math.isfinite(value):
+                raise ValueError(f"{name} = {value}: allowed are finite numbers")
         if way <= 0.0:
             self._samples, self._point_mm = 0, math.inf
             return

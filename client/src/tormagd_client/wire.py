@@ -170,7 +170,8 @@ def _contact(fields: Mapping[str, float]) -> Contact:
     try:
         return Contact(**fields)
     except TypeError as error:
-        raise ValueError(f"contact = {dict(fields)!r}: {error}") from error
+        allowed = "handle_mm, stiffness_N_mm and friction_N, numbers"
+        raise ValueError(f"contact = {fields!r}: allowed are {allowed}") from error
 
 
 class Numbering:
