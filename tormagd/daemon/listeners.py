@@ -28,7 +28,7 @@ class Listeners:
         """Takes what XPUB tells: 1 or 0, and what is subscribed to, or not any more. `peer` is None where libzmq says
         it of one that has gone."""
         for topic in TOPICS:
-            if word.startswith(topic, 1):
+            if word[1:] == topic:
                 self._count(topic, self._asked[topic], peer, is_subscription=word[0] == 1)
 
     def _count(self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
