@@ -29,7 +29,9 @@ MAX_DT_S: Final = 0.02
 "Readings teach at most this often; a gap in the readings counts as the second at most."
 CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
 STOPPING_MM_S: Final = 0.5 * MOVING_MM_S
-"A handle whose rate over the last 10 ms is less stands, whatever its slower rate still says."
+STUCK_N: Final = 0.08
+"""A handle whose rate over the last 10 ms is less, and that gives so much less than friction, is stuck, whatever its
+slower rate still says."""
 COMES_TO_REST: Final = 3.0
 "A handle that has slid no faster for some travel creeps; one that has slid so many times faster only comes to rest."
 MIN_EXPECTED_N: Final = 0.1
@@ -211,16 +213,21 @@ class Believe:
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
         is_mobilised = self._nominal.contact.is_known(measured)
-        # a hand that meets a wall stops within 10 ms, and then its friction is what the hand gives
         is_slow = self._nominal.contact.slides and (
-            rate_mm_s < MOVING_MM_S
-            or abs(measured.handle.quick_mm_s) < STOPPING_MM_S
-            or self.handle.moved_gap_at_rest(model_N)
+            rate_mm_s < MOVING_MM_S or self._is_stuck(measured, model_N) or self.handle.moved_gap_at_rest(model_N)
         )
         if is_mobilised and not is_slow:
             self._hear_at_speed(now_s, measured, model_N, dt_s)
         else:
             self._hear_at_creep(now_s, measured, model_N, dt_s, is_mobilised)
+
+    def _is_stuck(self, measured: Measured, model_N: float) -> bool:
+        """Whether the handle has stopped with less than friction: a hand that meets a wall does, within 10 ms."""
+        handle = measured.handle
+        if abs(handle.quick_mm_s) >= STOPPING_MM_S:
+            return False
+        reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
+        return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
 
     def _hear_at_creep(self, now_s: float, measured: Measured, model_N: float, dt_s: float, is_mobilised: bool) -> None:
         self.strength.settle()
