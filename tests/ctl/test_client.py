@@ -175,7 +175,7 @@ def test_a_law_of_the_handles_way_is_published_as_a_contact_or_what_has_its_name
     client.publish(0.4, contact={"handle_mm": 12.0, "stiffness_N_mm": 0.5, "friction_N": 0.1})
     with pytest.raises(ValueError, match=r"contact\.stiffness_N_mm = -1\.0: allowed is 0\.\.100"):
         client.publish(0.4, contact={"handle_mm": 12.0, "stiffness_N_mm": -1.0})
-    with pytest.raises(ValueError, match=r"contact = \{'place': 12\.0\}: .*place"):
+    with pytest.raises(ValueError, match=r"contact = \{'place': 12\.0\}: allowed are handle_mm"):
         client.publish(0.4, contact={"place": 12.0})
     until_s = time.monotonic() + PATIENCE_S
     while len(fake_daemon.setpoints) < 2 and time.monotonic() < until_s:
