@@ -14,7 +14,6 @@ bursts. The band of the picture is the just noticeable difference of force, 10 %
 import argparse
 import json
 import math
-import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
@@ -111,7 +110,7 @@ def judged(case: Case) -> Json:
         "felt_1_2_N_ms": reached_ms(run, case.wall_N_mm, 1.2),
         "felt_stiffness_ratio": felt_stiffness_ratio(run, case.wall_N_mm),
         "free_drag_N": free_drag_N(run),
-        "standby_N": None if not force.standby_N else force.standby_N,
+        "standby_N": force.standby_N or None,
         "withdrawal_held_ms": held_ms(run, waiting_N),
         "withdrawal_bound_ms": held_ms(bound, waiting_N),
         "tip_depth_mm": float(run.depth_mm.max()),
@@ -264,7 +263,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--picture", type=Path, metavar="FILE.png")
     options = parser.parse_args(arguments)
     played = drawn(options.draws) if options.draws else cases(options.quick)
-    with ProcessPoolExecutor(os.process_cpu_count() if hasattr(os, "process_cpu_count") else os.cpu_count()) as pool:
+    with ProcessPoolExecutor() as pool:
         rows = list(tqdm(pool.map(judged, played), total=len(played), disable=options.json))
     result = {"cases": rows, "kept": kept(rows), "energy_error": max(row["energy_error"] for row in rows)}
     if options.picture:

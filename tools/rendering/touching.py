@@ -6,10 +6,12 @@ controller knows: the newest message, and the handle's place and speed. *Infinit
 """
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from rendering.device_draws import device as device_of
 from rendering.following import VALID_S, armed
@@ -19,6 +21,7 @@ from tormagd.config import Config, Rates
 from tormagd.control.ask.path import FLATTEST_N_MM, TIMES_S, nearest_path_mm
 from tormagd.control.records import TimedSetpoint, Travel, Wall
 from tormagd.lab.arrays import Array
+from tormagd.lab.ideal_actuator import put_gap
 from tormagd.lab.ideal_carriage import Brake, Drive, brake_of, drive_of
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
@@ -119,15 +122,19 @@ class Link:
         return TimedSetpoint(self._wall.force_N(tip_mm), now_s, VALID_S, withdraw_N=withdraw_N, wall=wall)
 
 
-def core_of(case: Case) -> Core:
-    """The controller of the scene `aorta_2`, at 1000 and 500 Hz, with every term."""
+@cache
+def core_with(standby_N: float | UnsetType = UNSET) -> Core:
+    """The controller of the scene `aorta_2`, at 1000 and 500 Hz, that waits at this force; nothing in it changes."""
+    scene = load_scene("aorta_2")
+    force = msgspec.structs.replace(scene.force, standby_N=standby_N)
     config = Config(scene="aorta_2", rates=Rates(control_hz=1000, inference_hz=500))
-    scene = msgspec.structs.replace(load_scene("aorta_2"), signal=None)
-    core = build_core(config, scene)
-    if not case.mode.endswith("standby"):
-        return core
-    force = msgspec.structs.replace(scene.force, standby_N=core.portrait.min_N + 0.3)
-    return build_core(config, msgspec.structs.replace(scene, force=force))
+    return build_core(config, msgspec.structs.replace(scene, force=force, signal=None))
+
+
+def core_of(case: Case) -> Core:
+    """The one that this case is played by."""
+    core = core_with()
+    return core_with(core.portrait.min_N + 0.3) if case.mode.endswith("standby") else core
 
 
 class Scenario:
@@ -200,7 +207,7 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
     plant = Plant(parameters, scenario.felt)
     drive = drive_of(parameters) if has_motors else None
     bound = Bound(scenario.core, brake_of(parameters), drive, case.push_mm_s)
-    bound.move(plant, scenario.core.scene.insert.gap_open_mm)
+    put_gap(plant, scenario.core.scene.insert.gap_open_mm)
     plant.advance(PERIOD_S)
     for _ in scenario.begin(plant.time_s):
         bound.update(plant, scenario.setpoint(plant.time_s, plant.truth))
@@ -229,15 +236,7 @@ class Bound:
         if abs(truth.force_N) > PULLS_N:
             self._is_pushing = truth.force_N > 0.0
         strength = truth.kinetic_N / float(np.interp(truth.gap_mm, self._gap_mm, self._fresh_N))
-        self.move(plant, self._moved(truth.gap_mm, self._wanted_mm(setpoint, truth, strength)))
-
-    def move(self, plant: Plant, gap_mm: float) -> None:
-        """Puts both carriages there, and turns their screws with them."""
-        lead_mm_rad = plant.parameters.screw.lead_mm / math.tau
-        by_mm = 0.5 * (gap_mm - plant.gap_mm)
-        for axis in (plant.left, plant.right):
-            axis.position_m += 1e-3 * by_mm
-            axis.angle_rad += by_mm / lead_mm_rad
+        put_gap(plant, self._moved(truth.gap_mm, self._wanted_mm(setpoint, truth, strength)))
 
     def _gaps_for(self, forces_N: Array, strength: float) -> Array:
         bounded_N = np.clip(forces_N, self._waiting_N, self._most_N)

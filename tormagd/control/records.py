@@ -33,7 +33,6 @@ class TimedSetpoint(Value):
     """The newest valid setpoint: a law of the force over the handle's way and place, `asked_N`.
 
     force_N                      of a handle that pushes on, where there is no `wall`
-
     stamp_s                      when the publisher meant it, on the clock of `now_s`
     valid_for_s                  how long after the stamp it is followed
     displacement_mm, rate_mm_s   the handle's, planned for; None where the publisher states none

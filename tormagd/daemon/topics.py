@@ -4,7 +4,7 @@ import time
 
 from tormagd.assembly.build import Core
 from tormagd.config import Config
-from tormagd.control.records import Measured
+from tormagd.control.ask.way import place_and_rate
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
@@ -38,7 +38,7 @@ class Topics:
     def handle(self) -> tuple[float, float] | None:
         """The handle's place and rate, positive pushing on; None without a device."""
         measured = self._control.stepper.measured
-        return None if measured is None else self._travel(measured)
+        return None if measured is None else place_and_rate(measured, self._push_sign)
 
     def verdict(self) -> Verdict | None:
         """Of the newest setpoint, as things are now; None without one."""
@@ -53,7 +53,7 @@ class Topics:
         self._due_ns = self._period_ns + (beat.due_ns if beat.due_ns - self._due_ns > self._period_ns else self._due_ns)
         self._sensed_s = measured.sensed_s
         heard_ns = time.time_ns() - round(NS * (time.monotonic() - measured.sensed_s))
-        place_mm, rate_mm_s = self._travel(measured)
+        place_mm, rate_mm_s = place_and_rate(measured, self._push_sign)
         message = Motion(
             v=VERSION, t_ns=heard_ns, device_s=measured.handle_time_s, handle_mm=place_mm, handle_mm_s=rate_mm_s
         )
@@ -84,11 +84,6 @@ class Topics:
             believe.device,
             Carriages(core.gap_speed_mm_s, believe.carriages.lag_s, core.scene.force.tolerance_rms_N),
         )
-
-    def _travel(self, measured: Measured) -> tuple[float, float]:
-        handle = measured.handle
-        onward = self._push_sign * handle.turn.direction
-        return self._push_sign * measured.handle_mm, onward * handle.quick_mm_s
 
     @staticmethod
     def _verdict(source: str, seq: int, found: Judged) -> Verdict:

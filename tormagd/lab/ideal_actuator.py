@@ -17,6 +17,15 @@ from tormagd.safety.codes import Limit
 from tormagd.simulation.plant import Plant
 
 
+def put_gap(plant: Plant, gap_mm: float) -> None:
+    """Move both carriages of `plant` at once, by the same way each, to where its gap is `gap_mm`."""
+    before_mm, lead_mm_rad = plant.gap_mm, plant.parameters.screw.lead_mm / math.tau
+    for axis in (plant.left, plant.right):
+        # the screw turns with the carriage, so the encoder sees it
+        axis.position_m += 0.5e-3 * (gap_mm - before_mm)
+        axis.angle_rad += 0.5 * (gap_mm - before_mm) / lead_mm_rad
+
+
 @final
 class IdealCarriages(Actuator):
     """Moves the gap of one simulated device, whose motors rest."""
@@ -54,11 +63,7 @@ class IdealCarriages(Actuator):
             wanted_mm = self._open_mm if is_over else target_of(plan, now_s, 0.0, floor_mm, self._open_mm).gap_mm
         reach_mm = self._top_speed_mm_s * dt_s
         gap_mm = min(max(wanted_mm, before_mm - reach_mm), before_mm + reach_mm)
-        lead_mm_rad = self._plant.parameters.screw.lead_mm / math.tau
-        for axis in (self._plant.left, self._plant.right):
-            # the screw turns with the carriage, so the encoder sees it
-            axis.position_m += 0.5e-3 * (gap_mm - before_mm)
-            axis.angle_rad += 0.5 * (gap_mm - before_mm) / lead_mm_rad
+        put_gap(self._plant, gap_mm)
         self.reference = Reference(gap_mm, (gap_mm - before_mm) / dt_s)
         return Drive(0.0, 0.0, 0.0, 0.0, [] if gap_mm == wanted_mm else [Limit.RATE])
 

@@ -33,6 +33,12 @@ class MessageError(ValueError):
     """A message that was refused: the text says which field, its value and what is allowed."""
 
 
+def _require_within(key: str, value: float | None, least: float, most: float) -> None:
+    """Raises ValueError as `require`; None is allowed. Five hundred setpoints a second put no range into words."""
+    if not (value is None or least <= value <= most):
+        require(False, key, value, f"{least:g}..{most:g}")
+
+
 class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """An elastic wall on the way of the handle, as `handle_mm` of the telemetry counts it, positive pushing on: the
     force is `friction_N` before it, and `stiffness_N_mm` more for each mm behind it."""
@@ -42,13 +48,9 @@ class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     friction_N: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, least, most in (
-            ("handle_mm", -MAX_PLACE_MM, MAX_PLACE_MM),
-            ("stiffness_N_mm", 0.0, MAX_STIFFNESS_N_MM),
-            ("friction_N", 0.0, MAX_FORCE_N),
-        ):
-            value = getattr(self, name)
-            require(least <= value <= most, f"contact.{name}", value, f"{least:g}..{most:g}")
+        _require_within("contact.handle_mm", self.handle_mm, -MAX_PLACE_MM, MAX_PLACE_MM)
+        _require_within("contact.stiffness_N_mm", self.stiffness_N_mm, 0.0, MAX_STIFFNESS_N_MM)
+        _require_within("contact.friction_N", self.friction_N, 0.0, MAX_FORCE_N)
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -85,13 +87,9 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
         require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
         require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
-        for name, least, most in (
-            ("displacement_mm", 0.0, MAX_DISPLACEMENT_MM),
-            ("rate_mm_s", -MAX_RATE_MM_S, MAX_RATE_MM_S),
-            ("withdraw_cf", 0.0, MAX_FORCE_N),
-        ):
-            value = getattr(self, name)
-            require(value is None or least <= value <= most, name, value, f"{least:g}..{most:g}")
+        _require_within("displacement_mm", self.displacement_mm, 0.0, MAX_DISPLACEMENT_MM)
+        _require_within("rate_mm_s", self.rate_mm_s, -MAX_RATE_MM_S, MAX_RATE_MM_S)
+        _require_within("withdraw_cf", self.withdraw_cf, 0.0, MAX_FORCE_N)
         if self.preview_N is not None:
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
             require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)

@@ -86,8 +86,7 @@ class Governor:
         self._path: Final = Path(portrait, gap_speed_mm_s)
         self._gap_speed_mm_s: Final = gap_speed_mm_s
         self._least_N: Final = force.least_N
-        self._min_N: Final = force.waiting_N
-        self._max_N: Final = force.most_N
+        self._allowed: Final = (force.waiting_N, force.most_N)
         self._release_N_s: Final = force.release_N_s
         self.forecast = Forecast()
         self.begin(now_s)
@@ -124,24 +123,30 @@ class Governor:
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
         # what comes is told from what is asked: the least that the device makes is learned, and so it varies
         asked_N = setpoint.asked_N(travel)
-        allowed_N = min(max(asked_N, self._min_N), self._max_N)
+        allowed_N = within(asked_N, self._allowed)
         blended_N = self._blended(setpoint, travel, allowed_N, dt_s)
         force_N, limits = self._within_reach(asked_N, blended_N, lowest_N, highest_N)
         if setpoint.is_contested:
             limits = (*limits, Limit.OTHER_SOURCE)
-        heard_N = min(max(setpoint.force_N, self._min_N), self._max_N)
+        heard_N = within(setpoint.force_N, self._allowed)
         self._hear(setpoint, heard_N, force_N, device)
-        bounds = min(max(self._min_N, lowest_N), highest_N), min(max(self._max_N, lowest_N), highest_N)
+        given = lowest_N, highest_N
+        bounds = within(self._allowed[0], given), within(self._allowed[1], given)
         foresight = 1.0
-        if setpoint.wall is not None or (setpoint.withdraw_N is not None and not travel.is_pushing):
+        wall = setpoint.wall
+        if not travel.is_pushing and (wall is not None or setpoint.withdraw_N is not None):
             self._foreseen(setpoint.stamp_s, heard_N, age_s)
-            path_N = self._against(setpoint.wall, travel, dt_s, force_N, bounds, device, lag_s)
+            self.sent_N, self.expected_N = None, None
+            path_N = [force_N] * len(PATH_S)
+        elif wall is not None:
+            self._foreseen(setpoint.stamp_s, heard_N, age_s)
+            path_N = self._against(wall, travel, dt_s, force_N, bounds, device, lag_s)
         elif setpoint.preview_N:
             path_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
         else:
             foresight = self._foreseen(setpoint.stamp_s, heard_N, age_s)
             path_N = self._continued(max(age_s, 0.0), dt_s, force_N, foresight, bounds, device, lag_s)
-        if self.blend_N != 0.0 and setpoint.wall is None:
+        if self.blend_N != 0.0 and wall is None:
             path_N = [within(each_N + self.blend_N, bounds) for each_N in path_N]
         governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
         if self.blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N:
@@ -177,10 +182,9 @@ class Governor:
         before_N = self.law_N
         if before_N is None and wall is not None and self.stamp_s != -math.inf and self.was_pushing:
             before_N = self.last_N
-        # a takeover has a ramp of its own, and one that withdraws is let go at once
-        is_ramped = before_N is not None and travel.is_pushing and setpoint.holder == self.holder
         blended_N = allowed_N
-        if is_ramped and before_N is not None:
+        # a takeover has a ramp of its own, and one that withdraws is let go at once
+        if before_N is not None and travel.is_pushing and setpoint.holder == self.holder:
             moved_N = 0.0 if wall is None else wall.stiffness_N_mm * abs(place_mm - self.law_mm)
             most_N = self._release_N_s * dt_s + moved_N
             blended_N = within(allowed_N, (before_N - most_N, before_N + most_N))
@@ -192,7 +196,7 @@ class Governor:
 
     def _against(
         self,
-        wall: Wall | None,
+        wall: Wall,
         travel: Travel,
         dt_s: float,
         force_N: float,
@@ -200,21 +204,14 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """The forces at PATH_S of a handle that pushes against a wall, or withdraws. Updates `sent_N` and
-        `expected_N`."""
-        if wall is None or not travel.is_pushing:
-            self.sent_N, self.expected_N = None, None
-            return [force_N] * len(PATH_S)
+        """The forces at PATH_S of a handle that pushes against a wall. Updates `sent_N` and `expected_N`."""
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
-        allowed = self._min_N, self._max_N
+        begins_s = lag_s + SPEEDING_UP_S
         wanted_N = [
-            within(
-                within(wall.force_N(place_mm + rate_mm_s * (lag_s + SPEEDING_UP_S + after_s)), allowed) + added_N,
-                bounds,
-            )
+            within(within(wall.force_N(place_mm + rate_mm_s * (begins_s + after_s)), self._allowed) + added_N, bounds)
             for after_s in TIMES_S
         ]
-        over_N = within(within(wall.friction_N, allowed) + added_N, bounds) - wall.friction_N + EARLY_N
+        over_N = within(within(wall.friction_N, self._allowed) + added_N, bounds) - wall.friction_N + EARLY_N
         most_N = [wall.force_N(place_mm + rate_mm_s * after_s) + over_N for after_s in PATH_S]
         return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
@@ -240,7 +237,7 @@ class Governor:
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
             self.slope_N_s = setpoint.preview_slope_N_s
-            last_N = min(max(setpoint.preview_N[-1], self._min_N), self._max_N)
+            last_N = within(setpoint.preview_N[-1], self._allowed)
             self.forecast.update(setpoint.stamp_s + setpoint.preview_s, last_N)
         else:
             self.forecast.forget()
@@ -311,8 +308,8 @@ class Governor:
     ) -> tuple[float, tuple[Limit, ...]]:
         """Of what the scene allows, what the device gives: never over the scene's greatest, unless the open gap itself
         makes more. Its limits are those of `asked_N`, too."""
-        limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._max_N else (Limit.RANGE,)
-        if asked_N < self._min_N and self._least_N < self._min_N:
+        limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._allowed[1] else (Limit.RANGE,)
+        if asked_N < self._allowed[0] and self._least_N < self._allowed[0]:
             limits = (*limits, Limit.STANDBY)
         if allowed_N < lowest_N:
             return lowest_N, (*limits, Limit.F_MIN)

@@ -18,6 +18,12 @@ SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, 5 N/mm at 1.5 N either way."
 
 
+def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
+    """Return where the handle is, mm, and how it moves, mm/s, positive pushing on."""
+    handle = measured.handle
+    return push_sign * measured.handle_mm, push_sign * handle.turn.direction * handle.quick_mm_s
+
+
 @final
 class Way:
     """The stage that follows the handle of a brake along the way of the task."""
@@ -50,5 +56,5 @@ class Way:
             is_pushing = not is_pushing
         if is_pushing != before.is_pushing:
             self.changed_mm = place_mm
-        self.travel = Travel(self._push_sign * place_mm, onward * measured.handle.quick_mm_s, is_pushing)
+        self.travel = Travel(*place_and_rate(measured, self._push_sign), is_pushing)
         return self.travel
