@@ -90,7 +90,7 @@ def drawn(count: int) -> list[Case]:
 
 def judged(case: Case) -> Json:
     """The row of one case: run, bound, and what a gap without inertia would leave."""
-    run, bound, infinite = rendered(case), ideal(case), ideal(case, has_motors=False)
+    run, bound, infinite = rendered(case, core_of(case)), ideal(case), ideal(case, has_motors=False)
     free = infinite.depth_mm < -0.5 * FREE_MM
     waiting_N = float(infinite.kinetic_N[free & (infinite.time_s < infinite.time_s[-1] / 2.0)].mean())
     is_counted = case.wall_N_mm * infinite.depth_mm.max() >= waiting_N + COUNTED_N
@@ -238,7 +238,7 @@ def draw(picture: Path) -> None:
     figure.suptitle("A wall of 0.25 N/mm, pushed at 30 mm/s over 100 ms, sample 2", fontsize=13)
     for axis, (mode, title) in zip(axes.flat, DRAWN.items(), strict=True):
         case = Case("sample_2", 0.3, 0.25, 30.0, 100.0, mode)
-        run, bound = rendered(case), ideal(case)
+        run, bound = rendered(case, core_of(case)), ideal(case)
         wall_N = case.wall_N_mm * np.maximum(run.depth_mm, 0.0)
         low_N, high_N = (1.0 - FORCE_JND) * wall_N, (1.0 + FORCE_JND) * wall_N
         axis.fill_between(run.time_s, low_N, high_N, color="#c9d6df", label="the wall, +- 10 %")

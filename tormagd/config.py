@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import checked as checked, convert, table_in as table_in
+from tormagd.toml_file import checked as checked, convert, read_toml, table_in as table_in
 from tormagd_client.endpoints import Endpoints, Strict, require_usable
 from tormagd_client.printable import require
 
@@ -80,7 +80,8 @@ class Rates(Strict, frozen=True):
     motion_hz: Annotated[int, Meta(ge=1, le=4_000)] = 500
     "Of the topic `motion`, for whoever subscribes; no more than `control_hz`."
     of_scene: bool = False
-    "Whether the daemon runs at the rates that its scene needs, in place of these two; control at 500 Hz at the least."
+    """Whether the daemon runs at the rates of its scene in place of these two, control at 500 Hz at the least. Where a
+    file states neither, it does."""
 
 
 class RealTime(Strict, frozen=True):
@@ -248,5 +249,10 @@ class Config(Strict, frozen=True):
 
 
 def load_config(path: Path | None) -> Config:
-    """The configuration in `path`, or the defaults. Raises ConfigError."""
-    return Config() if path is None else convert(path, Config)
+    """Read the configuration in `path`, or take the defaults; without stated rates it is at its scene's. Raises
+    ConfigError."""
+    config = Config() if path is None else convert(path, Config)
+    stated = {} if path is None else read_toml(path).get("rates", {})
+    if stated.keys() & {"control_hz", "inference_hz", "of_scene"}:
+        return config
+    return msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, of_scene=True))

@@ -107,6 +107,7 @@ def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
     except msgspec.ValidationError as error:
         text = str(error)
         told = _value_at(tables, text) + _known_key(kind, text)
+        text = text.replace("`object`", "a `[table]`")
         refused = text if "`$" in text or where == "$" else f"{text} - at `$`"
         raise ConfigError(refused.replace("`$", f"`{where}") + told) from error
 

@@ -103,13 +103,11 @@ def test_a_weak_device_that_was_slid_at_speed_is_known_as_such(arm, render) -> N
 
 
 def test_a_term_that_is_left_out_does_not_act(arm, render) -> None:
-    config, left_out = Config(scene="pulse"), Terms(creep=False, scale=False, hysteresis=False)
+    config, left_out = Config(scene="pulse"), Terms(creep=False, scale=False, memory=False)
     loop = arm(core=build_core(config, msgspec.structs.replace(load_scene("pulse"), terms=left_out)), config=config)
     render(loop, 1.5, 1.0)
     told = beliefs(loop.planner, loop.stepper, loop.now_s, left_out)
-    assert {name for name, it in told.items() if it.acts} == {
-        "offset", "sensor_zero", "acceleration_scale", "relaxed"
-    }  # fmt: skip
+    assert {name for name, it in told.items() if it.acts} == {"offset", "sensor_zero", "acceleration_scale"}
     assert (told["scale"].value, told["field_lag"].value) == (1.0, 0.0)
 
 

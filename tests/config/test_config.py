@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import LEAST_INFERENCE_HZ, Config, load_config
+from tormagd.config import LEAST_INFERENCE_HZ, Config, Rates, load_config
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
 from tormagd_client.endpoints import ConfigError
@@ -41,8 +41,12 @@ def refusal(path: Path, *said: str) -> str:
     return text
 
 
+AT_SCENES = Rates(of_scene=True)
+"Where a file states no rate."
+
+
 def test_no_file_and_an_empty_file_are_the_defaults(write) -> None:
-    assert load_config(None) == load_config(write("")) == Config()
+    assert load_config(None) == load_config(write("")) == Config(rates=AT_SCENES)
 
 
 def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
@@ -51,7 +55,7 @@ def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
         "pulse",
         "/dev/ttyACM3",
         (1, 3),
-        Config().rates,
+        AT_SCENES,
         {},
     )
 
@@ -89,7 +93,7 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
         ("[device]\nprot = '/dev/null'", "$.device", "prot", "unknown field"),
         ("[rates]\ncontrol_Hz = 1000", "$.rates", "control_Hz", "unknown field"),
         ("scene = 3", "$.scene", "3", "`str`"),
-        ("[device]\noptions = 3", "$.device.options", "3", "`object`"),
+        ("[device]\noptions = 3", "$.device.options", "3", "a `[table]`"),
         ("[rates]\ncontrol_hz = 1000.5", "$.rates.control_hz", "1000.5", "`int`"),
         ("[rates]\ninference_hz = 82", "$.rates.inference_hz", "82", ">= 83"),
         ("[rates]\ncontrol_hz = 50", "$.rates.control_hz", "50", ">= 83"),
@@ -99,7 +103,7 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
         ("[realtime]\ncpus = [0, -1]", "$.realtime.cpus", "[0, -1]", ">= 0"),
         ("[position]\nduty_limit = 1.01", "$.position.duty_limit", "1.01", "<= 1.0"),
         ("[position]\nproportional_per_mm = -6.0", "$.position.proportional_per_mm", "-6.0", "> 0.0"),
-        ("rates = 1000", "$.rates", "1000", "`object`"),
+        ("rates = 1000", "$.rates", "1000", "a `[table]`"),
         ("[trim]\nmost = 0.9", "$.trim.most", "0.9", ">= 1.0"),
         ("[sources]\npriority = 'a'", "$.sources.priority", "'a'", "`array`"),
         ("[sources]\npriority = ['']", "$.sources.priority", "['']", ">= 1"),
@@ -267,7 +271,7 @@ def test_check_prints_the_resolved_configuration_and_names_a_broken_plugin(write
         ("[device.options]\ninterface = 'slcan'", "unknown field `interface` - at `$.device.options`"),
         ("[device]\nbackend = 'can'", "missing required field `interface` - at `$.device.options`"),
         ("[position]\nproportional_per_mm = 500.0", "margin"),
-        ("[rates]\ncontrol_hz = 500", "rates.control_hz"),
+        ("[rates]\ncontrol_hz = 250", "rates.control_hz"),
         ("not toml", "line 1"),
         # a refusal that takes more than the file names line and key, too
         ('\nscene = "pulsee"\n', "did you mean `pulse`? (line 2)\n"),

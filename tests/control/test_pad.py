@@ -14,7 +14,7 @@ from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.exact import plain
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import EVERY_TERM, RELAXATION_S, load_scene, scene_path
+from tormagd.scenes.scene import EVERY_TERM, load_scene, scene_path
 from tormagd_client.endpoints import ConfigError
 
 CONFIG = Config(scene="radial_pulse")
@@ -79,7 +79,7 @@ def test_a_pad_that_is_held_is_pressed_harder_as_it_relaxes(pad_core: Core) -> N
 
 
 def test_without_the_term_nothing_is_remembered() -> None:
-    without = build_core(CONFIG, msgspec.structs.replace(SCENE, terms=EVERY_TERM.without(*RELAXATION_S)))
+    without = build_core(CONFIG, msgspec.structs.replace(SCENE, terms=EVERY_TERM.without("memory")))
     forgetful = held(without, 60.0)
     assert (forgetful.believe.memory.relaxed_N, forgetful.planned.field_mT) == (
         0.0,

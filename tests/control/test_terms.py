@@ -109,7 +109,7 @@ def test_without_the_creep_term_nothing_slow_is_learned(after) -> None:
     )
 
 
-def test_without_the_slope_a_force_is_held_until_the_next(told) -> None:
+def test_without_the_forecast_a_force_is_held_until_the_next(told) -> None:
     def motion(core: Core) -> tuple[float, float]:
         planner = core.planner()
         for number in range(50):
@@ -119,7 +119,7 @@ def test_without_the_slope_a_force_is_held_until_the_next(told) -> None:
     slope_N_s, speed_mm_s = motion(core_without())
     assert slope_N_s == pytest.approx(0.5, rel=0.05)
     assert speed_mm_s < -5.0
-    assert motion(core_without("slope")) == (0.0, 0.0)
+    assert motion(core_without("forecast")) == (0.0, 0.0)
 
 
 def test_without_the_forecast_nothing_is_remembered(after) -> None:
@@ -127,8 +127,8 @@ def test_without_the_forecast_nothing_is_remembered(after) -> None:
     assert full != plain(Forecast()) == without
 
 
-@pytest.mark.parametrize("names", [(), ("lag",)])
-def test_without_the_lag_late_carriages_stay_late(moving, planned, names: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("names", [(), ("motor",)])
+def test_without_the_motor_late_carriages_stay_late(moving, planned, names: tuple[str, ...]) -> None:
     """Carriages that are always a millimetre behind, while what comes is known."""
     core = core_without(*names)
     planner = core.planner()
@@ -142,7 +142,7 @@ def test_without_the_lag_late_carriages_stay_late(moving, planned, names: tuple[
     assert lag_s == 0.0 if names else lag_s > 0.002
 
 
-def test_without_the_lag_what_is_known_of_it_is_not_looked_at(told) -> None:
+def test_without_the_motor_what_is_known_of_it_is_not_looked_at(told) -> None:
     ahead = {"preview_N": tuple(1.0 + 0.1 * (step > 15) for step in range(35)), "preview_dt_s": 0.002}
 
     def gap_mm(core: Core, lag_s: float) -> float:
@@ -151,7 +151,7 @@ def test_without_the_lag_what_is_known_of_it_is_not_looked_at(told) -> None:
         return told(planner, 1.0, **ahead).gap_mm
 
     assert gap_mm(core_without(), 0.02) != gap_mm(core_without(), 0.0)
-    assert gap_mm(core_without("lag"), 0.02) == gap_mm(core_without("lag"), 0.0)
+    assert gap_mm(core_without("motor"), 0.02) == gap_mm(core_without("motor"), 0.0)
 
 
 @pytest.fixture

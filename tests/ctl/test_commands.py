@@ -1,4 +1,5 @@
 import io
+import json
 import math
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from tormagd.ctl.main import main
 from tormagd.ctl.operate import DONE
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import firmware_text, status_text
-from tormagd.scenes.scene import TERMS, load_scene
+from tormagd.scenes.scene import load_scene
 from tormagd_client.messages import LinkReport, Status
 
 SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}
@@ -191,9 +192,24 @@ def test_a_scene_is_checked_as_the_daemon_does(ctl):
     assert list(comes_s) == sorted(comes_s, reverse=True)
 
 
-def test_a_decision_is_explained_with_what_was_measured(ctl):
+def test_every_measured_way_is_shown_with_what_it_costs(ctl):
     text = ctl("scene", "explain", "brain").ended(0).out
-    assert all(said in text for said in (*TERMS, "500 Hz      83 Hz", "nearest", "sample_3 learning"))
+    assert all(said in text for said in ("1000 / 500 Hz, newton", "chosen, runs here", "contact", "signal, frozen"))
+
+
+def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_written(tmp_path, ctl):
+    every = ctl("--json", "scene", "explain", "pulse").ended(0).result
+    errors_N = {json.dumps(tried["way"]): max(tried["rms_N"]) for tried in every["tried"]}
+    shares = {json.dumps(share["way"]): share["daemon"] for share in every["shares"]}
+    cheap, exact = tmp_path / "cheap.toml", tmp_path / "exact.toml"
+    words = "--json", "scene", "check", "pulse"
+    found = ctl(*words, "--tolerance", str(max(errors_N.values())), "--out", str(cheap)).ended(0).result
+    assert found["daemon_share"] == min(shares[way] for way in errors_N)
+    found = ctl(*words, "--share", "1.0", "--out", str(exact)).ended(0).result
+    assert found["rms_N"] == min(errors_N.values())
+    for path in (cheap, exact):  # what is written asks for the same, and is taken
+        assert load_scene(str(path)).fingerprint == load_scene("pulse").fingerprint
+        ctl("scene", "check", str(path)).ended(0)
 
 
 @pytest.fixture

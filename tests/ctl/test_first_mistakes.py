@@ -105,6 +105,15 @@ CORONARY, BRAIN = (Path(scene_path(name)).read_text(encoding="utf-8") for name i
             ('"code":"not_measured"', "docs/guides/scene.md"),
             {"other.toml": CORONARY.replace("most_N = 2.0", "most_N = 1.9")},
         ),
+        ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
+        ("tormagctl scene check pulse --tolerance 0.0001", 1, "allowed is at least", {}),
+        ("tormagctl scene explain pulse --share 0.5", 2, "tormagctl scene check NAME with one of", {}),
+        (
+            "tormagctl scene check pulse --share 0.5 --out a.toml",
+            2,
+            "File exists: allowed is a new file",
+            {"a.toml": ""},
+        ),
         (
             "tormagctl --config unfit.toml --json doctor --measure",
             1,

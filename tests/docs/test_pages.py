@@ -217,6 +217,7 @@ DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 def drawn():
     """Every picture that is drawn from committed figures, and these."""
     yield "images/scenes.png", measured().scenes
+    yield "images/scenes_trade.png", measured()
     for path in sorted(DOCS.glob("evidence/*.json")):
         evidence = json.loads(path.read_text(encoding="utf-8"))
         for picture in DRAWN.findall(evidence["command"]):

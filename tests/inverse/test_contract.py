@@ -27,7 +27,7 @@ from tormagd.model.force_curve import ForceCurve, Known, Network
 from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.physics.errors import DomainError
 from tormagd.scenes.measured import measured
-from tormagd.scenes.scene import Solver, load_scene, shipped_scenes, terms_of
+from tormagd.scenes.scene import Solver, load_scene, shipped_scenes
 
 torch.set_num_threads(1)  # a second thread costs more than it saves at this size, and waits for a busy processor
 
@@ -521,19 +521,23 @@ def test_without_torch_the_scene_is_refused_and_the_package_named(
 def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name: str) -> None:
     scene = load_scene(name)
     # without the rate there is nothing to search
-    best = "portrait" if "rate" in terms_of(scene).left_out else "newton"
+    best = "portrait" if "rate" in scene.terms.left_out else "newton"
     wanted = best if scene.solver.name == "auto" else scene.solver.name
     assert build_core(Config(scene=name)).solver.solver == wanted
 
 
 def test_no_other_search_without_torch_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
-    """Why nothing picks among them: on the device, by what `tools/required_terms.py --store` measured."""
-    for scene in measured().scenes:
-        found = {item.search: item for item in scene.searches}
-        assert set(found) == set(RUNTIME_SOLVERS).difference(choice.OF_TORCH)
-        newton, nearest = found["newton"], found["nearest"]
-        assert scene.us_s(newton.cost) < scene.us_s(nearest.cost)
-        assert newton.rms_N < nearest.rms_N + 0.01 * scene.tolerance_N
+    """Why nothing picks among them: on the device, by what `tools/benchmark.py scenes` measured."""
+    file = measured()
+    for scene in file.scenes:
+        way = scene.chosen
+        ways = [msgspec.structs.replace(way, search=search) for search in ("newton", "nearest")]
+        newton, nearest = (scene.of(each) for each in ways)
+        newtons, nearests = (file.share(each) for each in ways)
+        assert newtons is not None
+        assert nearests is not None
+        assert newtons.daemon < nearests.daemon
+        assert newton.worst_N < nearest.worst_N + 0.01 * scene.tolerance_N
 
 
 def test_a_scene_may_name_its_search() -> None:

@@ -287,6 +287,13 @@ def test_the_slope_is_that_of_finite_differences(model: ForceModel) -> None:
     assert model.field_slope_N_per_mT([POINT])[0] == pytest.approx(slope, rel=1e-6)
 
 
+def test_a_saturated_unit_that_rises_still_rises(model: ForceModel) -> None:
+    """Honest data level off: a slope that rounding makes 0 would be refused as one that does not rise."""
+    steep = replace(model, hidden_weight=60.0 * np.abs(model.hidden_weight), output_weight=np.abs(model.output_weight))
+    rows = [(*POINT[:2], field_mT, POINT[3]) for field_mT in np.linspace(*model.field_range_mT, 9)]
+    assert steep.field_slope_N_per_mT(rows).min() > 0.0
+
+
 @pytest.mark.parametrize("position", range(4))
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 2 * LARGEST])
 def test_inputs_that_are_no_numbers_are_refused(model: ForceModel, position: int, value: float) -> None:

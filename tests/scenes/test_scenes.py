@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from tormagd.assembly.build import Core, at_rates_of, build_core
-from tormagd.config import Config, Rates
+from tormagd.config import Config, Rates, load_config
 from tormagd.control.records import TimedSetpoint
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.features import FEATURES
@@ -137,7 +137,7 @@ def test_contradictions_are_refused(write, low: str, low_value: str, high: str, 
         ({"handle__least_mm_s": "0.1"}, ("$.handle.least_mm_s", ">= 0.5")),
         ({"budget__core_share": "0.0"}, ("$.budget.core_share", "> 0.0")),
         ({"terms": '"some"'}, ("$.terms", "'some'")),
-        ({"terms": '"required"', "force__most_N": "1.9"}, ("was not measured as it is now", "docs/guides/scene.md")),
+        ({"terms": '"required"'}, ("a `[table]`", "$.terms", "required")),
         ({"terms__gravity": "false"}, ("gravity", "unknown field")),
     ],
 )
@@ -240,18 +240,12 @@ def test_a_thousand_scenes_are_a_thousand_fingerprints(write) -> None:
 
 
 def test_terms_are_named_in_the_scene(write) -> None:
-    assert load_scene(write()).terms == load_scene(write(terms='"all"')).terms == EVERY_TERM
+    assert load_scene(write()).terms == EVERY_TERM
     named = load_scene(write(terms__rate="false", terms__motor="false")).terms
     assert isinstance(named, Terms)
     assert named.left_out == ("rate", "motor")
     with pytest.raises(ValueError, match="term 'gravity': allowed is one of rate, creep"):
         EVERY_TERM.without("gravity")
-
-
-def test_a_time_constant_belongs_to_the_nearest_of_its_terms() -> None:
-    alone = EVERY_TERM.without("relaxation_1_s", "relaxation_100_s", "relaxation_1000_s")
-    assert [time_s for time_s in (0.01, 3.0, 3.3, 10.0, 31.0, 32.0, 1e5) if alone.relaxes(time_s)] == [3.3, 10.0, 31.0]
-    assert all(EVERY_TERM.relaxes(time_s) for time_s in (1e-3, 1.0, 1e5))
 
 
 def test_a_daemon_may_run_at_the_rates_of_its_scene(write) -> None:
@@ -263,6 +257,17 @@ def test_a_daemon_may_run_at_the_rates_of_its_scene(write) -> None:
     assert at_rates_of(load_scene(write(bandwidth__control_hz="2000")), own).rates.control_hz == 2000
     said = "scene bench: rates.of_scene: rates.telemetry_hz = 50"
     refused(write(bandwidth__control_hz="510"), said, load=lambda path: at_rates_of(load_scene(path), own))
+
+
+@pytest.mark.parametrize(
+    ("stated", "is_of_scene"),
+    [("", True), ("telemetry_hz = 20", True), ("control_hz = 1000", False), ("inference_hz = 250", False)],
+)
+def test_a_file_that_states_no_rate_is_at_its_scenes(stated: str, is_of_scene: bool, tmp_path: Path) -> None:
+    path = tmp_path / "tormagd.toml"
+    path.write_text(f"[rates]\n{stated}\n", encoding="utf-8")
+    assert load_config(path).rates.of_scene is is_of_scene
+    assert load_config(None).rates.of_scene
 
 
 def test_a_hold_of_a_day_and_a_recording_at_1_khz_are_taken(write, tmp_path: Path) -> None:

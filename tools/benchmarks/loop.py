@@ -92,11 +92,14 @@ class Pair(NamedTuple):
 
 
 class Stand(NamedTuple):
-    """What is measured: scheduling, how often setpoints come, and of which checkout daemon and device are."""
+    """What is measured: scheduling, how often setpoints come, of which checkout daemon and device are, the rates of
+    control and of plans, and the scene (empty: the default)."""
 
     realtime: RealTime
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
+    rates_hz: tuple[int, int] = (CONTROL_HZ, CONTROL_HZ)
+    scene: str = ""
 
 
 T = TypeVar("T")
@@ -320,12 +323,14 @@ def hammer(address: str, stop: Event) -> None:
 
 
 def write_config(folder: Path, port: str, stand: Stand) -> Path:
-    """A configuration with its sockets in `folder`; planning in every period, as in examples/service.toml."""
+    """A configuration with its sockets in `folder`."""
     path = folder / "tormagd.toml"
     sockets = "".join(f'{name} = "ipc://{folder}/{name}"\n' for name in ENDPOINTS)
-    realtime = stand.realtime
+    realtime, (control_hz, inference_hz) = stand.realtime, stand.rates_hz
+    scene = f'scene = "{stand.scene}"\n' if stand.scene else ""
     path.write_text(
-        f'[device]\nport = "{port}"\n[endpoints]\n{sockets}[rates]\ninference_hz = {CONTROL_HZ}\n'
+        f'{scene}[device]\nport = "{port}"\n[endpoints]\n{sockets}'
+        f"[rates]\ncontrol_hz = {control_hz}\ninference_hz = {inference_hz}\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
         f"lock_memory = {str(realtime.lock_memory).lower()}\n"
         f"cpus = {list(realtime.cpus)}\n"

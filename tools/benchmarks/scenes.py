@@ -1,49 +1,224 @@
-"""`benchmark scenes`: what each scene costs and misses with all terms, and with those that were chosen for it.
+"""`benchmark scenes`: how exactly, and at what cost of the daemon, each scene is served.
 
-Nothing is measured here: the errors on the simulated device, and the costs beside their own `measured_machine_us`, are
-those that `required_terms.py --store` measured.
+Without options it prints what the package carries. `--live` measures scenes again: the ways to serve one are rates and
+searches. Screened on the scene's own signal and samples 1 to 3, the cheapest way has to do in every situation what the
+usual way does, on devices that decide, or is not chosen; others then judge. An error will do within TOLERATED of
+the scene's tolerance, or where it is at most WORSE of it over the usual way's. `--shares` measures what each way takes
+of a processor: daemons on simulated devices, in turns. `--store` writes the file that comes with the package.
 """
 
 import argparse
+import contextlib
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Collection
+from functools import partial
+from pathlib import Path
 
 import msgspec
+from rendering.device_draws import SAMPLES, SECOND
+from rendering.scene_runs import OF_A_HANDLE, ROOT, SITUATIONS, Case, run_all
 
-from tormagd.assembly.build import Core, build_core
-from tormagd.config import Config
+from benchmarks import loop
+from tormagd.assembly.build import choose_solver
+from tormagd.config import RealTime
+from tormagd.headroom.machine_loop import machine_us
+from tormagd.lab import executors
 from tormagd.lab.arrays import Json
-from tormagd.scenes.measured import MeasuredScene, measured, on_first
-from tormagd.scenes.scene import EVERY_TERM, TERMS, load_scene
+from tormagd.scenes.measured import (
+    FILE,
+    Judged,
+    Measured,
+    MeasuredScene,
+    Share,
+    Tried,
+    Way,
+    allowed_N,
+    measured,
+)
+from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes
+from tormagd.simulation.parameters import PLANTS_INSERT
+from tormagd_client import Client
+from tormagd_client.endpoints import ConfigError
+
+STORED = ROOT / "tormagd" / "scenes" / FILE
+RATES_HZ = (1_000, 500), (1_000, 83), (500, 500), (500, 83)
+"Of control and of plans: the usual ones, and what may be chosen in their place."
+SEARCHES = "newton", "nearest"
+"Those that need no torch."
+THESIS = Way(500, 83, "thesis")
+"The thesis's own loop."
+FIRST_DECIDING, FIRST_JUDGING = 80, 100
+"Of the draws of the plant card; twice as many judge as decide."
+DRAWS = 10
+SETTLES_S = 3.0
+SHARED_SCENE, FIFO = "coronary", 50
+KEYS = "daemon", "step_us", "plan_us"
+
+Runs = Callable[[Collection[Case]], dict[Case, float]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """None of its own."""
+    """What is measured again."""
+    parser.add_argument("--live", nargs="*", metavar="NAME", help="measure these scenes (names, files; none: all)")
+    parser.add_argument("--draws", type=int, default=DRAWS, help="so many decide, twice as many judge (%(default)s)")
+    parser.add_argument("--shares", action="store_true", help="measure what each way takes of a processor")
+    parser.add_argument("--pairs", type=int, default=5, help="of those, how many turns (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=5.0, help="and how long each (%(default)s)")
+    parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
+    executors.add_options(parser, 1, needed="tormagd, and tools/ on their path")
 
 
 def measure(options: argparse.Namespace) -> Json:
     """`{scenes: [...], measured_machine_us}`: each scene's figures."""
     file = measured()
-    return {"scenes": [figures(scene) for scene in file.scenes], "measured_machine_us": file.machine_us}
+    if options.shares:
+        ways = [*(Way(*hz, search) for hz in RATES_HZ for search in SEARCHES), THESIS]
+        shares = tuple(shares_of(ways, options.pairs, options.seconds))
+        file = msgspec.structs.replace(file, shares=shares, pairs=options.pairs, machine_us=round(machine_us(), 1))
+        store(file, options.store)
+    if options.live is not None:
+        known: dict[Case, float] = {}
+        with executors.chosen(options) as executor:
+            runs = partial(run_all, executor=executor, known=known)
+            for name in options.live or shipped_scenes():
+                found = measured_scene(name, runs, options.draws)
+                scenes = {scene.name: scene for scene in (*file.scenes, found)}
+                file = msgspec.structs.replace(file, scenes=tuple(scenes[name] for name in sorted(scenes)))
+                store(file, options.store)
+    return {"scenes": [figures(scene, file) for scene in file.scenes], "measured_machine_us": file.machine_us}
 
 
-def figures(scene: MeasuredScene) -> Json:
-    """One scene's decision as numbers. `full` is every term at the usual rates."""
-    on_sample_1 = on_first(scene.judged)
+def store(file: Measured, is_wanted: bool) -> None:
+    """Write the file that comes with the package, where that is wanted."""
+    if is_wanted:
+        STORED.write_bytes(msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n")
+
+
+def figures(scene: MeasuredScene, file: Measured) -> Json:
+    """One scene's choice as numbers. `full` is the usual way."""
+    chosen, usual = file.share(scene.chosen), file.share(scene.usual.way)
     return {
         "name": scene.name,
-        "terms_in": [term for term in TERMS if term not in scene.left_out],
-        "terms_out": list(scene.left_out),
-        "control_hz": scene.control_hz,
-        "inference_hz": scene.inference_hz,
-        "solver": core_without(scene.name, scene.left_out).solver.solver,
-        "rms_N": on_sample_1.chosen_N,
-        "rms_full_N": on_sample_1.full_N,
+        "terms_in": list(TERMS),
+        "terms_out": [],
+        "control_hz": scene.chosen.control_hz,
+        "inference_hz": scene.chosen.inference_hz,
+        "solver": scene.chosen.search,
+        "rms_N": scene.of(scene.chosen).rms_N[0],
+        "rms_full_N": scene.usual.rms_N[0],
         "tolerance_N": scene.tolerance_N,
-        "cost_us_per_s": scene.cost_us_s,
-        "cost_full_us_per_s": scene.cost_full_us_s,
+        "cost_us_per_s": chosen and chosen.core_us_s,
+        "cost_full_us_per_s": usual and usual.core_us_s,
+        "daemon_share": chosen and chosen.daemon,
+        "daemon_share_full": usual and usual.daemon,
+        "plan_us": chosen and chosen.plan_us,
+        "judged": [msgspec.to_builtins(each) | {"tolerance_N": scene.tolerance_N} for each in scene.judged],
     }
 
 
-def core_without(name: str, left_out: tuple[str, ...]) -> Core:
-    """The core of a shipped scene without these terms."""
-    terms = EVERY_TERM.without(*left_out)
-    return build_core(Config(scene=name), msgspec.structs.replace(load_scene(name), terms=terms))
+def measured_scene(name: str, runs: Runs, draws: int = DRAWS) -> MeasuredScene:
+    """Measure one scene, whole, on so many draws; `runs` gives the outcomes of cases. Raises ConfigError for a scene
+    without a signal."""
+    scene = load_scene(name)
+    if scene.signal is None:
+        raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
+    own = choose_solver(scene).solver
+    ways = [Way(*hz, own) for hz in RATES_HZ]
+    tried = [tried_way(name, way, runs) for way in ways]
+    tolerance_N = scene.force.tolerance_rms_N
+    usual, *others = tried
+    chosen, judged = usual.way, judge(name, scene, usual.way, usual.way, runs, draws)
+    for other in sorted(others, key=lambda each: each.way.control_hz + each.way.inference_hz):
+        pairs = zip(other.rms_N, usual.rms_N, strict=True)
+        if usual.worst_N > tolerance_N or any(error_N > allowed_N(usual_N, tolerance_N) for error_N, usual_N in pairs):
+            continue
+        found = judge(name, scene, other.way, usual.way, runs, draws)
+        if all(item.rms_N <= allowed_N(item.usual_N, tolerance_N) for item in found if item.group == "deciding"):
+            chosen, judged = other.way, found
+            break
+    hz = chosen.control_hz, chosen.inference_hz
+    tried += [tried_way(name, Way(*hz, search), runs) for search in SEARCHES if search != own]
+    if scene.element == "torque":
+        tried.append(tried_way(name, THESIS, runs))
+    return MeasuredScene(scene.name, scene.fingerprint, tolerance_N, chosen, tuple(tried), judged)
+
+
+def tried_way(name: str, way: Way, runs: Runs) -> Tried:
+    """The scene's own signal on the samples."""
+    cases = [case_of(name, way, device, "signal", is_learning=True) for device in SAMPLES]
+    found = runs(cases)
+    return Tried(way, tuple(found[case] for case in cases))
+
+
+def judge(name: str, scene: Scene, way: Way, usual: Way, runs: Runs, draws: int) -> tuple[Judged, ...]:
+    """The worst device of each group in each situation, beside the usual way."""
+    tolerance_N = scene.force.tolerance_rms_N
+    worst = []
+    for group, situation, devices, learns in groups(scene, draws):
+        ours, theirs = ([case_of(name, each, device, situation, learns) for device in devices] for each in (way, usual))
+        found = runs([*ours, *theirs])
+        outcomes = [
+            Judged(group, one.device, situation, learns, found[one], found[other])
+            for one, other in zip(ours, theirs, strict=True)
+        ]
+        worst.append(max(outcomes, key=lambda item: item.rms_N - allowed_N(item.usual_N, tolerance_N)))
+    return tuple(worst)
+
+
+def groups(scene: Scene, draws: int) -> list[tuple[str, str, tuple[str, ...], bool]]:
+    """Group, situation, devices, and whether they are learned: what decides, then what judges."""
+    if scene.element == "tactile":
+        stays = [each for each in SITUATIONS if each not in OF_A_HANDLE]
+        return [*(("deciding", each, SAMPLES, True) for each in stays), ("deciding", "signal", SAMPLES, False)]
+    deciding, judging = (
+        tuple(f"draw {first + number}" for number in range(count))
+        for first, count in ((FIRST_DECIDING, draws), (FIRST_JUDGING, 2 * draws))
+    )
+    # the second plant is an element of its own: no other insert fits into it
+    second = (SECOND,) if scene.insert.name == PLANTS_INSERT else ()
+    many, held_on = (*SAMPLES, *deciding, *second), (*SAMPLES, *second)
+    return [
+        *(("deciding", each, held_on if each == "hold" else many, True) for each in SITUATIONS),
+        ("deciding", "signal", SAMPLES, False),
+        ("judging", "signal", judging, True),
+        ("judging", "contact", judging, True),
+    ]
+
+
+def case_of(name: str, way: Way, device: str, situation: str, is_learning: bool) -> Case:
+    """The run of a scene served in this way."""
+    return Case(name, device, situation, way.search, is_learning, way.control_hz, way.inference_hz)
+
+
+def shares_of(ways: list[Way], pairs: int, seconds: float) -> list[Share]:
+    """What each way takes, in the median of turns over all of them."""
+    found: dict[Way, list[Share]] = {way: [] for way in ways}
+    for turn in range(pairs):
+        for way in ways if turn % 2 == 0 else ways[::-1]:
+            found[way].append(share_of(way, seconds))
+    return [
+        Share(way, *(round(statistics.median(getattr(each, key) for each in found[way]), 4) for key in KEYS))
+        for way in ways
+    ]
+
+
+def share_of(way: Way, seconds: float) -> Share:
+    """One run of a daemon that serves SHARED_SCENE in this way, with setpoints as often as plans."""
+    with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
+        scene = Path(folder) / "scene.toml"
+        stated = scene_path(SHARED_SCENE).read_text(encoding="utf-8")
+        scene.write_text(f'{stated}\n[solver]\nname = "{way.search}"\n', encoding="utf-8")
+        rates_hz = way.control_hz, way.inference_hz
+        stand = loop.Stand(RealTime(FIFO, lock_memory=True), way.inference_hz, None, rates_hz, str(scene))
+        return _share_of(way, stand, Path(folder), seconds)
+
+
+def _share_of(way: Way, stand: loop.Stand, folder: Path, seconds: float) -> Share:
+    with loop.daemon(stand, folder) as (config, pid):
+        time.sleep(SETTLES_S)
+        _, daemon, _ = loop.spent(pid, partial(time.sleep, seconds))
+        with contextlib.closing(Client(config.endpoints, 5.0)) as client:
+            rates = client.request("status")["rates"]
+    return Share(way, daemon, rates["control"]["exec_us"]["p50"], rates["inference"]["exec_us"]["p50"])

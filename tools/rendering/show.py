@@ -41,9 +41,6 @@ DAEMON_FIFO = 50
 DEVICE_FIFO, PUBLISHER_FIFO = DAEMON_FIFO - 10, DAEMON_FIFO - 20
 CONFIG = f"""scene = "{{scene}}"
 
-[rates]
-of_scene = true
-
 [device]
 port = "{{port}}"
 

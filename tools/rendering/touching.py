@@ -26,6 +26,7 @@ from tormagd.lab.ideal_carriage import Brake, Drive, brake_of, drive_of
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import FeltHand, Impedance
+from tormagd.simulation.parameters import with_insert
 from tormagd.simulation.patient import Delay
 from tormagd.simulation.plant import Plant, Truth
 
@@ -39,8 +40,8 @@ FREE_MM = 20.0
 "From where the hand begins to push to the wall."
 LEARNING: Legs = [(2.0, 15.0), (0.8, 0.0)]
 LEARNT_S = sum(lasts_s for lasts_s, _ in LEARNING)
-LEARNING_N, LEARNS_FOR_S = 1.2, 1.6
-"The device is asked for this while the hand slides, so that it is known."
+LEARNS, LEARNS_FOR_S = 0.6, 1.6
+"Of the greatest force: what is asked while the hand slides, so that the device is known."
 RESTS_S = 0.8
 ONSET_N, COUNTED_N = 0.2, 0.3
 "Over the waiting level: where a wall is felt, and what it has to reach in order to count."
@@ -52,7 +53,8 @@ MASS_KG = 0.15
 
 class Case(NamedTuple):
     """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without; jitter
-    and loss are the network's. `is_known`: a law tells the wall before it was met."""
+    and loss are the network's. `is_known`: a law tells the wall before it was met. Hand and wall come to rest at
+    `most_N`."""
 
     device: str
     hand_N_mm: float
@@ -63,6 +65,7 @@ class Case(NamedTuple):
     jitter_ms: float = 0.0
     loss: float = 0.0
     is_known: bool = True
+    most_N: float = MOST_N
 
 
 class Touch(NamedTuple):
@@ -154,7 +157,7 @@ class Scenario:
     def begin(self, now_s: float) -> range:
         """The hand sets out now; the ticks that it takes."""
         case = self._case
-        push_s = (FREE_MM + MOST_N / case.wall_N_mm + MOST_N / case.hand_N_mm) / case.push_mm_s
+        push_s = (FREE_MM + case.most_N / case.wall_N_mm + case.most_N / case.hand_N_mm) / case.push_mm_s
         there: Legs = [(push_s, case.push_mm_s), (RESTS_S, 0.0)]
         legs = [*LEARNING, *there, (push_s, -case.push_mm_s), (RESTS_S, 0.0)]
         self._hand.begin(legs, now_s)
@@ -167,7 +170,7 @@ class Scenario:
         sent = self._patient.update(now_s, truth.handle_mm)
         if since_s >= LEARNT_S:
             return sent
-        return TimedSetpoint(LEARNING_N if since_s < LEARNS_FOR_S else 0.0, now_s, VALID_S)
+        return TimedSetpoint(LEARNS * self._case.most_N if since_s < LEARNS_FOR_S else 0.0, now_s, VALID_S)
 
     def see(self, truth: Truth, limits: tuple[Limit, ...] = ()) -> None:
         """One tick."""
@@ -185,10 +188,10 @@ class Scenario:
         return Touch(time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N, faults, limits)
 
 
-def rendered(case: Case) -> Touch:
-    """Plays one case by the controller. Raises RuntimeError where the device is not enabled."""
-    scenario = Scenario(case, core_of(case))
-    loop = armed(scenario.core, device_of(case.device), scenario.felt)
+def rendered(case: Case, core: Core) -> Touch:
+    """Play one case by this controller. Raises RuntimeError where the device is not enabled."""
+    scenario = Scenario(case, core)
+    loop = armed(core, with_insert(device_of(case.device), core.scene.insert.name), scenario.felt)
     truth = loop.simulated.truth
     faults: tuple[str, ...] = ()
     for _ in scenario.begin(loop.now_s):

@@ -25,6 +25,7 @@ from tormagd.control.move.motor import Margins, margins, pull_V
 from tormagd.control.nominal import Nominal
 from tormagd.inverse.choice import BESIDE_PLANS, Choice, build, mean_error_N, named
 from tormagd.model.features import FEATURES
+from tormagd.model.memory import NO_MEMORY
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
 from tormagd.model.rising import falling_at
 from tormagd.model.shipped import model_path
@@ -32,7 +33,7 @@ from tormagd.physics.errors import DomainError, require
 from tormagd.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
 from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Finger, Scene, load_scene, scene_path, terms_of
+from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Finger, Scene, load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
@@ -124,7 +125,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     """The scene's element as the model has it, and how its field is searched for."""
-    terms = terms_of(scene)
+    terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
     require("insert.name, cip_percent", cip_percent, *model.feature_ranges[FEATURES.index("cip_percent")])
     nominal = Nominal(model, contact, cip_percent, terms.rate)
@@ -135,7 +136,7 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
         choice = choice._replace(reason=f"{choice.reason}; epsilon {mean_error_N(model):.4f} N, its model's mean error")
     search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, model, rises=rises)
     law = _law(scene, reach, field) if contact.slides else None
-    memory = model.metadata.memory.of(relaxes=terms.relaxes, hysteresis=terms.hysteresis)
+    memory = model.metadata.memory if terms.memory else NO_MEMORY
     return Element(nominal, memory, field, reach, search, law, choice.solver in BESIDE_PLANS), choice
 
 
@@ -343,7 +344,7 @@ def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
     known to rise, or Newton's method. Raises DomainError."""
     wanted = scene.solver
     if wanted.name == AUTO:
-        if not terms_of(scene).rate:
+        if not scene.terms.rate:
             return IN_PORTRAIT
         return BY_NEWTON if rises else SEVERAL_BRANCHES
     return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)

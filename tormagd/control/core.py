@@ -32,7 +32,7 @@ from tormagd.model.features import require_number
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
-from tormagd.scenes.scene import Scene, terms_of
+from tormagd.scenes.scene import Scene
 
 _PAUSED: Final = OperatingState.PAUSED
 
@@ -43,7 +43,7 @@ class Planner:
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begin at `now_s` with the gap open and an unseen device."""
-        terms, insert = terms_of(scene), scene.insert
+        terms, insert = scene.terms, scene.insert
         gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
         self.believe = Believe(config, scene, element.nominal, followed, element.portrait.min_N)

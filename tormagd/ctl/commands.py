@@ -311,11 +311,25 @@ COMMANDS = {
             option(
                 "action",
                 choices=("list", "show", "check", "explain", "new"),
-                help="check: does the daemon take it, and what does the device give of it; explain: which terms, and "
-                "why; new: write one, asking for what the task needs",
+                help="check: does the daemon take it, and what does the device give of it; explain: how it may be "
+                "served, how exactly, at what cost; new: write one, asking for what the task needs",
             ),
             option("name", nargs="?", metavar="NAME|FILE"),
             option("--force", type=Path, metavar="FORCE.csv", help="new: propose a scene for this recorded force"),
+            option(
+                "--share",
+                type=ABOVE_ZERO,
+                metavar="S",
+                help="check: the most exact way that takes at most this of a processor",
+            ),
+            option(
+                "--tolerance",
+                type=ABOVE_ZERO,
+                dest="tolerance_N",
+                metavar="N",
+                help="check: the cheapest way whose RMS error, N, is at most this",
+            ),
+            option("--out", "-o", type=Path, metavar="FILE.toml", help="check: write the scene served so, a new file"),
         ),
     ),
     "keys": Command(

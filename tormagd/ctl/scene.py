@@ -8,19 +8,30 @@ import msgspec
 from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.process import answer_of
-from tormagd.scenes.measured import Measured, MeasuredScene, is_met, measured, on_first, required
+from tormagd.scenes.measured import Measured, MeasuredScene, Share, Tried, Way, measured
 from tormagd.scenes.scene import Force, Scene, load_scene, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 30.0
 "Of the daemon's own check, which takes half a second."
-TOLERANCES = (0.5, 1.0, 2.0)
-"Times the scene's own, for which the terms are stated."
 
 
-def scene(action: str, name: str | None, force: Path | None, config: Config, config_file: Path | None) -> Outcome:
-    """One of the five; without a name, of the configuration's scene."""
+def scene(
+    action: str,
+    name: str | None,
+    force: Path | None,
+    share: float | None,
+    tolerance_N: float | None,
+    out: Path | None,
+    config: Config,
+    config_file: Path | None,
+) -> Outcome:
+    """One of the five; without a name, of the configuration's scene. Raises CommandError."""
     named = name or config.scene
+    if share is not None or tolerance_N is not None or out is not None:
+        from tormagd.ctl.scene_served import serve_scene
+
+        return serve_scene(action, named, share, tolerance_N, out)
     match action:
         case "list":
             return list_scenes()
@@ -79,19 +90,20 @@ def _line(key: str, value: object) -> str:
 
 
 def check_scene(name: str, config: Path | None) -> Outcome:
-    """Whether a daemon with this configuration takes the scene, what its device gives of it, and whether its cost is
-    within its budget. Raises CommandError where it does not, and for a faulty scene."""
+    """Say whether a daemon with this configuration takes the scene, what its device gives of it, and whether its cost
+    is within its budget. Raises CommandError where it does not, and for a faulty
+    scene."""
     derived = _derived(name, config)
     scene = _loaded(name)
-    known = _known(scene)
-    share = None if known is None else _core_share(known[1], derived)
-    if share is not None and share > scene.budget.core_share:
+    file = measured()
+    share = file.share(way_of(derived)) if not derived["terms_out"] else None
+    if share is not None and share.daemon > scene.budget.core_share:
         raise CommandError(
             Exit.REFUSED,
             "budget",
-            f"scene {scene.name}: its steps and plans take {share:.1%} of a processor: allowed is "
+            f"scene {scene.name}: a daemon takes {share.daemon:.1%} of a processor for it: allowed is "
             f"budget.core_share = {scene.budget.core_share:g}",
-            "leave terms out, or lower the rates: tormagctl scene explain says what that costs",
+            "tormagctl scene explain says what other rates and searches take",
         )
     force, signal, least_N = scene.force, scene.signal, derived["least_N"]
     lines = [
@@ -114,11 +126,16 @@ def check_scene(name: str, config: Path | None) -> Outcome:
             else []
         ),
         *_waiting(force, derived["approaches_s"]),
-        "cost       not measured: docs/guides/scene.md says how"
+        f"served     {told(way_of(derived))}",
+        "cost       not measured of these rates, search and terms"
         if share is None
-        else f"cost       {share:.1%} of a processor, {scene.budget.core_share:.0%} are allowed",
+        else f"cost       {share.daemon:.1%} of a processor for the daemon, {scene.budget.core_share:.0%} are allowed",
     ]
-    result = {"scene": scene.name, "core_share": share, "core_share_allowed": scene.budget.core_share} | derived
+    result = {
+        "scene": scene.name,
+        "core_share": share and share.daemon,
+        "core_share_allowed": scene.budget.core_share,
+    } | derived
     return Outcome(result, "\n".join(lines))
 
 
@@ -135,90 +152,61 @@ def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]
 
 
 def explain_scene(name: str, config: Path | None) -> Outcome:
-    """The decision on one scene, as it was measured, as a table. Raises CommandError where nothing was measured, for a
-    scene that the daemon refuses, and for a faulty one."""
+    """Show every way to serve a scene that was measured, the chosen one, and how that was judged. Raises CommandError
+    where nothing was measured, for a scene that the daemon refuses, and for a faulty one."""
     derived = _derived(name, config)
-    scene = _loaded(name)
-    known = _known(scene)
-    if known is None:
+    file = measured()
+    found = measured_as(_loaded(name), file)
+    tolerance_N = found.tolerance_N
+    runs = way_of(derived)
+    lines = [
+        f"{found.name}: tolerance {1e3 * tolerance_N:g} mN RMS",
+        "",
+        f"{'way':28} {'samples 1 to 3, mN':>22} {'of a processor':>15}",
+        *(_tried(each, file.share(each.way), found.chosen, runs) for each in found.tried),
+        "",
+        *([] if found.is_met else ["NOT MET: the usual way itself is over the tolerance", ""]),
+        f"{'chosen, judged':28} {'worst device':>14} {'chosen':>10} {'usual':>10}",
+        *(
+            f"{item.signal + ('' if item.learning else ', frozen'):28} {item.device:>14} {1e3 * item.rms_N:7.1f} mN "
+            f"{1e3 * item.usual_N:7.1f} mN"
+            for item in found.judged
+        ),
+        "",
+        f"Shares: the daemon's processes, live on the simulated device, beside a machine_us of {file.machine_us:g}.",
+    ]
+    result = msgspec.to_builtins(found) | {"shares": msgspec.to_builtins(file.shares), "derived": derived}
+    return Outcome(result, "\n".join(lines))
+
+
+def _tried(tried: Tried, share: Share | None, chosen: Way, runs: Way) -> str:
+    marks = [word for way, word in ((chosen, "chosen"), (runs, "runs here")) if way == tried.way]
+    errors = " ".join(f"{1e3 * error_N:6.1f}" for error_N in tried.rms_N)
+    taken = "not measured" if share is None else f"{share.daemon:.1%}"
+    return f"{told(tried.way):28} {errors:>22} {taken:>15}  {', '.join(marks)}".rstrip()
+
+
+def way_of(derived: dict[str, Any]) -> Way:
+    """The way that the daemon's own check says it would serve the scene."""
+    return Way(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
+
+
+def told(way: Way) -> str:
+    """Rates and search, for a person."""
+    return f"{way.control_hz} / {way.inference_hz} Hz, {way.search}"
+
+
+def measured_as(scene: Scene, file: Measured) -> MeasuredScene:
+    """What was measured of a scene that asks for just this. Raises CommandError where nothing was."""
+    found = file.scene(scene.fingerprint)
+    if found is None:
         raise CommandError(
             Exit.REFUSED,
             "not_measured",
             f"scene {scene.name} was not measured as it is now",
             "docs/guides/scene.md says how that is done, in some minutes",
         )
-    file, found = known
-    tolerance_N = found.tolerance_N
-    needed = {factor: required(found.terms, factor * tolerance_N, file.share) for factor in TOLERANCES}
-    out, usual = set(derived["terms_out"]), found.rates[0]
-    solver = derived["solver"]
-    width = max(len(item.term) for item in found.terms)
-    lines = [
-        f"{scene.name}: {scene.description}",
-        f"tolerance  {1e3 * tolerance_N:g} mN rms; a term is required that adds more than {file.share:.0%} of it",
-        f"search     {solver['solver']} ({solver['reason']})",
-        f"cost       {found.cost_full_us_s / 1e4:.2f}% of a processor with every term at "
-        f"{usual.control_hz} / {usual.inference_hz} Hz, "
-        f"{found.cost_us_s / 1e4:.2f}% with those that are required at {found.control_hz} / {found.inference_hz} Hz "
-        f"({file.build}, machine_us {file.machine_us:g})",
-        "",
-        f"{'term':{width}} runs   required  added, frozen  added, learning      saved    at half  at twice the "
-        "tolerance",
-    ]
-    for item in found.terms:
-        at_half, at_twice = ("in" if item.term in needed[factor] else "out" for factor in (0.5, 2.0))
-        lines.append(
-            f"{item.term:{width}} {'out' if item.term in out else 'in':6s} "
-            f"{'out' if item.term in found.left_out else 'in':8s} "
-            f"{1e3 * item.frozen_added_N:11.1f} mN {1e3 * item.learning_added_N:13.1f} mN "
-            f"{found.saved_us_s(item) / 1e4:8.2f}% {at_half:>10s} {at_twice:>9s}"
-        )
-    back = [item.term for item in found.terms if item.term not in needed[1.0] and item.term not in found.left_out]
-    lines += [
-        *([f"{', '.join(back)}: not required alone, but with the others out"] if back else []),
-        "",
-        "true force, RMS    every term   required ones",
-        *(
-            f"{it.plant} {'learning' if it.is_learning else 'frozen':9s} {1e3 * it.full_N:7.1f} mN "
-            f"{1e3 * it.chosen_N:10.1f} mN"
-            for it in found.judged
-        ),
-        *([] if is_met(found.judged, tolerance_N) else ["NOT MET: the full model itself is over the tolerance"]),
-        "",
-        "every term  control  inference  RMS on sample 1",
-        *(
-            f"            {at.control_hz:4d} Hz  {at.inference_hz:6d} Hz  {1e3 * on_first(at.judged).chosen_N:7.1f} mN"
-            f"{'  chosen' if at is found.at_chosen else ''}"
-            for at in found.rates
-        ),
-        "",
-        "search named     RMS on sample 1    core share",
-        *(
-            f"{named.search:15s} {1e3 * named.rms_N:12.1f} mN  {found.us_s(named.cost) / 1e4:10.2f}%"
-            for named in found.searches
-        ),
-    ]
-    result = msgspec.to_builtins(found) | {
-        "derived": derived,
-        "required": {f"{factor:g}": names for factor, names in needed.items()},
-    }
-    return Outcome(result, "\n".join(lines))
-
-
-def _core_share(found: MeasuredScene, derived: dict[str, Any]) -> float:
-    """Of the terms and at the rates that the daemon runs; a set of terms that was not measured counts as all. A plan is
-    dearest at slow rates: at rates that were not measured the share is at most this."""
-    hz = derived["control_hz"], derived["inference_hz"]
-    if tuple(derived["terms_out"]) == found.left_out:
-        cost = found.chosen
-    else:
-        cost = next((at.cost for at in found.rates if at.hz == hz), found.at_chosen.cost)
-    return 1e-6 * cost.us_s(*hz)
-
-
-def _known(scene: Scene) -> tuple[Measured, MeasuredScene] | None:
-    file = measured()
-    return next(((file, found) for found in file.scenes if found.fingerprint == scene.fingerprint), None)
+    return found
 
 
 def _loaded(name: str) -> Scene:

@@ -31,7 +31,6 @@ from tormagd.hardware.connection import Connection
 from tormagd.keys import KeyRing
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import OperatingState, RefusedError
-from tormagd.scenes.scene import terms_of
 from tormagd_client.endpoints import ConfigError
 
 NS = 1_000_000_000
@@ -138,7 +137,7 @@ class Daemon:
             "running scene %s (%s), without the terms: %s; with the %s solver at %g mT (%s)",
             scene.name,
             scene.fingerprint,
-            ", ".join(terms_of(scene).left_out) or "none",
+            ", ".join(scene.terms.left_out) or "none",
             solver.solver,
             solver.step_mT,
             solver.reason,

@@ -18,7 +18,7 @@ from tormagd.daemon.search_process import SearchProcess
 from tormagd.hardware.backend import Backend, choose, installed
 from tormagd.keys import KeyRing
 from tormagd.output import write_line
-from tormagd.scenes.scene import load_scene, terms_of
+from tormagd.scenes.scene import load_scene
 from tormagd.toml_file import placed
 from tormagd_client.endpoints import ENDPOINTS, ConfigError
 from tormagd_client.printable import printable
@@ -81,7 +81,7 @@ def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> None
             "control_hz": config.rates.control_hz,
             "inference_hz": config.rates.inference_hz,
             "fingerprint": core.scene.fingerprint,
-            "terms_out": terms_of(core.scene).left_out,
+            "terms_out": core.scene.terms.left_out,
             "least_resolution_N": least_resolution_N(core.portrait, core.scene.force.most_N),
             "missed_rms_N": None if core.missed is None else core.missed.rms_N,
             "missed_share": None if core.missed is None else core.missed.share,

@@ -31,7 +31,6 @@ from tormagd.daemon.topics import Topics
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
-from tormagd.scenes.scene import terms_of
 from tormagd_client.messages import (
     Description,
     DeviceReport,
@@ -211,7 +210,7 @@ class TelemetryLoop:
         stamp = self._endpoint.inbox.newest
         age_s = None if stamp is None else now_s - stamp.stamp_s
         planner, stepper = self._inference.planner, self._control.stepper
-        believed = beliefs(planner, stepper, now_s, terms_of(self._core.scene))
+        believed = beliefs(planner, stepper, now_s, self._core.scene.terms)
         told = self.topics.handle(), self.topics.verdict()
         return snapshot(self._ticks[-1], self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed, *told)
 
@@ -335,7 +334,7 @@ class TelemetryLoop:
             build=str(settle()),
             scene=self._core.scene.name,
             scene_fingerprint=self._core.scene.fingerprint,
-            terms_out=terms_of(self._core.scene).left_out,
+            terms_out=self._core.scene.terms.left_out,
             solver=self._core.solver.solver,
             roller_radius_mm=self._core.scene.roller_radius_mm,
             uptime_s=round(time.monotonic() - self._started_s, 1),

@@ -6,8 +6,7 @@ F0 is the force without memory, which the network knows. What of it is there wit
 relax each by a Prony series (`tormagd.physics.relaxation`); a brake's by the same, of a pad's they differ.
 """
 
-from collections.abc import Callable
-from itertools import compress, pairwise
+from itertools import pairwise
 
 import msgspec
 
@@ -57,20 +56,6 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     @property
     def _field_fractions(self) -> tuple[float, ...]:
         return self.fractions if isinstance(self.field_fractions, msgspec.UnsetType) else self.field_fractions
-
-    def of(self, *, relaxes: Callable[[float], bool], hysteresis: bool) -> "Memory":
-        """Of these alone; `relaxes` says of a time constant, s, whether what relaxes with it is one of them."""
-        is_kept = [relaxes(time_s) for time_s in self.times_s]
-        fractions, times_s, added = (
-            tuple(compress(values, is_kept)) for values in (self.fractions, self.times_s, self._field_fractions)
-        )
-        return Memory(
-            fractions=fractions,
-            times_s=times_s,
-            field_fractions=added if added != fractions else msgspec.UNSET,
-            lag_mT=self.lag_mT if hysteresis else 0.0,
-            turn_mT=self.turn_mT,
-        )
 
 
 NO_MEMORY = Memory()

@@ -218,8 +218,9 @@ class ForceModel:
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
         weight, bias, output, _ = self.physical
-        rises = 1 - np.tanh((rows @ weight.T + bias) / 2) ** 2
-        return np.asarray(rises @ (output * weight[:, FIELD] / 4), dtype=np.float64)
+        # the sigmoid's slope without 1 - tanh^2, which is 0 by rounding where a unit is saturated
+        falls = np.exp(-np.abs(rows @ weight.T + bias))
+        return np.asarray(falls / (1.0 + falls) ** 2 @ (output * weight[:, FIELD]), dtype=np.float64)
 
 
 def save_model(path: Path | str, model: ForceModel) -> None:

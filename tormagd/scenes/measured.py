@@ -1,4 +1,4 @@
-"""What `tools/required_terms.py` measured: which terms each scene requires, and what leaving the others out saves."""
+"""What `tools/benchmark.py scenes` measured: how exactly and at what cost each scene is served, and what was chosen."""
 
 from importlib import resources
 
@@ -6,144 +6,112 @@ import msgspec
 from msgspec import Struct
 
 
-class Cost(Struct, frozen=True):
-    """Processor time of a step and of a plan, us, at the rates that they were measured at: what is done by the time and
-    not by the plan, such as the forecast, makes a plan dearer that comes seldom."""
-
-    step_us: float
-    plan_us: float
-
-    def us_s(self, control_hz: int, inference_hz: int) -> float:
-        """Of a second of control."""
-        return control_hz * self.step_us + inference_hz * self.plan_us
-
-
-class Without(Struct, frozen=True):
-    """One term left out: the RMS error of the force that this adds on sample 1, N, after the device was learned and
-    then no more (`frozen`), and while it is learned; and what steps and plans cost without it."""
-
-    term: str
-    frozen_added_N: float
-    learning_added_N: float
-    cost: Cost
-
-    @property
-    def added_N(self) -> float:
-        """The greater: learning hides what a term does, and is not always on."""
-        return max(self.frozen_added_N, self.learning_added_N)
-
-
-class Judged(Struct, frozen=True):
-    """RMS errors of the force on one sample, N: of the full model at the usual rates, and of another choice."""
-
-    plant: str
-    is_learning: bool
-    full_N: float
-    chosen_N: float
-
-
-class AtRates(Struct, frozen=True):
-    """All terms at other rates."""
+class Way(Struct, frozen=True):
+    """One way to serve a scene: rates of control and of plans, Hz, and the search for the field."""
 
     control_hz: int
     inference_hz: int
-    judged: tuple[Judged, ...]
-    cost: Cost
+    search: str
+
+
+class Share(Struct, frozen=True):
+    """The processor time of a daemon that serves a scene in one way, live on the simulated device.
+
+    `daemon` is of all its processes, over wall time. `step_us` and `plan_us` are the core's own, in the median.
+    """
+
+    way: Way
+    daemon: float
+    step_us: float
+    plan_us: float
 
     @property
-    def hz(self) -> tuple[int, int]:
-        """Of control and of inference."""
-        return self.control_hz, self.inference_hz
+    def core_us_s(self) -> float:
+        """The core's own processor time in a second of control, us."""
+        return self.way.control_hz * self.step_us + self.way.inference_hz * self.plan_us
 
 
-class WithSearch(Struct, frozen=True):
-    """The chosen terms and rates with a search that is named: RMS error on sample 1 while the device is learned, N."""
+class Tried(Struct, frozen=True):
+    """The RMS error of the force, N, of a scene's own signal served in one way, on each of the three samples."""
 
-    search: str
+    way: Way
+    rms_N: tuple[float, ...]
+
+    @property
+    def worst_N(self) -> float:
+        """The greatest of the three."""
+        return max(self.rms_N)
+
+
+class Judged(Struct, frozen=True):
+    """The worst device of a group, `deciding` or `judging`, in one situation: the RMS error of the force, N, as chosen
+    and in the usual way."""
+
+    group: str
+    device: str
+    signal: str
+    learning: bool
     rms_N: float
-    cost: Cost
+    usual_N: float
 
 
 class MeasuredScene(Struct, frozen=True):
-    """One scene as it was measured, and what was chosen: the rates by all terms, then the terms at these rates."""
+    """One scene: every way that was tried, the usual one first, the chosen one, and how that was judged."""
 
     name: str
     fingerprint: str
     tolerance_N: float
-    control_hz: int
-    inference_hz: int
-    left_out: tuple[str, ...]
-    terms: tuple[Without, ...]
+    chosen: Way
+    tried: tuple[Tried, ...]
     judged: tuple[Judged, ...]
-    rates: tuple[AtRates, ...]
-    "The first are the usual ones."
-    searches: tuple[WithSearch, ...]
-    chosen: Cost
 
     @property
-    def hz(self) -> tuple[int, int]:
-        """The chosen rates, of control and of inference."""
-        return self.control_hz, self.inference_hz
+    def usual(self) -> Tried:
+        """The scene at 1000 Hz of control and 500 of plans."""
+        return self.tried[0]
 
     @property
-    def at_chosen(self) -> AtRates:
-        """All terms at the chosen rates."""
-        return next(at for at in self.rates if at.hz == self.hz)
+    def is_met(self) -> bool:
+        """Whether the usual way keeps to the tolerance on the three samples."""
+        return self.usual.worst_N <= self.tolerance_N
 
-    @property
-    def cost_full_us_s(self) -> float:
-        """Of the processor, for a second of control with every term at the usual rates."""
-        usual = self.rates[0]
-        return usual.cost.us_s(*usual.hz)
-
-    @property
-    def cost_us_s(self) -> float:
-        """The same with what was chosen."""
-        return self.us_s(self.chosen)
-
-    def us_s(self, cost: Cost) -> float:
-        """Of a second of control at the chosen rates."""
-        return cost.us_s(*self.hz)
-
-    def saved_us_s(self, without: Without) -> float:
-        """What leaving one term out saves of that, all others in."""
-        return self.us_s(self.at_chosen.cost) - self.us_s(without.cost)
+    def of(self, way: Way) -> Tried:
+        """What was found of a way that was tried. Raises StopIteration for another."""
+        return next(each for each in self.tried if each.way == way)
 
 
 class Measured(Struct, frozen=True):
-    """The file: how it was made, and every scene."""
+    """The file: how it was made, what each way costs, and every scene."""
 
     command: str
-    share: float
-    "Of a scene's tolerance: a term that adds more when it is left out is required."
-    seconds: float
-    "Of each run, at the least: a hold is measured to its end, two minutes of it at most."
-    build: str
     machine_us: float
-    "Of the machine that the costs are of: see `tormagd.headroom.machine_loop`."
+    "Of the machine that the shares are of: see `tormagd.headroom.machine_loop`."
+    pairs: int
+    "Runs of each way that a share is the median of."
+    shares: tuple[Share, ...]
     scenes: tuple[MeasuredScene, ...]
 
+    def share(self, way: Way) -> Share | None:
+        """What a way costs; None where nobody measured it."""
+        return next((each for each in self.shares if each.way == way), None)
 
-FILE = "required_terms.json"
-JUDGED = 0.8
-"Of a scene's tolerance: an error within it is one that terms and rates may be chosen for."
+    def scene(self, fingerprint: str) -> MeasuredScene | None:
+        """The scene that asks for just this; None where it was not measured."""
+        return next((each for each in self.scenes if each.fingerprint == fingerprint), None)
+
+
+FILE = "measured.json"
+TOLERATED = 0.8
+"Of a scene's tolerance: an error within it may be chosen."
+WORSE = 0.2
+"Of a scene's tolerance: an error that is so much over the usual way's may be chosen."
 
 
 def measured() -> Measured:
-    """The file that comes with the package."""
+    """Read the file that comes with the package."""
     return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measured)
 
 
-def required(terms: tuple[Without, ...], tolerance_N: float, share: float) -> tuple[str, ...]:
-    """The terms of a scene whose absence adds more than `share` of a tolerance."""
-    return tuple(item.term for item in terms if item.added_N > share * tolerance_N)
-
-
-def is_met(judged: tuple[Judged, ...], tolerance_N: float) -> bool:
-    """Whether the full model keeps to the tolerance while the device is learned."""
-    return all(item.full_N <= tolerance_N for item in judged if item.is_learning)
-
-
-def on_first(judged: tuple[Judged, ...]) -> Judged:
-    """The outcomes on the first sample, while it is learned."""
-    return next(item for item in judged if item.is_learning)
+def allowed_N(usual_N: float, tolerance_N: float) -> float:
+    """The greatest error, N, of a way that may be chosen in place of the usual one."""
+    return max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)

@@ -4,7 +4,6 @@ The daemon runs one scene. Nothing that a scene does not ask for is modelled or 
 """
 
 import hashlib
-import math
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,9 +13,8 @@ from msgspec import UNSET, Meta, UnsetType
 
 from tormagd.config import LEAST_INFERENCE_HZ
 from tormagd.named_file import named, shipped
-from tormagd.scenes.measured import measured
 from tormagd.toml_file import convert
-from tormagd_client.endpoints import ConfigError, Strict
+from tormagd_client.endpoints import Strict
 
 AUTO = "auto"
 LEAST_SETPOINT_HZ = 12.0
@@ -119,15 +117,12 @@ class Terms(Strict, frozen=True):
     `scale`       the device's force over the model's is learned: friction, modulus, field
     `offset`      the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds
                   back, beyond what its model expects
-    `relaxation_1_s`, `_10_s`, `_100_s`, `_1000_s`
-                  what the elastomer has relaxed away of the force is told by the model, from what it was put to: each
-                  the part whose time constants are the nearest to its own
-    `hysteresis`  how far the field lags behind that of its gap is told by the model, from where the gap has been
-    `slope`       setpoints are carried along their slope to now and ahead
-    `forecast`    a force that repeats itself is foreseen
-    `lag`         how late the carriages are is learned, and made up for
-    `motor`       the duty that the reference takes of the motors is fed forward: for its speed and acceleration, the
-                  dry friction of gearbox and screw, and the magnets' pull, which limits the opening speed as well
+    `memory`      what the elastomer has relaxed away of the force, and how far the field lags behind that of its gap,
+                  is told by the model from where the gap has been
+    `forecast`    setpoints are carried along their slope to now and ahead, and a force that repeats itself is foreseen
+    `motor`       how late the carriages are is learned and made up for, and the duty that the reference takes is fed
+                  forward: for its speed and acceleration, the dry friction of gearbox and screw, and the magnets'
+                  pull, which limits the opening speed as well
 
     A pad has no `creep`. What safety rests on is no term: the ceiling, the judgement of the sensor, the force law
     beside the search.
@@ -137,27 +132,16 @@ class Terms(Strict, frozen=True):
     creep: bool = True
     scale: bool = True
     offset: bool = True
-    relaxation_1_s: bool = True
-    relaxation_10_s: bool = True
-    relaxation_100_s: bool = True
-    relaxation_1000_s: bool = True
-    hysteresis: bool = True
-    slope: bool = True
+    memory: bool = True
     forecast: bool = True
-    lag: bool = True
     motor: bool = True
     learning: bool = True
-    "No part of the model, but whether `creep`, `scale`, `offset` and `lag` go on learning, or stay what they are."
+    "No part of the model, but whether `creep`, `scale`, `offset` and the carriages' lag go on being learned."
 
     @property
     def left_out(self) -> tuple[str, ...]:
         """The names of the terms that are out."""
         return tuple(name for name in TERMS if not getattr(self, name))
-
-    def relaxes(self, time_s: float) -> bool:
-        """Whether what relaxes with this time constant is told."""
-        nearest = min(RELAXATION_S, key=lambda name: abs(math.log(time_s / RELAXATION_S[name])))
-        return bool(getattr(self, nearest))
 
     def without(self, *names: str) -> "Terms":
         """These terms with some more left out. Raises ValueError for a name that is none."""
@@ -169,8 +153,6 @@ class Terms(Strict, frozen=True):
 
 TERMS = tuple(name for name in Terms.__struct_fields__ if name != "learning")
 EVERY_TERM = Terms()
-RELAXATION_S = {"relaxation_1_s": 1.0, "relaxation_10_s": 10.0, "relaxation_100_s": 100.0, "relaxation_1000_s": 1e3}
-"The time constant of each of these terms."
 
 
 class Insert(Strict, frozen=True):
@@ -221,9 +203,8 @@ class Scene(Strict, frozen=True):
     finger: Finger | UnsetType = UNSET
     "What presses into a pad; a tactile scene has it, and no other."
     budget: Budget = msgspec.field(default_factory=Budget)
-    terms: Terms | Literal["all", "required"] = EVERY_TERM
-    """Which parts of the controller's model run. "required": those that `tools/required_terms.py` found this very scene
-    to require. `load_scene` puts the terms themselves in the words' place."""
+    terms: Terms = EVERY_TERM
+    "Which parts of the controller's model run."
     bandwidth: Bandwidth = msgspec.field(default_factory=Bandwidth)
     solver: Solver = msgspec.field(default_factory=Solver)
 
@@ -270,16 +251,11 @@ class Scene(Strict, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """Of the task: of all that is stated but how it is called, and how often and by which terms it is served."""
+        """Hash what is asked: all that is stated but names, budget, and how it is served (terms, rates, search)."""
         task = msgspec.structs.replace(
-            self, name="", description="", terms=EVERY_TERM, bandwidth=Bandwidth(), budget=Budget()
+            self, name="", description="", terms=EVERY_TERM, bandwidth=Bandwidth(), solver=Solver(), budget=Budget()
         )
         return hashlib.sha256(msgspec.json.encode(task)).hexdigest()[:16]
-
-
-def terms_of(scene: Scene) -> Terms:
-    """The terms of a scene that was loaded, or made."""
-    return scene.terms if isinstance(scene.terms, Terms) else EVERY_TERM
 
 
 def shipped_scenes() -> tuple[str, ...]:
@@ -293,20 +269,5 @@ def scene_path(name_or_path: str) -> Path:
 
 
 def load_scene(name_or_path: str) -> Scene:
-    """The scene in a file or of a shipped name, its terms resolved. Raises ConfigError naming file, key, value and what
-    is allowed."""
-    path = scene_path(name_or_path)
-    scene = convert(path, Scene)
-    if scene.terms == "required":
-        return msgspec.structs.replace(scene, terms=_required(scene, path))
-    return scene if isinstance(scene.terms, Terms) else msgspec.structs.replace(scene, terms=EVERY_TERM)
-
-
-def _required(scene: Scene, path: Path) -> Terms:
-    for known in measured().scenes:
-        if known.fingerprint == scene.fingerprint:
-            return EVERY_TERM.without(*known.left_out)
-    raise ConfigError(
-        f'{path}: terms = "required": this scene was not measured as it is now: allowed is one that was: '
-        "docs/guides/scene.md says how, and what stands in its place in a table [terms]"
-    )
+    """Read the scene in a file or of a shipped name. Raises ConfigError naming file, key, value and what is allowed."""
+    return convert(scene_path(name_or_path), Scene)

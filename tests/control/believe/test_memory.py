@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import msgspec
 import pytest
 from hypothesis import given, strategies as st
 
@@ -17,7 +18,7 @@ from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.physics.relaxation import PronySeries
 
 MEMORY = Memory(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0), lag_mT=8.0, turn_mT=80.0)
-STEADY = MEMORY.of(relaxes=lambda _: True, hysteresis=False)
+STEADY = msgspec.structs.replace(MEMORY, lag_mT=0.0)
 GAPS_MM = (45.0, 95.0)
 FAR_MM, NEAR_MM = 70.0, 48.0
 
@@ -106,17 +107,6 @@ def test_the_field_lags_along_its_way_and_not_in_time(follow) -> None:
 def test_an_element_without_memory_or_a_past_is_as_its_gap(follow, gaps_mm: tuple[float, ...], memory: Memory) -> None:
     remembered = follow(*[found(gap_mm) for gap_mm in gaps_mm], memory=memory)
     assert (remembered.lag_mT, remembered.relaxed_N) == (0.0, 0.0)
-
-
-def test_each_can_be_left_out() -> None:
-    assert [MEMORY.of(relaxes=lambda _: True, hysteresis=lags) for lags in (True, False)] == [MEMORY, STEADY]
-    assert MEMORY.of(relaxes=lambda _: False, hysteresis=True) == Memory(lag_mT=8.0, turn_mT=80.0)
-    short = MEMORY.of(relaxes=lambda time_s: time_s < 100.0, hysteresis=False)
-    assert short == Memory(fractions=(0.05, 0.04), times_s=(8.0, 90.0), turn_mT=80.0)
-    pads = Memory(fractions=(0.01, 0.04), times_s=(1.0, 10.0), field_fractions=(0.03, 0.05))
-    assert pads.of(relaxes=lambda time_s: time_s > 5.0, hysteresis=True) == Memory(
-        fractions=(0.04,), times_s=(10.0,), field_fractions=(0.05,)
-    )
 
 
 RELAXED = 0.13

@@ -80,7 +80,6 @@ class Governor:
     ) -> None:
         """Begin with the gap open. `force` is the scene's, `gap_speed_mm_s` the gap's greatest, `terms` what is in
         use."""
-        self._has_slope: Final = terms.slope
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._path: Final = Path(portrait, gap_speed_mm_s)
@@ -168,7 +167,7 @@ class Governor:
         if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
             self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
             self.forecast.forget()
-        elif spacing_s > MAX_STEP_S or not self._has_slope or setpoint.wall is not None:
+        elif spacing_s > MAX_STEP_S or not self._has_forecast or setpoint.wall is not None:
             self.slope_N_s = 0.0
         elif spacing_s > 0.0:
             rate_N_s = device.scale * self._portrait.force_rate_N_s(device.model_N(force_N), self._gap_speed_mm_s)

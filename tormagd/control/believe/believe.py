@@ -22,7 +22,7 @@ from tormagd.control.records import Belief, Measured
 from tormagd.control.sight import unsensed_s
 from tormagd.model.displacement import MOVING_MM_S
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import Scene, terms_of
+from tormagd.scenes.scene import Scene
 
 MIN_DT_S: Final = 0.003
 MAX_DT_S: Final = 0.02
@@ -94,7 +94,7 @@ class Believe:
     ) -> None:
         """Begin with an unseen device. `min_model_N` is the model's force with the gap open, for `min_N`. `update`
         advances `memory`."""
-        terms = terms_of(scene)
+        terms = scene.terms
         trim = config.trim
         self._min_model_N: Final = min_model_N
         self.memory, self.handle = memory, HandleWatch()
@@ -110,7 +110,7 @@ class Believe:
         self.learns = terms.learning
         """Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it
         forgotten."""
-        self._has_lag: Final = terms.lag
+        self._has_lag: Final = terms.motor
         self._has_creep: Final = terms.creep and nominal.contact.slides
         self._fits: Final = terms.scale or terms.offset
 

@@ -17,7 +17,7 @@ from tormagd.control.move.reference import Expected, Reference, Speeds, follow, 
 from tormagd.control.records import Measured, Plan
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import Scene, terms_of
+from tormagd.scenes.scene import Scene
 
 WEAK_MM: Final = 1.0
 "Carriages further behind than this have weaker motors than believed."
@@ -65,7 +65,7 @@ class Carriages(Actuator):
         self._lag_s: Final = electrical_time_s(motor) + EXCHANGE_S
         self._gear_loss: Final = 1.0 - motor.gear_efficiency
         self._coulomb: Final = motor.coulomb_V / motor.supply_V
-        terms = terms_of(scene)
+        terms = scene.terms
         self._has_motor: Final = terms.motor
         self._learns: Final = terms.learning
 

