@@ -1,6 +1,6 @@
-"""The interface every backend offers, and how one is found.
+"""The interface of a backend, and the choice of one among the installed plugins.
 
-A backend carries typed messages over one kind of wire. It does not pace, retry or interpret: the link does.
+A backend carries typed messages over one kind of wire. It does not pace, retry or interpret: `link.DeviceLink` does.
 """
 
 import logging
@@ -18,19 +18,22 @@ from tormagd.named_file import did_you_mean
 from tormagd_client.endpoints import ConfigError, Strict
 
 ENTRY_POINTS = "tormagd.backends"
-"""Each of this group is a `Driver`."""
+"""The group of entry points under which plugins register; each names a `Driver`."""
 OptionsT = TypeVar("OptionsT", bound=Strict)
 
 PLUGIN_ERRORS = (
     ImportError, AttributeError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError, SyntaxError,
 )  # fmt: skip
-"""What a stranger's module may raise while it is imported."""
+"""What the module of a foreign plugin may raise while it is imported."""
 
 log = logging.getLogger(__name__)
 
 
 class BackendError(OSError):
-    """The device is gone, or cannot be opened. The text says what happened, `remedy` what to do if that is special."""
+    """The device is gone, or cannot be opened. The text says what happened.
+
+    `remedy` says what to do; it is empty where the usual advice for the connection's state will do.
+    """
 
     def __init__(self, cause: str, remedy: str = "") -> None:
         super().__init__(cause)
@@ -45,41 +48,44 @@ class LinkStatistics(Protocol):
     corrupt: int
     lost: int
     repeated: int
-    """What the backend knew for a repetition; not the States it gives out that are no news, which the link counts."""
+    """Frames that the backend itself took for repetitions. Repeated States that it hands on are counted by the link."""
     resynchronisations: int
     unsent: int
     """Messages that the wire did not take at once."""
     refused: dict[str, str]
-    """By message (or "frame", where it was none yet), why the newest one was refused: `{"State": "CRC-8"}`."""
+    """Why the newest refused message was refused, by its name, or by "frame" for bytes that were no message yet.
+
+    For example `{"State": "CRC-8"}`.
+    """
 
 
 Stream: TypeAlias = FrameStream | CanStream
-"What a backend takes its bytes apart with."
+"What turns a backend's messages into the wire's bytes, and bytes into messages."
 Received: TypeAlias = bytes | list[tuple[int, bytes]]
-"What came at once: a serial port's bytes, or a bus's frames, identifier and data each."
+"What one read gave: a serial port's bytes, or a bus's frames, identifier and data each."
 Sent: TypeAlias = bytes | tuple[int, bytes]
-"What one message became."
+"What one message became on the wire: a serial frame's bytes, or a CAN frame's identifier and data."
 
 
 class Backend(Protocol):
-    """An open connection to one device. One that has a `stream: Stream` besides has its frames in the black box."""
+    """An open connection to one device. If it also has a `stream: Stream`, the black box keeps its frames."""
 
     @property
     def statistics(self) -> LinkStatistics:
         """Counters since the connection was opened."""
 
     def receive(self) -> Sequence[Message]:
-        """All valid messages that have arrived; never blocks. Raises BackendError when the device is gone."""
+        """Return the valid messages that have arrived; never block. Raises BackendError when the device is gone."""
 
     def send(self, message: Message) -> None:
-        """Hands one message to the wire; never blocks. Raises BackendError when the device is gone."""
+        """Hand one message to the wire; never block. Raises BackendError when the device is gone."""
 
     def close(self) -> None:
-        """Gives the device back. Never raises."""
+        """Close the connection, so that others may open the device. Never raises."""
 
 
 def _accept(device: Device, options: Strict, rates: Rates) -> None:
-    """Nothing more to check."""
+    """Accept all settings: a driver without a check of its own."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +109,9 @@ class Chosen(NamedTuple):
 
 
 def installed() -> dict[str, str]:
-    """Every backend plugin by name, with the reason why it does not load, or "".
+    """Load every installed backend plugin; return by its name why it does not load, "" where it does.
 
-    A broken one is reported and skipped, so that a third party's package stops nobody else.
+    A plugin that does not load is logged as a warning: a third party's package stops nobody else.
     """
     found = {}
     for entry in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
@@ -120,9 +126,10 @@ def installed() -> dict[str, str]:
 
 
 def choose(device: Device, rates: Rates) -> Chosen:
-    """The backend that `device.backend` names, ready to be opened; only that plugin is imported.
+    """Import the backend plugin that `device.backend` names, check the settings, and return it ready to be opened.
 
-    Raises ConfigError: unknown (naming the installed ones), broken, or not what `device` asks for.
+    Raises ConfigError where no such plugin is installed, where it does not load, and where it refuses
+    `device.options` or `rates`. No other plugin is imported, and nothing is opened.
     """
     found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if device.backend not in found:
@@ -138,6 +145,7 @@ def choose(device: Device, rates: Rates) -> Chosen:
 
 
 def _load(entry: metadata.EntryPoint) -> Driver[Any]:
+    """Import the driver of an entry point. Raises TypeError for one that is no Driver, and what its import raises."""
     loaded = entry.load()
     if not isinstance(loaded, Driver):
         raise TypeError(f"{entry.value} is {loaded!r:.80}: allowed is a {Driver.__module__}.{Driver.__name__}")

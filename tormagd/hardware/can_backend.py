@@ -1,7 +1,7 @@
-"""The CAN backend: python-can opens the bus, which is drained whenever it is asked for.
+"""The CAN backend: python-can opens the bus, and each `receive` drains it.
 
-Any python-can interface whose bus has a descriptor will do: `socketcan` in the field, `slcan` and `udp_multicast` on
-the bench, `tormagsim` for the simulated device.
+A python-can interface will do if its bus has a file descriptor: `socketcan` in the field, `slcan` and `udp_multicast`
+on the bench, `tormagsim` for the simulated device.
 """
 
 import contextlib
@@ -28,18 +28,18 @@ from tormagd_client.endpoints import ConfigError, Strict
 FRAMES_AT_ONCE = 256
 """Most frames taken in one `receive`: a bus that never falls silent must not keep the loop."""
 UNSENT_FRAMES = 50
-"""Frames in a row that the bus did not take; at 1 kHz, the device's own command timeout."""
+"""Frames in a row that the bus may leave untaken; at 1 kHz, the device's own command timeout."""
 EXCHANGE_BITS = 395
-"""Drive, State and Sense with the most stuffing: firmware_protocol/README.md."""
+"""Bits of one Drive, State and Sense with the most stuffing: firmware_protocol/README.md."""
 MOST_LOAD = 0.7
-"""What is left is for Status, commands and the bus's other nodes."""
+"""Share of the bit rate that these three may take; the rest is for Status, commands and the bus's other nodes."""
 BUS_OFF = 0x40
 """Error class in the identifier of an error frame: linux/can/error.h, CAN_ERR_BUSOFF."""
 ABSENT = {
     errno.ENODEV: ("there is no such interface", "plug the adapter in"),
     errno.EAFNOSUPPORT: ("the kernel knows no CAN", "sudo modprobe can_raw"),
 }
-"""Why the kernel opens no `socketcan` interface, and what comes before bringing it up."""
+"""Why the kernel opens no `socketcan` interface, and what to do before the interface is brought up."""
 
 
 class CanOptions(Strict, frozen=True):
@@ -56,10 +56,13 @@ class CanOptions(Strict, frozen=True):
 
 
 class CanBackend:
-    """An open bus and the conversation with one node on it."""
+    """An open CAN bus and the conversation with one node on it: a `Backend`."""
 
     def __init__(self, port: str, options: CanOptions, bus: can.BusABC, held: int | None = None) -> None:
-        """`held` is a descriptor that keeps others from opening the adapter; it is closed with the bus."""
+        """Take over the open `bus`; `close` shuts it down.
+
+        `held` is a descriptor whose lock keeps other programs from the adapter; `close` closes it. None: no lock.
+        """
         self._port, self._options, self._bus, self._held = port, options, bus, held
         self._fd: int = bus.fileno()
         self.stream = CanStream(options.node)
@@ -74,9 +77,10 @@ class CanBackend:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """All messages of the node that have arrived.
+        """Return the node's messages among the frames that have arrived, from FRAMES_AT_ONCE frames at most.
 
-        Raises BackendError when the bus is off or gone, or when another host drives the node.
+        Frames that cannot be read are counted as corrupt. Raises BackendError when the bus is off or gone, or when
+        another host drives the node.
         """
         self.stream.received = []
         messages: list[Message] = []
@@ -86,7 +90,7 @@ class CanBackend:
             except (can.CanError, OSError) as error:
                 if not (isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError)):
                     raise self._gone("receiving failed", error) from error
-                self._bus.flush()  # it would keep a line that is no text for ever
+                self._bus.flush()  # python-can would keep a line that is no text for ever
                 self.stream.count_unreadable()
                 continue
             except (ValueError, IndexError):  # how slcan says that a line of the adapter's is damaged
@@ -101,9 +105,10 @@ class CanBackend:
         return messages
 
     def send(self, message: Message) -> None:
-        """Hands one frame to the bus. One that it does not take at once is dropped: the next tick has a newer one.
+        """Hand one frame to the bus. If the bus does not take the frame at once, drop and count it.
 
-        Raises BackendError when the bus is off or gone, or has not taken any for UNSENT_FRAMES.
+        The next tick has a newer one. Raises BackendError when the bus is off or gone, or has taken none of over
+        UNSENT_FRAMES frames in a row; EncodeError for a value that does not fit the wire.
         """
         identifier, data = self.stream.pack(message)
         frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
@@ -124,10 +129,10 @@ class CanBackend:
             )
 
     def close(self) -> None:
-        """Gives the bus back."""
+        """Shut the bus down and drop the adapter's lock. Errors of a bus that is gone are ignored."""
         with contextlib.suppress(can.CanError, OSError):
             self._bus.shutdown()
-        if isinstance(self._bus, slcanBus):  # it says goodbye to the adapter first, and keeps the port if that is gone
+        if isinstance(self._bus, slcanBus):  # its shutdown talks to the adapter first, and if that fails keeps the port
             self._bus.serialPortOrig.close()
         if self._held is not None:
             os.close(self._held)
@@ -142,6 +147,10 @@ class CanBackend:
         return f"check the device's supply, wiring, termination and bit rate ({self._options.bitrate})"
 
     def _unpack(self, frame: can.Message) -> Message | None:
+        """Return the message in a frame; None for an error frame, a foreign one, and one that does not decode.
+
+        Raises BackendError on bus-off, and when another host drives the node.
+        """
         if frame.is_error_frame:
             if frame.arbitration_id & BUS_OFF or self._bus.state is can.BusState.ERROR:
                 raise BackendError(
@@ -161,6 +170,7 @@ class CanBackend:
             ) from error
 
     def _gone(self, what: str, error: can.CanError | OSError) -> BackendError:
+        """Return the error that says `what` failed and why, with a remedy where the interface is down."""
         number = _errno(error)
         if number == errno.ENETDOWN:
             return BackendError(f"{self._name}: the interface is down", remedy=_bring_up(self._port, self._options))
@@ -168,7 +178,10 @@ class CanBackend:
 
 
 def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
-    """Raises ConfigError for an interface that is not installed or cannot be waited for, and for too slow a bus."""
+    """Refuse an interface that is not installed, fails to load or has no descriptor, and a bit rate that is too low.
+
+    The bit rate has to carry `rates.control_hz` exchanges a second at MOST_LOAD. Raises ConfigError. Opens nothing.
+    """
     interface = options.interface
     if interface not in BACKENDS:
         raise ConfigError(
@@ -194,7 +207,10 @@ def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
 
 
 def open_can(device: Device, options: CanOptions) -> CanBackend:
-    """Opens `device.port` through `options.interface`. Raises BackendError saying why not."""
+    """Open `device.port` through `options.interface`; a slcan adapter is locked first, so that one program holds it.
+
+    Raises BackendError saying why not, and what to do where that is known.
+    """
     name = f"{options.interface} {device.port}"
     held = None
     try:
@@ -226,9 +242,12 @@ DRIVER = Driver(CanOptions, open_can, check_can)
 
 
 def _of_the_interface(options: CanOptions) -> dict[str, Any]:
-    """What makes an interface fit the loop. Interfaces not named here must not block in `recv(0)`."""
+    """Return the arguments that `can.Bus` takes for this interface alone; none for one that is not named here.
+
+    With them `recv(0)` does not block; an interface that is not named here must not block by itself.
+    """
     fitting: dict[str, dict[str, Any]] = {
-        # other nodes' frames need not wake us
+        # other nodes' frames need not wake the daemon
         "socketcan": {"can_filters": [{"can_id": options.node, "can_mask": 0xF, "extended": False}]},
         # by default it sleeps for 2 s when it opens, and for 1 ms whenever it finds nothing to read
         "slcan": {"tty_baudrate": options.baud, "sleep_after_open": 0.0, "timeout": 0.0},
@@ -243,7 +262,10 @@ def _bring_up(port: str, options: CanOptions) -> str:
 
 
 def _hold(path: str) -> int:
-    """A descriptor with the lock that pyserial's exclusive ports take; python-can opens its own without one."""
+    """Open `path` and return a descriptor that holds the lock of pyserial's exclusive ports; python-can takes none.
+
+    Raises OSError, a BlockingIOError where another program has the lock.
+    """
     descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -254,7 +276,7 @@ def _hold(path: str) -> int:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """The number of the system's error behind one of python-can's, which wraps it in one way or another."""
+    """Return the errno of the system's error behind one of python-can's; None where there is none."""
     while error is not None:
         number = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
         if number is not None and number > 0:  # a resolver's errors have numbers of their own, under 0

@@ -1,4 +1,4 @@
-"""Messages to CAN frames and back: the part of the CAN backend that needs no bus."""
+"""Messages to CAN frames and back: the part of the CAN backend that works without a bus."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -21,26 +21,26 @@ from firmware_protocol.framing import FramingStatistics, Succession
 
 FROM_DEVICE = (State, Sense, Status, Identity)
 UNREADABLE = (0x2000_0000, b"")
-"""An error frame, and what stands for a line that is no frame at all: linux/can.h, CAN_ERR_FLAG."""
+"""What stands for an error frame, and for bytes that were no frame at all: linux/can.h, CAN_ERR_FLAG."""
 ECHOES = 32
-"""Drives that may be on the way while their own echo is not back, on a bus that has one (UDP multicast)."""
+"""Sent Drives that are kept, to know their echo by, on a bus that returns what is sent (UDP multicast)."""
 
 
 class SecondHostError(Exception):
-    """Somebody else drives our node."""
+    """A Drive to the node came from another host."""
 
 
 class CanStream:
-    """Both directions of one conversation with one node. What does not decode is counted, never raised.
+    """Both directions of one conversation with one node. A frame that does not decode is counted, never raised.
 
-    `statistics` are of the frames of our node; what the bus itself discards is not seen. Corrupt are error frames, too,
-    and lost are States missing from their counter: one that is no news is given out for the link to count.
+    `statistics` are of the frames of this node; what the bus itself discards is not seen. Error frames count as
+    corrupt. `lost` counts the States that are missing from their counter. A repeated State is returned, not counted.
     """
 
     __match_args__: ClassVar = ("node", "statistics", "_states", "_drives", "_synchronised")
 
     def __init__(self, node: int) -> None:
-        """Raises EncodeError for a node outside 0..15."""
+        """Begin a conversation with `node`. Raises EncodeError for a node outside 0..15."""
         self.node = node
         self.statistics = FramingStatistics()
         self._identifiers = {message: can_identifier(function, node) for message, function in FUNCTION.items()}
@@ -48,12 +48,12 @@ class CanStream:
         self._drives: deque[bytes] = deque(maxlen=ECHOES)
         self._synchronised = True
         self.received: list[tuple[int, bytes]] = []
-        """The node's frames that were taken apart, UNREADABLE among them; whoever reads the bus begins it anew."""
+        """The node's frames since the reader of the bus last emptied the list, UNREADABLE among them."""
         self.sent = UNREADABLE
         """The newest outgoing frame."""
 
     def pack(self, message: Message) -> tuple[int, bytes]:
-        """Identifier and data of the frame. Raises EncodeError for a value that does not fit the wire."""
+        """Return a message's CAN identifier and data. Raises EncodeError for a value that does not fit the wire."""
         data = encode(message)
         if isinstance(message, Drive):
             self._drives.append(data)
@@ -61,7 +61,10 @@ class CanStream:
         return self.sent
 
     def unpack_all(self, frames: Iterable[tuple[int, bytes]]) -> list[Message]:
-        """The messages in frames that were read together, UNREADABLE among them. Raises SecondHostError."""
+        """Return the messages in frames (identifier, data); UNREADABLE counts as corrupt. Raises SecondHostError.
+
+        The same as `unpack` of each, for frames that were recorded.
+        """
         messages: list[Message] = []
         for identifier, data in frames:
             if identifier == UNREADABLE[0]:
@@ -71,9 +74,10 @@ class CanStream:
         return messages
 
     def unpack(self, identifier: int, data: bytes) -> Message | None:
-        """The message in a frame; None for another node's, a host's and an unusable one.
+        """Return the message in a frame; None for a frame of another node, of a host, or one that does not decode.
 
-        Raises SecondHostError for a Drive to our node that is not the echo of one of ours.
+        A frame that does not decode is counted as corrupt. Raises SecondHostError for a Drive to this node that is not
+        the echo of one of the last ECHOES sent.
         """
         if identifier & 0xF != self.node:
             return None
@@ -98,7 +102,7 @@ class CanStream:
         return message
 
     def count_unreadable(self) -> None:
-        """Counts a frame that could not even be taken apart."""
+        """Count an error frame, or bytes that were no frame, as corrupt, and note UNREADABLE in `received`."""
         self.received.append(UNREADABLE)
         self._count_corrupt()
 

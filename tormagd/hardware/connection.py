@@ -1,4 +1,4 @@
-"""Keeps a device connected: opens the port, watches it, and opens it again after a loss. Never re-arms anything.
+"""A connection that lasts: it opens the port, watches it, and opens it again after a loss. It never re-arms anything.
 
 CLOSED --> IDENTIFYING <--> UNANSWERED             the port is opened: --> IDENTIFYING
              |     ^                               the port fails, or a running device falls silent: --> LOST
@@ -37,25 +37,26 @@ log = logging.getLogger(__name__)
 
 
 class Traffic(Protocol):
-    """Who is told of all that passes, as it was."""
+    """A listener to all that passes between daemon and device, byte for byte: the black box's journal."""
 
     def read(self, now_s: float, raw: Received) -> None:
-        """This was read, and taken in at this time."""
+        """Take the bytes or frames that were read from the device at `now_s`."""
 
     def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        """One period's messages; the wire has not taken at once so many in all."""
+        """Take the frames of one period. `unsent` messages in all were not taken by the wire at once."""
 
     def connected(self, memory: Any) -> None:
-        """A conversation began; None: it is over."""
+        """Take the memory of a conversation that begins, as `Connection.memory` gives it; None: it is over."""
 
 
 class Connection:
-    """One device, however often its cable is pulled.
+    """The connection to one device, over as many openings of its port as it takes.
 
-    It moves when `receive` and `exchange` are called, both once a control period; it has no clock and no timers.
+    Its state changes only in calls, `receive` and `exchange` once a control period each; it has no clock and no timers.
     """
 
     def __init__(self, device: Device, open_backend: Callable[[], Backend], on_loss: Callable[[], None]) -> None:
+        """Begin closed. `on_loss` is called whenever `state` leaves RUNNING, but not by `close`."""
         self._device, self._open_backend, self._on_loss = device, open_backend, on_loss
         self._is_wanted = False
         self._backend: Backend | None = None
@@ -71,16 +72,16 @@ class Connection:
         self.losses = 0
         self._last_loss = ""
         self.traffic: Traffic | None = None
-        """Nobody is told unless it is set."""
+        """Who hears of all traffic; None: nobody."""
 
     @property
     def state(self) -> LinkState:
-        """Where the connection stands."""
+        """The state of the conversation while the port is open; else CLOSED, BACK_OFF or LOST."""
         return self._waiting if self._link is None else self._link.state
 
     @property
     def cause(self) -> str:
-        """Why it does not run, or what is missing for a measurement; empty while nothing is."""
+        """Why the device does not run, or what a measurement still lacks; empty when it runs and is measured."""
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return self._cause
@@ -96,33 +97,36 @@ class Connection:
 
     @property
     def remedy(self) -> str:
-        """What to do about the cause."""
+        """What a person can do about the cause; empty where there is no cause or no advice."""
         if self.state is LinkState.RUNNING:
             return "look at what the firmware sends, and at its CRC-8" if self.cause else ""
         return self._remedy or _REMEDIES.get(self.state, "")
 
     @property
     def link(self) -> DeviceLink | None:
-        """The conversation of this opening of the port; None while it is not open."""
+        """The conversation since the port was last opened; None while the port is not open."""
         return self._link
 
     @property
     def measurement(self) -> Measurement | None:
-        """The newest measurement while the link runs."""
+        """The newest measurement; None unless the device runs and has sent all that a measurement needs."""
         return self._link.measurement if self._link is not None and self._link.state is LinkState.RUNNING else None
 
     @property
     def pending(self) -> DeviceRequest:
-        """The request that the device has not acknowledged; what waits for a device to come back counts too."""
+        """The request that the device has not acknowledged, also of a device that is lost; NONE where there is none."""
         return self._unfinished if self._link is None else self._link.pending
 
     def open(self, now_s: float) -> None:
-        """Opens the port, now or as soon as it can be."""
+        """Open the port. Where that fails, `exchange` tries again later."""
         self._is_wanted = True
         self._open(now_s)
 
     def receive(self, now_s: float) -> None:
-        """Takes in what has come since the last period."""
+        """Read all that has come from the device and hand it to the conversation; nothing while the port is closed.
+
+        A port that fails is closed, to be opened again by a later `exchange`.
+        """
         backend, link = self._backend, self._link
         if backend is None or link is None:
             return
@@ -141,9 +145,11 @@ class Connection:
     def exchange(
         self, now_s: float, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
     ) -> None:
-        """Sends one drive message, and whatever handshake or request is due; opens the port when it is time to.
+        """Send this period's Drive to a running device, then the Hello or command that is due.
 
-        To be called behind `receive`: what has come by then is no silence.
+        Opens the port first when it is time to, and closes one that fails or whose device is lost. A `request` counts
+        once for each `number`; unless it is RETRACT, it is dropped where the device does not run. Duties are -1..1.
+        Call it after `receive`, so that what has come by then does not count as silence.
         """
         if self._link is None and self._is_wanted and now_s >= self._reopen_s:
             self._open(now_s)
@@ -174,28 +180,36 @@ class Connection:
             self._give_back(now_s, link.cause, "")
 
     def close(self) -> None:
-        """Closes the port for good."""
+        """Close the port; it stays closed until `open`."""
         self._is_wanted = False
         self._release()
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
         self._seen = LinkState.CLOSED
 
     def memory(self) -> Any:
-        """What the conversation remembers, as plain data: with it, and with what is read from now on, it goes on as it
-        does here. None where there is none, or its backend shows no stream."""
+        """Return the conversation's state as plain data, from which `remember` continues it elsewhere.
+
+        None while the port is closed, and for a backend without a stream.
+        """
         if self._link is None or self._stream is None:
             return None
         return {"requested": self._requested, "link": plain(self._link), "stream": plain(self._stream)}
 
     def remember(self, memory: Any, known: Kinds) -> None:
-        """Goes on with an open port as another connection did. Raises InexactError."""
+        """Continue the conversation that `memory` describes on this connection's open port.
+
+        `known` are the types that `memory` may contain. Raises InexactError for data that fit no known type.
+        """
         self._requested = memory["requested"]
         restore(self._link, memory["link"], known)
         restore(self._stream, memory["stream"], known)
         self._seen = self.state
 
     def report(self) -> LinkReport:
-        """State, cause and remedy, identity, counters of this opening of the port, round trip and clock."""
+        """Return the link's report for `status`; None in it for what is not known yet or needs an open port.
+
+        Counters are those since the port was last opened.
+        """
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
         round_trip = None if link is None else link.round_trip.report()
@@ -217,7 +231,7 @@ class Connection:
             protocol_version=PROTOCOL_VERSION,
             **counted,
             round_trip_us=None if round_trip is None else RoundTripReport(**round_trip),
-            # a State has been on its way for about half of the shortest round trip
+            # a State is on its way for about half of the shortest round trip
             clock=None if link is None else clock_report(link.clock.fit(), link.round_trip.least_s / 2.0),
             unsent=None if backend is None else backend.statistics.unsent,
             refused={} if backend is None else dict(backend.statistics.refused),
@@ -226,6 +240,10 @@ class Connection:
         )
 
     def _open(self, now_s: float) -> None:
+        """Open the port and begin a conversation, in which an unfinished RETRACT is sent again.
+
+        Where the port does not open, log why and wait in BACK_OFF.
+        """
         try:
             self._backend = self._open_backend()
         except BackendError as error:
@@ -247,25 +265,27 @@ class Connection:
         self._notice()
 
     def _send(self, backend: Backend, message: Message, sent: list[Sent]) -> None:
+        """Send a message, and add its frame to `sent` where the backend has a stream."""
         backend.send(message)
         if self._stream is not None:
             sent.append(self._stream.sent)
 
     def _lose(self, now_s: float, error: BackendError) -> None:
-        """The port failed."""
+        """End the conversation of a port that failed with `error`, and close the port to open it again later."""
         assert self._link is not None, "only an open port can fail"
         self._link.lose(str(error))
         self._notice()
         self._give_back(now_s, str(error), error.remedy)
 
     def _give_back(self, now_s: float, cause: str, remedy: str) -> None:
-        """Closes the port, to open it again later."""
+        """Close the port, remember the unacknowledged request, and wait in LOST until the port is opened again."""
         assert self._link is not None, "only what is open is given back"
         self._unfinished = self._link.pending
         self._release()
         self._wait(now_s, LinkState.LOST, cause, remedy)
 
     def _release(self) -> None:
+        """Close the backend, if one is open, and tell `traffic` that the conversation is over."""
         if self._backend is not None:
             self._backend.close()
             if self.traffic is not None:
@@ -273,12 +293,13 @@ class Connection:
         self._backend = self._link = self._stream = None
 
     def _wait(self, now_s: float, state: LinkState, cause: str, remedy: str) -> None:
+        """Wait in `state` before the port is opened again, twice as long each time, to LONGEST_BACK_OFF_S."""
         self._waiting, self._cause, self._remedy = state, cause, remedy
         self._reopen_s = now_s + self._back_off_s
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
 
     def _notice(self) -> None:
-        """Acts on a change of state: says it, and tells the core when the device is gone."""
+        """Log a change of state, if there was one. When RUNNING has ended, count the loss and call `on_loss`."""
         before, state = self._seen, self.state
         if state is before:
             return
@@ -300,7 +321,10 @@ def _refusals(refused: Mapping[str, str]) -> str:
 
 
 def clock_report(fit: ClockFit | None, way_s: float = 0.0) -> ClockReport | None:
-    """The line through a clock for `status`; `way_s` is how long what was heard of it had been on its way."""
+    """Return a clock's fit, rounded for `status`; None without one.
+
+    `way_s` is how long the clock's messages were on their way; it is taken off the offset.
+    """
     if fit is None:
         return None
     return ClockReport(

@@ -1,4 +1,4 @@
-"""Messages to serial bytes and back: the part of the serial backend that needs no port."""
+"""Messages to serial bytes and back: the part of the serial backend that works without a port."""
 
 from typing import ClassVar, final
 
@@ -16,7 +16,7 @@ class FrameStream:
         self._decoder = FrameDecoder()
         self._sequence = 0
         self.received = b""
-        """What was last taken apart."""
+        """The bytes that `unpack` was last given."""
         self.sent = b""
         """The newest outgoing frame."""
 
@@ -26,14 +26,14 @@ class FrameStream:
         return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
-        """The bytes of the next outgoing frame. Raises EncodeError for a value that does not fit the wire."""
+        """Return a message's frame, with the next sequence number. Raises EncodeError for a value that does not fit."""
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         self.sent = frame
         return frame
 
     def unpack(self, data: bytes) -> list[Message]:
-        """The valid messages completed by `data`."""
+        """Return the valid messages that `data` completes; a frame that does not decode is counted as corrupt."""
         self.received = data
         messages: list[Message] = []
         for frame in self._decoder.feed(data):

@@ -33,16 +33,17 @@ from tormagd.safety.operating_state import DeviceRequest
 REPEAT_S: Final = 0.05
 "A Hello or a command without its acknowledgement is sent again after this time."
 GIVE_UP_S: Final = 1.0
-"A Home or Clear that the device has not taken by then, it would take as a surprise."
+"A Home or Clear that is not acknowledged after this time is given up: later it would be a surprise."
 HELLO_S: Final = 1.0
-"A device that was reset takes no Drive before a Hello; it hears one this often."
+"A Hello is sent this often: a device that was reset takes no Drive before one."
 SILENT_S: Final = 0.08
 "Without any message for this long the link is lost; by then the firmware's own 50 ms have passed."
 UNANSWERED_S: Final = 1.0
-"A device that has not said who it is for this long is asked only every HELLO_S: it may be another make's."
+"A device that has sent no Identity for this long gets a Hello only every HELLO_S: it may be another make's."
 FIRST_NONCE: Final = 255
-"""A Hello's until a command has been acknowledged. Commands count from 1 to 254, so that theirs is always another, and
-0 is what a device shows after a reset."""
+"""The nonce of a Hello until a command is acknowledged. Commands count from 1 to 254, so that theirs always differs.
+
+A device shows 0 after a reset."""
 OVERTAKEN: Final = 16
 "A State whose counter is behind by less than this repeats an earlier one, or was overtaken; it is no measurement."
 
@@ -59,7 +60,16 @@ _COMMANDS: Final[dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]]] 
 
 
 class LinkState(StrEnum):
-    """Where the connection stands. A conversation is in one of the last five."""
+    """Where a connection stands. In CLOSED, BACK_OFF and LOST the port is not open.
+
+    CLOSED       never opened, or closed on purpose
+    BACK_OFF     the port did not open
+    IDENTIFYING  the device is asked who it is
+    UNANSWERED   the device has not answered for UNANSWERED_S
+    REFUSED      the firmware has another protocol schema
+    RUNNING      the device is known, and is sent Drives
+    LOST         the port failed, or a running device fell silent
+    """
 
     CLOSED = "CLOSED"
     BACK_OFF = "BACK_OFF"
@@ -79,7 +89,7 @@ _NO_REQUEST: Final = DeviceRequest.NONE
 
 @final
 class DeviceLink:
-    """One conversation, from the opening of the port to its loss. A new connection takes a new link."""
+    """One conversation with a device, from the opening of the port to its loss. A new opening needs a new link."""
 
     __match_args__: ClassVar = (
         "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
@@ -91,7 +101,7 @@ class DeviceLink:
 
     def __init__(self, now_s: float) -> None:
         self.repeated = 0
-        """States that were no news: from a sender that is stuck, or overtaken on their way."""
+        """States that were dropped: they repeat an earlier one, or were overtaken on their way."""
         self._drives = self._states = 0
         self._counter = 0
         self._request = DeviceRequest.NONE
@@ -99,7 +109,10 @@ class DeviceLink:
         self._begin(now_s, "waiting for the device to say who it is")
 
     def _begin(self, now_s: float, cause: str) -> None:
-        """Knows nothing of the device; also when it turns out to have been reset, or to be another one."""
+        """Begin to identify the device, for `cause`, and forget all that was known of it.
+
+        Also after a reset or a replacement. A pending RETRACT stays; any other request is dropped.
+        """
         self.state = _IDENTIFYING
         self.cause = cause
         self.identity: Identity | None = None
@@ -119,7 +132,7 @@ class DeviceLink:
         self._told: Status | None = None
         self._is_measured = False
         self._measurement: Measurement | None = None
-        """Made of the following when it is asked for: State and Sense change them one after the other."""
+        """Made from the following fields when it is asked for; None when they have changed since."""
         self._number = 0
         self._received_s = 0.0
         self._sensed_s = 0.0
@@ -129,27 +142,30 @@ class DeviceLink:
         self._right_mm = 0.0
         self._handle_mm = 0.0
         self._least_delay_s = 0.0
-        if self._request is not DeviceRequest.RETRACT:  # opening is always wanted still; nothing else moves unasked
+        if self._request is not DeviceRequest.RETRACT:  # opening is still wanted; nothing else may move unasked
             self._request = DeviceRequest.NONE
 
     @property
     def measurement(self) -> Measurement | None:
-        """The newest State, with the newest Sense and Status; None before there was one of each."""
+        """The newest State, with the newest Sense and Status; None until a State follows the first of both.
+
+        A Status that first says HOMED counts from the next State on, whose positions have the new origin.
+        """
         if self._measurement is None and self._is_measured:
             self._measurement = self._measured()
         return self._measurement
 
     @property
     def pending(self) -> DeviceRequest:
-        """The request that the device has not acknowledged."""
+        """The request that the device has not acknowledged; NONE where there is none."""
         return self._request
 
     def is_silent(self, now_s: float) -> bool:
-        """Whether a running device has not been heard for too long."""
+        """Tell whether a running device has sent nothing for longer than SILENT_S."""
         return self.state is _RUNNING and now_s - self._heard_s > SILENT_S
 
     def receive(self, now_s: float, message: Message) -> None:
-        """Takes one message from the device."""
+        """Take one message that came from the device at `now_s`. After UNANSWERED, ask at once who it is."""
         self._heard_s = now_s
         if self.state is _UNANSWERED:
             self.state = _IDENTIFYING
@@ -164,9 +180,12 @@ class DeviceLink:
             self._take_identity(message)
 
     def due(self, now_s: float) -> list[Message]:
-        """Handshake and command messages to send now, behind the period's Drive; also notices silence and a reset."""
+        """Return the Hello and the command to send at `now_s`, after the period's Drive; often none.
+
+        First changes `state` on silence, a reset or a replacement, and gives up a Home or Clear after GIVE_UP_S.
+        """
         self.round_trip.drive(self._counter, now_s)
-        self._watch(now_s)
+        self._change_state(now_s)
         is_waiting = False
         if self._request is not _NO_REQUEST:
             if self._request is not DeviceRequest.RETRACT and now_s - self._requested_s > GIVE_UP_S:
@@ -184,24 +203,26 @@ class DeviceLink:
         return messages
 
     def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
-        """The Drive message of this period; duties in -1..1."""
+        """Return the next Drive, with its counter. Duties are -1..1 of the supply voltage; positive opens."""
         self._counter = (self._counter + 1) % 256
         self._drives += 1
         return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._counter)
 
     def request(self, now_s: float, request: DeviceRequest) -> None:
-        """Asks the device for a routine; repeated until its Status acknowledges it. Replaces an unfinished one.
+        """Ask the device for a routine: `due` repeats the command until a Status acknowledges it.
 
-        A device may refuse: HOME and CLEAR are given up after GIVE_UP_S, RETRACT when the device has latched.
+        Replaces an unacknowledged request. HOME and CLEAR are given up after GIVE_UP_S, RETRACT when the device has
+        latched a fault.
         """
         self._nonce = _next_nonce(self._nonce)
         self._request = request
         self._request_due_s = self._requested_s = now_s
 
     def missing(self, refused: Mapping[str, str]) -> str:
-        """What a running device has not said yet that a measurement needs, as in "no Sense yet, State refused: CRC-8".
+        """Return what a measurement of a running device still lacks, as in "no Sense yet, State refused: CRC-8".
 
-        `refused` says by message why the newest one of it was refused. Empty where there is a measurement.
+        `refused` says by a message's name why the newest was refused. Empty where there is a measurement, and where
+        the device does not run.
         """
         if self.state is not _RUNNING or self._is_measured:
             return ""
@@ -212,22 +233,26 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Makes the link's quality anew; to be asked for where `is_judging`. The backend's counters only grow."""
+        """Renew `quality` from the backend's counters; call it when `is_judging`.
+
+        The counters, of frames received and damaged and of messages not taken at once, only grow.
+        """
         counts = Counts(self._drives, self._states, frames, damaged, unsent)
         self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
         self._measurement = None
 
     def is_judging(self, now_s: float) -> bool:
-        """Whether it is time to."""
+        """Tell whether `judge` is due."""
         return self._quality_watch.is_due(now_s)
 
     def lose(self, cause: str) -> None:
-        """The port failed: the conversation is over."""
+        """End the conversation in LOST: the port failed, for `cause`."""
         self.state = LinkState.LOST
         self.cause = cause
 
-    def _watch(self, now_s: float) -> None:
-        # what broke was heard a tick ago: so the core has seen the measurement that shows it, and names it better
+    def _change_state(self, now_s: float) -> None:
+        """Identify a device anew that was reset or replaced; else enter LOST on silence, UNANSWERED for no Identity."""
+        # the break was heard a tick ago: so the core has seen the measurement that shows it, and names it better
         if self._broken:
             self._begin(now_s, self._broken)
         elif self.is_silent(now_s):
@@ -238,6 +263,7 @@ class DeviceLink:
             self.cause = f"the device has not said who it is for {UNANSWERED_S:g} s"
 
     def _take_identity(self, identity: Identity) -> None:
+        """Enter RUNNING, or REFUSED for another protocol schema; a changed serial number is noted as a replacement."""
         self.round_trip.identity()
         known, self.identity = self.identity, identity
         if known is not None and known.serial_number != identity.serial_number:
@@ -253,12 +279,16 @@ class DeviceLink:
             )
 
     def _take_status(self, now_s: float, status: Status) -> None:
+        """Keep a Status: it ends an acknowledged request, shows a reset, and dates the Drive that the device obeys.
+
+        It also ends a RETRACT that a latched device will not take.
+        """
         if self._status is None:
-            # an earlier host has counted as far; its last number again would be taken for a repetition
+            # an earlier host has counted this far; its last number again would be taken for a repetition
             self._nonce = _next_nonce(status.command_nonce)
         elif self._status.command_nonce != 0 and status.command_nonce == 0:
             self._broken = "the device was reset"
-        # a device that has just homed has a new origin: the position that is known here is from before
+        # a device that has just homed has a new origin; the newest State here is still of the old one
         has_new_origin = self._status is not None and _is_homed(status) and not _is_homed(self._status)
         self._status = status
         if not has_new_origin:
@@ -269,7 +299,7 @@ class DeviceLink:
             self._request = DeviceRequest.NONE
             self._acknowledged = self._nonce
         elif self._request is DeviceRequest.RETRACT and status.mode is DeviceMode.LATCHED:
-            # it has opened already, or cannot, and will not try again before a Clear
+            # a latched device has opened already, or cannot, and will not try again before a Clear
             self._request = DeviceRequest.NONE
         # only a running device says which Drive it obeys; one late Status alone is a stall, not the wire's doing
         last_s = self._delay_s
@@ -281,6 +311,7 @@ class DeviceLink:
             self._measurement = None
 
     def _take_sense(self, now_s: float, sense: Sense) -> None:
+        """Keep a Sense, and add its handle's travel once there are measurements."""
         # Sense follows the State of the same instant; the measurement takes the newest of both
         self._sensed_s = now_s
         previous = self._sense
@@ -290,6 +321,10 @@ class DeviceLink:
         self._sense = sense
 
     def _take_state(self, now_s: float, state: State) -> None:
+        """Keep a State, unwrap its positions and time, and feed the clock; one that is no news is counted and dropped.
+
+        The first after a Status and a Sense begins the measurements.
+        """
         previous = self._state
         if previous is not None and (previous.counter - state.counter) % 256 < OVERTAKEN:
             self.repeated += 1
@@ -311,6 +346,7 @@ class DeviceLink:
         self.clock.add(now_s, self._device_time_s)
 
     def _begin_measuring(self, now_s: float, state: State) -> None:
+        """Begin measurements with this State, unless a Status or a Sense is still missing."""
         if self._status is None or self._sense is None:
             return
         self._is_measured = True
@@ -321,6 +357,7 @@ class DeviceLink:
         self._right_mm = state.right_position_mm
 
     def _measured(self) -> Measurement:
+        """Return a Measurement of the newest State, Sense and Status."""
         sense, status = self._sense, self._told
         assert sense is not None, "measuring begins with a Sense"
         assert status is not None, "measuring begins with a Status"
@@ -355,5 +392,5 @@ def _next_nonce(nonce: int) -> int:
 
 
 def _unwrapped(previous: float, value: float, span: float) -> float:
-    """The shortest way from `previous` to `value` on a circle of `span`."""
+    """Return the shortest way from `previous` to `value` on a circle of `span`, with its sign."""
     return (value - previous + span / 2.0) % span - span / 2.0

@@ -1,6 +1,6 @@
-"""How well the wire carries, in the figures of the last second: before anything swings, it should be known that it may.
+"""How well the wire carries messages, in figures of the last second: they warn before a slow loop swings.
 
-A `LinkQuality` goes with every measurement, so that a step decides on what it was given, and a replay decides the same.
+Every measurement carries a `LinkQuality`, so that a step decides on its inputs alone, and a replay decides the same.
 """
 
 from collections import deque
@@ -9,21 +9,24 @@ from typing import ClassVar, Final, final
 from firmware_protocol.value import Value
 
 LOOKED_S: Final = 0.1
-"How often the figures are made anew."
+"The figures are renewed this often: a look."
 LOOKS: Final = 10
-"They are of so many of these times: of a second."
+"Looks that the figures span: a second."
 SETTLING_LOOKS: Final = 3
-"In the first of a conversation the answers of the last Drives are still on their way."
+"Looks left out at first in a conversation: the answers to the last Drives are still on their way."
 LOSES: Final = 0.02
-"A wire that loses or damages a greater share does not what it should: a serial cable or a CAN bus loses none."
+"A wire that loses or damages a greater share is lossy: a sound serial cable or CAN bus loses none."
 
 
 @final
 class LinkQuality(Value):
-    """Shares of the last second: of the Drives that no State answered, of the received frames that were damaged, of the
-    sent messages that the wire did not take at once. `round_trip_s` is the usual one, the lesser of two looks', 0 while
-    it is not known; `clock_drift` is by which share the device's clock runs fast, 0 while that is not known, -1 for one
-    that stands.
+    """How well the wire carried in the last second.
+
+    unanswered     share of the Drives that no State answered
+    damaged        share of the received frames that were damaged
+    unsent         messages that the wire did not take at once, as a share of the Drives
+    round_trip_s   the usual time from a Drive to its State, the lesser of the last two looks'; 0 while unknown
+    clock_drift    by which share the device's clock runs fast; 0 while unknown, -1 for a clock that stands
     """
 
     def __init__(
@@ -42,7 +45,7 @@ class LinkQuality(Value):
 
     @property
     def is_lossy(self) -> bool:
-        """Whether messages are lost or damaged by more than a wire in order does."""
+        """Tell whether any of the three shares is above LOSES."""
         return self.unanswered > LOSES or self.damaged > LOSES or self.unsent > LOSES
 
     def __str__(self) -> str:
@@ -57,7 +60,10 @@ UNKNOWN_QUALITY: Final = LinkQuality()
 
 @final
 class Counts(Value):
-    """Counters that only grow: Drives, States that were news, frames received and damaged, messages not taken."""
+    """Counters of one conversation, which only grow.
+
+    Drives sent, States that were news, frames received whole and damaged, messages that the wire did not take at once.
+    """
 
     def __init__(self, drives: int = 0, states: int = 0, frames: int = 0, damaged: int = 0, unsent: int = 0) -> None:
         self.drives: Final = drives
@@ -69,7 +75,7 @@ class Counts(Value):
 
 @final
 class LinkWatch:
-    """Makes the figures of one conversation. Asked whether it is time in every period, it looks ten times a second."""
+    """The figures of one conversation, renewed every LOOKED_S from its counters."""
 
     __match_args__: ClassVar = ("_counts", "_due_s", "_round_trip_s")
 
@@ -79,15 +85,15 @@ class LinkWatch:
         self._round_trip_s = 0.0
 
     def is_due(self, now_s: float) -> bool:
-        """Whether the counters are to be looked at."""
+        """Tell whether the next `look` is due."""
         return now_s >= self._due_s
 
     def look(self, now_s: float, counts: Counts, round_trip_s: float, clock_drift: float) -> LinkQuality:
-        """The quality now."""
+        """Return the quality since the look LOOKS before this one, and put the next look off by LOOKED_S."""
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)
         before = self._counts[0]
-        # at 4 kHz one pause fills all that a round trip is the usual one of; by the next look it has gone
+        # at 4 kHz one pause fills the window of the usual round trip; by the next look it has left
         least_s, self._round_trip_s = min(self._round_trip_s, round_trip_s), round_trip_s
         return LinkQuality(
             1.0 - _share(counts.states - before.states, counts.drives - before.drives, of_none=1.0),
@@ -102,4 +108,5 @@ class LinkWatch:
 
 
 def _share(part: int, whole: int, of_none: float = 0.0) -> float:
+    """Return part / whole, at most 1; `of_none` where the whole is 0."""
     return min(part / whole, 1.0) if whole > 0 else of_none

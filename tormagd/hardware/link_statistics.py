@@ -1,7 +1,7 @@
-"""How long the wire takes, and how the device's clock runs against ours.
+"""How long the wire takes, and how the device's clock runs against the host's.
 
-Both are fed by the conversation for every Drive and State, and both remember a bounded number of figures. What costs
-more than a comparison is computed where it is asked for, not where it is fed.
+The conversation feeds both with every Drive and State; both keep a bounded number of figures. What costs more than a
+comparison is computed when it is asked for, not when it is fed.
 """
 
 import math
@@ -13,41 +13,42 @@ from typing import ClassVar, Final, TypeAlias, final
 from firmware_protocol.value import Value
 
 ROUND_TRIPS = 256
-"The round trips that percentiles are taken of: a quarter of a second of control."
+"Round trips that percentiles are taken from: a quarter of a second of control."
 USUAL_OF: Final = 101
-"More than twice as many as a device that stands still for its whole timeout answers late, at 1 kHz."
+"Round trips that the median is taken from: over twice the 50 late ones after a device stood still, at 1 kHz."
 WINDOW_S = 0.5
-"The least delayed State of this time stands for all of it: queues on the way only ever add."
+"The least delayed State of a window of this time stands for all of the window: queues on the way only ever add."
 WINDOWS = 60
 LEAST_WINDOWS = 6
 OUTLIER = 4.0
 "Standard deviations, by the median of the absolute deviations, beyond which a window does not count."
 MOST_RESIDUAL_US = 2_000.0
-"More than this around the line, and it is no line."
+"A line with a larger standard deviation around it does not fit."
 NEWEST_WINDOWS = 3
-"Where none of the newest lies on the line, the clock has left it."
+"Where none of so many newest windows lies on the line, the clock has left the line."
 DRIFT_WINDOWS: Final = 8
-"What the drift is watched by: a clock that runs wrong is known after four seconds."
+"Windows that the drift is taken from: a clock that runs wrong is known after four seconds."
 STANDING: Final = 20
-"States with the same time: a millisecond is a hundred steps of the device's clock."
+"After more States in a row with one time the clock stands: a millisecond is a hundred steps of the device's clock."
 CLOCK_STEP_S = 1e-5
-"The resolution of State.device_time_s; a window in the next step of it, with what jitter is left, is no outlier."
+"The resolution of State.device_time_s. A window one step off the line, with its jitter, is no outlier."
 
 
 Windows: TypeAlias = Sequence[tuple[float, float]]
-"Offset and host's time of each window, s."
+"Of each window, the host's time less the device's, and the host's time, s."
 
 
 @final
 class RoundTrip:
-    """Time from a Drive that is handed to the wire until its State has been read, s.
+    """Times from a Drive that is handed to the wire until its State has been read, s.
 
-    A State does not name the Drive it answers. The device answers in order, so when an Identity comes, the State before
-    it belongs to the last Drive before the Hello: that fixes how far the two counters are apart. A Drive that is lost
-    later, or not answered, moves them further apart. A Status, which names the last Drive that the device accepted,
-    shows that: until it has come round trips are not counted, and where it does not fit they are forgotten but for that
-    of the Drive it names. One lost Drive alone looks like an answer that is still on its way, and makes round trips one
-    period too long until the next Identity.
+    A State does not name the Drive that it answers. The device answers in order: the State before an Identity answers
+    the last Drive before the Hello. That fixes how far the two counters are apart. A Drive that is lost later, or not
+    answered, moves them further apart.
+
+    A Status names the last Drive that the device accepted. Round trips count only once a Status confirms them; where
+    it contradicts them, the recent ones are forgotten but for that of the Drive it names. One lost Drive alone looks
+    like an answer that is still on its way: round trips are then one period too long until the next Identity.
     """
 
     __match_args__: ClassVar = (
@@ -66,26 +67,26 @@ class RoundTrip:
         self._usual: deque[float] = deque(maxlen=USUAL_OF)
 
     def drive(self, counter: int, now_s: float) -> None:
-        """The Drive with this counter goes out now."""
+        """Note that the Drive with this counter goes out at `now_s`."""
         self._newest = counter
         self._sent_s[counter] = now_s
 
     def since_next_s(self, counter: int, now_s: float) -> float:
-        """Time since the Drive after the newest one with this counter went out, s; 0 where that was the last."""
+        """Return the time since the Drive after the one with this counter went out, s; 0 where none came after it."""
         return 0.0 if counter == self._newest else now_s - self._sent_s[(counter + 1) % 256]
 
     def hello(self) -> None:
-        """A Hello goes out after the newest Drive."""
+        """Note that a Hello goes out after the newest Drive."""
         self._before_hello = self._newest
 
     def identity(self) -> None:
-        """The answer to the newest Hello came in."""
+        """Note that the Identity for the newest Hello came: it fixes how far Drive and State counters are apart."""
         if self._before_hello is not None and self._state is not None:
             self._lead = self._before_hello - self._state
         self._before_hello = None
 
     def state(self, counter: int, now_s: float) -> None:
-        """The State with this counter came in now."""
+        """Note that the State with this counter came at `now_s`; its round trip waits for a Status to confirm it."""
         self._state, self._newest_s = counter, now_s
         lead = self._lead
         if lead is None:
@@ -93,11 +94,14 @@ class RoundTrip:
         answered = (counter + lead) % 256
         if (self._newest - answered) % 256 < 128:
             self._unsure.append(now_s - self._sent_s[answered])
-        else:  # it would be the answer to a Drive that has not been sent
+        else:  # it would answer a Drive that has not been sent
             self._lead = None
 
     def status(self, drive_counter: int) -> None:
-        """The device has said that this Drive was the last that it accepted."""
+        """Take the counter of the last Drive that the device accepted: count the round trips since the last Status.
+
+        Where the counter contradicts them, or is the first, drop the recent round trips and count this Drive's alone.
+        """
         state, lead = self._state, self._lead
         if state is None:
             return
@@ -119,18 +123,20 @@ class RoundTrip:
 
     @property
     def usual_s(self) -> float:
-        """The median of the newest USUAL_OF round trips; 0 while none is known. A device that stood still once answers
-        all that has waited for it late, which a mean would call a slow line."""
+        """The median of the newest USUAL_OF round trips, s; 0 while none is known.
+
+        A device that stood still once answers all waiting Drives late, which a mean would call a slow line.
+        """
         ordered_s = sorted(self._usual)
         return ordered_s[len(ordered_s) // 2] if ordered_s else 0.0
 
     @property
     def least_s(self) -> float:
-        """The shortest of the newest round trips; 0 while none is known."""
+        """The shortest of the recent round trips, s; 0 while none is known."""
         return min(self._recent, default=0.0)
 
     def report(self) -> dict[str, float] | None:
-        """Percentiles of the newest round trips, us; None while none is known."""
+        """Return the least, the median and the 99th percentile of recent round trips, us; None while none is known."""
         ordered_s = sorted(self._recent)
         if not ordered_s:
             return None
@@ -140,10 +146,11 @@ class RoundTrip:
 
 @final
 class ClockFit(Value):
-    """A straight line through the device's clock.
+    """A straight line through the host's time less the device's, over the host's time.
 
-    `offset_s` is the host's time minus the device's at the newest State, the way from the device included; `drift_ppm`
-    is positive where the device's clock runs fast. `residual_us` is the standard deviation around the line.
+    `offset_s` is its value at the newest window, with the State's way from the device in it. `drift_ppm` is positive
+    where the device's clock runs fast. `residual_us` is the standard deviation around the line. `windows` were looked
+    at, `outliers` of them were left out.
     """
 
     def __init__(self, offset_s: float, drift_ppm: float, residual_us: float, windows: int, outliers: int) -> None:
@@ -159,7 +166,7 @@ class DeviceClock:
     """The device's clock against the host's, by regression over the least delayed State of each half second.
 
     The line starts from a median of slopes (Theil 1950, of halves), so that a quarter of the windows may be wrong by
-    any amount; those far from it are left out of the least squares that follow.
+    any amount. Windows far from this line are left out of the least squares that follow.
     """
 
     __match_args__: ClassVar = ("_ends_s", "_least", "_newest_s", "_standing", "_windows", "drift")
@@ -173,10 +180,13 @@ class DeviceClock:
         self._newest_s = -math.inf
         self._standing = 0
         self.drift = 0.0
-        """By which share the clock runs fast, by the newest windows; 0 while not known, -1 for a clock that stands."""
+        """By which share the clock runs fast, over DRIFT_WINDOWS; 0 while unknown, -1 for a clock that stands."""
 
     def add(self, host_s: float, device_s: float) -> None:
-        """A State that was latched at `device_s` on the device's clock, unwrapped, was read at `host_s`."""
+        """Take a State that was latched at `device_s` on the device's clock, unwrapped, and read at `host_s`.
+
+        Renews `drift` when a window ends, and sets it to -1 after more than STANDING States with one time.
+        """
         if device_s != self._newest_s:
             self._newest_s, self._standing = device_s, 0
         else:
@@ -190,13 +200,17 @@ class DeviceClock:
             self._least = (offset_s, host_s)
 
     def fit(self) -> ClockFit | None:
-        """The line through the last half minute, or since the clock was set; None before some seconds of it."""
+        """Return the line through the last half minute, or since the clock was set; None where no line fits yet.
+
+        A line takes LEAST_WINDOWS windows, three seconds.
+        """
         if not self._is_fitted:
             self._fit = _newest_line(list(self._windows))
             self._is_fitted = True
         return self._fit
 
     def _turn(self, host_s: float) -> None:
+        """End the window, keep its least delayed State, and renew `drift` unless the clock stands."""
         if self._least[0] < math.inf:
             self._windows.append(self._least)
             self._is_fitted = False
@@ -208,7 +222,8 @@ class DeviceClock:
 
 
 def _newest_line(windows: Windows) -> ClockFit | None:
-    # no line fits across a clock that was set, or stood still for a while: the older half is forgotten until one does
+    """Return the line through the newest windows that lie on one; None where LEAST_WINDOWS do not."""
+    # no line fits across a clock that was set, or stood still for a while: the older half is dropped until one does
     while len(windows) >= LEAST_WINDOWS:
         fit, is_left = _robust_line(windows)
         if fit.residual_us < MOST_RESIDUAL_US and not is_left:
@@ -218,7 +233,7 @@ def _newest_line(windows: Windows) -> ClockFit | None:
 
 
 def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
-    """The line, and whether the clock has left it."""
+    """Return the line through the windows, outliers left out, and whether all of the NEWEST_WINDOWS lie off it."""
     newest_s = windows[-1][1]
     half = len(windows) // 2
     slope = _median([(b[0] - a[0]) / (b[1] - a[1]) for a, b in zip(windows, windows[-half:], strict=False)])

@@ -1,4 +1,4 @@
-"""What the device last said, with the wire's wrap-around taken out."""
+"""The device's newest state as one record, its wrapping counters unwrapped."""
 
 from typing import Final, final
 
@@ -6,14 +6,14 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from firmware_protocol.value import Value
 from tormagd.hardware.link_quality import UNKNOWN_QUALITY, LinkQuality
 
-# operations on flags make new ones, at a microsecond each, but for shifts; the core asks a thousand times a second
+# an operation on flags makes a new one, in a microsecond; a shift does not, and the core asks a thousand times a second
 _HOMED: Final = Switches.HOMED.bit_length() - 1
 _LEFT_OPEN: Final = Switches.LEFT_OPEN.bit_length() - 1
 _RIGHT_OPEN: Final = Switches.RIGHT_OPEN.bit_length() - 1
 _LATCHED: Final = DeviceMode.LATCHED
 _BUSY: Final = (DeviceMode.HOMING, DeviceMode.RETRACTING)
 _LARGEST: Final = 1e10
-"Of any number, and a clock's 300 years: what is computed of larger ones may overflow."
+"Bound on any number, 300 years of a clock's seconds: what is computed from larger ones may overflow."
 
 
 def _is_set(bits: int, place: int) -> bool:
@@ -24,12 +24,13 @@ def _is_set(bits: int, place: int) -> bool:
 class Measurement(Value):
     """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s.
 
-    `received_s` is the host's clock, `device_time_s` the device's own, unwrapped from an arbitrary start. `handle_mm`
-    is the travel of the roller's surface, unwrapped. `number` counts the states of this connection. Three streams make
-    it, and any of them may stop: `received_s` is when the newest State came, `sensed_s` the newest Sense (currents,
-    force, handle), `reported_s` the newest Status (mode, switches, faults, temperature, supply). `delay_s` is how
-    long ago the first Drive was sent that the device had not obeyed when it last said which it does: at most the way
-    there and back. `link` is how well the wire carried it.
+    Three streams make it, and any of them may stop. On the host's clock, `received_s` is when the newest State came,
+    `sensed_s` the newest Sense (currents, force, handle), `reported_s` the newest Status (mode, switches, faults,
+    temperature, supply). `device_time_s` is the device's own clock, unwrapped from an arbitrary start. `handle_mm` is
+    the travel of the roller's surface, unwrapped. `number` counts the states since the device was identified.
+
+    `delay_s` is the age of the first Drive that a Status does not show obeyed yet, at most the way there and back; of
+    the last two Statuses the lesser, and 0 unless the device is in RUN. `link` is how well the wire carries.
     """
 
     def __init__(
@@ -74,7 +75,10 @@ class Measurement(Value):
 
     @property
     def is_finite(self) -> bool:
-        """Whether all of it are numbers that may be computed with: the codec gives no others, a plugin may."""
+        """Tell whether the numbers are finite and small enough to compute with, 1e10 at most.
+
+        The codec gives no others; the backend of a plugin may.
+        """
         link = self.link
         # one comparison, as it stands in every tick: a sum of squares with NaN is not less, and nothing cancels
         squares = (
@@ -98,26 +102,26 @@ class Measurement(Value):
 
     @property
     def is_homed(self) -> bool:
-        """The device knows where its carriages are."""
+        """Tell whether the device says that it knows where its carriages are."""
         return _is_set(self.switches, _HOMED)
 
     @property
     def is_left_open(self) -> bool:
-        """The left carriage is at its open switch."""
+        """Tell whether the left carriage is at its open switch."""
         return _is_set(self.switches, _LEFT_OPEN)
 
     @property
     def is_right_open(self) -> bool:
-        """The right carriage is at its open switch."""
+        """Tell whether the right carriage is at its open switch."""
         return _is_set(self.switches, _RIGHT_OPEN)
 
     @property
     def is_busy(self) -> bool:
-        """The device moves by its own routine and takes no drive commands."""
+        """Tell whether the device homes or opens by its own routine, and takes no drive commands."""
         return self.mode in _BUSY
 
     @property
     def is_latched(self) -> bool:
-        """The device holds a fault that only a Clear takes away."""
+        """Tell whether the device holds a fault, which only a Clear takes away."""
         faults: int = self.faults
         return self.mode is _LATCHED or faults != 0

@@ -1,4 +1,4 @@
-"""The serial backend: pyserial opens and configures the port; its descriptor is read and written without waiting."""
+"""The serial backend: pyserial opens and configures the port, whose descriptor is then read and written directly."""
 
 import errno
 import os
@@ -32,7 +32,10 @@ class SerialOptions(Strict, frozen=True):
 
 
 def open_serial(device: Device, options: SerialOptions) -> SerialPort:
-    """Opens `device.port` exclusively. Raises BackendError saying why not."""
+    """Open `device.port` exclusively, with its driver's latency timer at 1 ms where that can be set.
+
+    What had come before is discarded. Raises BackendError saying why the port does not open.
+    """
     try:
         port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()
@@ -48,6 +51,7 @@ def open_serial(device: Device, options: SerialOptions) -> SerialPort:
 
 
 def _tell_nothing_from_gone(fd: int) -> None:
+    """Set VMIN to 1: a read without data then raises BlockingIOError, and returns no bytes only from a lost device."""
     # with pyserial's VMIN = 0 a read returns no bytes both when none have come and when the device is unplugged
     attributes = termios.tcgetattr(fd)
     attributes[6][termios.VMIN] = 1

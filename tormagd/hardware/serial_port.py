@@ -1,4 +1,4 @@
-"""An open serial port: frames are written to its descriptor, and what has come is read from it when it is asked for."""
+"""An open serial port: frames are written to its descriptor and read from it, never waiting."""
 
 import contextlib
 import os
@@ -13,12 +13,12 @@ from tormagd.hardware.frame_stream import FrameStream
 
 READ_BYTES: Final = 4_096
 UNSENT_BYTES: Final = 512
-"Half a frame may wait for the driver; more means that nobody reads at the other end."
+"Some frames may wait for the driver; more bytes than this mean that nobody reads at the other end."
 
 
 @final
 class SerialPort:
-    """Of a port that is exclusively held. Nothing here waits."""
+    """An open, exclusively held serial port and the conversation on it: a `Backend`. Nothing here waits."""
 
     def __init__(self, port: serial.Serial) -> None:
         self._port = port
@@ -32,7 +32,10 @@ class SerialPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """All valid messages that have arrived. Raises BackendError at end-of-file or a read error."""
+        """Return the valid messages in the next READ_BYTES bytes that have arrived.
+
+        Raises BackendError when the device was unplugged or the port cannot be read.
+        """
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:
@@ -44,7 +47,11 @@ class SerialPort:
         return self.stream.unpack(data)
 
     def send(self, message: Message) -> None:
-        """Writes one frame. Raises BackendError when the port is gone or its far end has stopped reading."""
+        """Write one frame behind what the driver had not taken yet; bytes that it does not take now are kept.
+
+        Raises BackendError when the port is gone or more than UNSENT_BYTES wait, and EncodeError for a value that does
+        not fit the wire.
+        """
         data = self._unsent + self.stream.pack(message)
         try:
             written = os.write(self._fd, data)
@@ -59,8 +66,8 @@ class SerialPort:
             raise BackendError(f"{self._port.port}: nobody reads at the other end")
 
     def close(self) -> None:
-        """Closes the port and drops its lock."""
-        # what was not sent is void, and closing would wait for it, up to half a minute; a device that is gone refuses
+        """Close the port and drop its lock; unsent bytes are discarded. Errors of a device that is gone are ignored."""
+        # closing would wait for unsent bytes, up to half a minute
         with contextlib.suppress(OSError, termios.error):
             self._port.reset_output_buffer()
         with contextlib.suppress(OSError):

@@ -1,6 +1,6 @@
-"""USB serial chips keep received bytes back, for 16 ms as a rule, unless they are told otherwise.
+"""The latency timer of USB serial chips, which keep received bytes back, for 16 ms as a rule, unless told otherwise.
 
-The driver of such a chip has a latency timer in sysfs. A port without one (a device's own USB, a pty) keeps nothing.
+The chip's driver shows the timer in sysfs. A port without one (a device's own USB, a pty) keeps nothing back.
 """
 
 import logging
@@ -15,7 +15,10 @@ log = logging.getLogger(__name__)
 
 
 def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
-    """How long the driver of this port (or of the port a link leads to) keeps bytes back; None for no such timer."""
+    """Return the latency timer of a port, or of the port that a link leads to, ms.
+
+    None where the port has none or the timer cannot be read.
+    """
     try:
         return int((sysfs / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii"))
     except (OSError, ValueError):
@@ -23,9 +26,9 @@ def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
 
 
 def make_prompt(port: serial.Serial, sysfs: Path = SYSFS) -> None:
-    """Has the driver of an open port hand bytes on within a millisecond, where it has a timer. A refusal is a warning.
+    """Set the latency timer of an open port to 1 ms, where it has one that is longer. A refusal is logged as a warning.
 
-    ASYNC_LOW_LATENCY needs no rights beyond the open port; the file itself is root's.
+    ASYNC_LOW_LATENCY needs no rights beyond the open port; the file in sysfs needs root's.
     """
     found_ms = latency_ms(port.port, sysfs)
     if found_ms is None or found_ms <= PROMPT_MS:
