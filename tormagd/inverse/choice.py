@@ -10,7 +10,7 @@ from tormagd.physics.errors import DomainError, require_that
 
 
 class Choice(NamedTuple):
-    """A search with its settings, and why it was taken, for the log. What a search does not have is 0."""
+    """A search with its settings, and why it was taken, for the log. A setting that the search lacks is 0."""
 
     solver: str
     step_mT: float
@@ -19,20 +19,22 @@ class Choice(NamedTuple):
 
 
 _USUAL = {"newton": (0.0, 0), "nearest": (2.0, 4), "torch": (1.0, 4), "thesis": (1.0, 0)}
-"Step of the grid, mT, and neighbours."
+"By the name of a search, the usual step of its grid, mT, and its number of neighbours; 0 where it has none."
 
 RUNTIME_SOLVERS = tuple(_USUAL)
 OF_TORCH = ("torch", "thesis")
-"They ask the network itself in torch, which is loaded for them only; the others ask the curve."
+"Searches that ask the network itself in torch, which is loaded for them only; the others ask the curve."
 BESIDE_PLANS = ("thesis",)
-"They take longer than a plan has: they run in a process of their own."
+"Searches that take longer than a plan has, and run in a process of their own."
 
 
 def named(
     solver: str, step_mT: float | None = None, neighbours: int | None = None, reason: str = "named by the scene"
 ) -> Choice:
-    """A search by its name, with its usual settings where none are given. Raises `DomainError` on another name, or a
-    setting that the search does not have."""
+    """Return the choice of a search by its name; None stands for its usual grid step or number of neighbours.
+
+    Raises `DomainError` for an unknown name, and for a setting that the search does not have.
+    """
     require_that(solver in _USUAL, "solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
     settings = []
     for key, given, usual in zip(("step_mT", "neighbours"), (step_mT, neighbours), _USUAL[solver], strict=True):
@@ -42,10 +44,10 @@ def named(
 
 
 def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel, *, rises: bool) -> FieldSolver:
-    """The search that was chosen, over these fields. `rises` says that every curve of the model rises over them.
+    """Build the chosen search over a range of fields. `rises`: every curve of the model rises over the whole range.
 
-    Raises `DomainError` where its settings do not fit the range, where Newton's method would have several roots, or
-    where torch is not installed.
+    Raises `DomainError` where the settings do not fit the range, where "newton" is chosen without `rises`, where torch
+    is needed and not installed, and where "thesis" is chosen and the model states no mean error.
     """
     if choice.solver == "newton":
         require_that(rises, "solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")
@@ -64,7 +66,10 @@ def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel
 
 
 def mean_error_N(model: ForceModel) -> float:
-    """The mean error of the force that its training states of `model`. Raises `DomainError` where it states none."""
+    """Return the mean absolute error of the model's force in its training's validation, N.
+
+    Raises `DomainError` where the model file states none.
+    """
     name, metrics = "validation_mae_N", model.metadata.metrics
     require_that(name in metrics, name, "missing in the model's metrics", "a model that states its mean error")
     return metrics[name]

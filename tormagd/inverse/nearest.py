@@ -1,4 +1,4 @@
-"""The k-nearest search: the force at every field of a grid at once, the nearest of them, and of those one branch."""
+"""The k-nearest search: the force at every field of a grid, the fields nearest in force, and one branch of them."""
 
 from collections.abc import Callable
 
@@ -13,11 +13,11 @@ from tormagd.physics.errors import require_that
 MAX_GRID_POINTS = 100_000
 
 Batch = Callable[[ForceCurve], Floats]
-"The force, N, at every field of a grid, for a state of the handle."
+"Returns the force, N, at every field of a grid, for the state of the handle that a curve is for."
 
 
 def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[np.float64]:
-    """Fields from least to greatest, evenly spaced by `step_mT` or a little less, both ends included.
+    """Return fields from least to greatest, mT, evenly spaced by `step_mT` or a little less, both ends included.
 
     Raises `DomainError` on an empty or non-finite range, a step that is not positive, or more than 100,000 points.
     """
@@ -37,18 +37,18 @@ def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[n
 class NearestFieldSearch:
     """Nearest-neighbour search of the field (section 4.2.6 of the thesis), vectorised and continuous.
 
-    It looks at the force at every field of a grid at once. Candidates are the `neighbours` points of the grid that are
-    nearest in force. Where predicted and asked force cross beside one, the root takes its place, by linear
-    interpolation, so that the answer is not bound to the grid. Where none do, those candidates count that are as near
-    as the best within rounding, and the point nearest the last field if it is: plateaus, touching points
-    and the ends of reach.
+    The force is evaluated at every field of a grid at once. Candidates are the `neighbours` points of the grid that are
+    nearest in force. Where predicted and asked force cross beside a candidate, the root takes its place, by linear
+    interpolation: the answer is not bound to the grid. Without a crossing, candidates count that are as near as the
+    best within rounding, and so does the point nearest the last field. That is so on plateaus, at touching points and
+    at the ends of reach.
 
     The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where the force
     rises with the field there is one root, and one neighbour finds it. Where it also falls there are several, each on
-    a branch of its own: with too few neighbours all of them may lie on another branch than the last field's.
+    a branch of its own: with too few neighbours all candidates may lie on another branch than the last field's.
 
-    `fields_mT` is an even grid, as `field_grid` makes it. `batch` tells the forces on it; the curve itself where none
-    is given. Raises `DomainError` on parameters it cannot use.
+    `fields_mT` is an even grid, as `field_grid` makes it. `batch` gives the forces on the grid; None: the curve does.
+    Raises `DomainError` unless `neighbours` is 1 to the number of grid points.
     """
 
     def __init__(self, fields_mT: NDArray[np.float64], neighbours: int = 8, batch: Batch | None = None) -> None:
@@ -59,7 +59,7 @@ class NearestFieldSearch:
         self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """See `FieldSolver.solve`."""
+        """Return the field for `force_N`, as `FieldSolver.solve` does. Raises `DomainError` for numbers not finite."""
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
         forces_N = curve.forces_N(self._fields_mT) if self._batch is None else self._batch(curve)
         candidates, reach = self._candidates(forces_N - force_N, near, tie_N(curve))
@@ -67,7 +67,10 @@ class NearestFieldSearch:
         return answer(curve, field_mT, force_N, curve.force_N(field_mT), 2, reach)
 
     def _candidates(self, excess_N: Floats, near_mT: float, same_N: float) -> tuple[NDArray[np.float64], Reach]:
-        """Fields in mT that fit equally well, and whether they fit, from the force above the one asked on the grid."""
+        """Return the fields that fit equally well, mT, and whether the force asked is in reach.
+
+        `excess_N` is the predicted less the asked force at each grid point. Forces nearer than `same_N` are equal.
+        """
         fields = self._fields_mT
         below = excess_N < 0
         crosses = below[1:] != below[:-1]
@@ -77,7 +80,7 @@ class NearestFieldSearch:
         left = beside[crosses[beside]]
         best_N = 0.0 if left.size else float(error_N[nearest].min())
         candidates = fields[nearest[error_N[nearest] <= best_N + same_N]]
-        # on a plateau of more points than `neighbours` it is chance which of them were taken
+        # on a plateau of more points than `neighbours` chance decides which are candidates
         here = min(max(round((near_mT - fields[0]) * self._per_mT), 0), len(fields) - 1)
         if error_N[here] <= best_N + same_N:
             candidates = np.append(candidates, fields[here])

@@ -1,4 +1,4 @@
-"""Newton's method on the whole range, where the force is known to rise with the field: the search of the hot path."""
+"""Newton's method for the field, where the force is known to rise with the field: the search of the hot path."""
 
 from typing import Final, final
 
@@ -8,22 +8,23 @@ from tormagd.model.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
 
 ACCURACY_MT: Final = 1e-3
-"""How near the curve's own root a search comes: a twentieth of what one encoder count (1/560 mm) changes at most."""
+"""Largest error of the root: a twentieth of the largest change of field over one encoder count (1/560 mm)."""
 
 LOOKED_AT_MT: Final = 0.25 * ACCURACY_MT
-"""A step that should end this near the root is taken for the last: only the force is looked at there, not the slope."""
+"""A step that should end this near the root is taken for the last: at its end only the force is evaluated, no slope."""
 
 MOST_EVALUATIONS: Final = 60
-"""Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; thrice that is for steps that alternate with it."""
+"""Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; three times as many allow for steps between bisections."""
 
 
 @final
 class RisingSearch:
-    """Newton's steps from the last field, or else from the least, in a bracket that is the whole range at first.
+    """Newton's method from the last field, or else from the least, in a bracket that begins as the whole range.
 
-    A rising force has one root at most: there is no look for others. A step to an end of the range or past it is a look
-    at that end, once; any other out of the bracket halves it, and so does a step that is not half of the one before.
-    The answer is the root to `ACCURACY_MT`; out of reach it is the end. Raises `DomainError` on a range that is none.
+    A rising force has one root at most. A step to or past an end of the range evaluates the force at that end, once.
+    Any other step out of the bracket is replaced by a bisection, and so is one of over half the step before. The answer
+    is the root to `ACCURACY_MT`, or the nearer end for a force out of reach. Raises `DomainError` unless the range is
+    finite and rises.
     """
 
     def __init__(self, field_range_mT: tuple[float, float]) -> None:
@@ -36,14 +37,14 @@ class RisingSearch:
         self._high_mT = high_mT
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """See `FieldSolver.solve`."""
+        """Return the field for `force_N`, as `FieldSolver.solve` does. Raises `DomainError` for numbers not finite."""
         low, high = self._low_mT, self._high_mT
         span = high - low
         field = checked_near_mT(force_N, last_field_mT, low)
         field = low if field < low else high if field > high else field
         same_N = tie_N(curve)
         left, right, left_seen, right_seen = low, high, False, False
-        # a step leaves its square times this: a parabola's over the range at first, then as the last two steps show
+        # a step ends at about its square times this from the root: a parabola's at first, then as the last steps show
         bend_per_mT, before = 1.0 / span, 2.0 * span
         predicted_N, evaluations = 0.0, 0
         while True:
@@ -60,7 +61,7 @@ class RisingSearch:
                 if field <= low:
                     return answer(curve, field, force_N, predicted_N, evaluations, Reach.BELOW)
                 right, right_seen = field, True
-            # an end of the range that was not looked at does not close the bracket: the force may be out of reach
+            # an end of the range that was not evaluated does not close the bracket: the force may be out of reach
             if (left_seen and right_seen and right - left <= ACCURACY_MT) or evaluations >= MOST_EVALUATIONS:
                 break
             # a slope that rounding made flat gives no direction, but the force rises
@@ -78,7 +79,7 @@ class RisingSearch:
                 if bend_per_mT * step * step <= LOOKED_AT_MT:
                     there_N = curve.force_N(following)
                     evaluations += 1
-                    # with a tenth of the excess left, the slope may have changed by a third, and tells how near it is
+                    # with a tenth of the excess left the slope is known to a third, and tells how near the root is
                     allowed_N = min(0.5 * ACCURACY_MT * slope, 0.1 * abs(excess_N))
                     if abs(there_N - force_N) <= max(allowed_N, same_N):
                         return answer(curve, following, force_N, there_N, evaluations, Reach.INSIDE)

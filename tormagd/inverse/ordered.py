@@ -1,4 +1,4 @@
-"""The loop as it was ordered: the network in torch on the CPU, as one batch over the grid, or row by row (Eq. 44)."""
+"""The searches of the order: the network in torch on the CPU, as one batch over the grid, or row by row (Eq. 44)."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,10 @@ torch.set_num_threads(1)  # a second thread costs more than it saves at these si
 
 
 def batch(model: ForceModel, fields_mT: Floats) -> Batch:
-    """The forces of `model` at all of these fields in one pass of the network."""
+    """Return a function from a curve to the forces of `model`, N, at all `fields_mT` (n), in one pass in torch.
+
+    Of the curve it takes displacement, rate and share of iron only.
+    """
     network, rows = to_network(model), torch.zeros((len(fields_mT), len(FEATURES)), dtype=torch.float64)
     rows[:, FIELD] = torch.from_numpy(fields_mT)
     others = torch.tensor([column for column in range(len(FEATURES)) if column != FIELD])
@@ -33,7 +36,10 @@ def batch(model: ForceModel, fields_mT: Floats) -> Batch:
 
 
 def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
-    """The force of `model` at one field, mT: a pass of the network for a single row."""
+    """Return a function from a curve and one field, mT, to the force of `model`, N: a pass in torch for one row.
+
+    Of the curve it takes displacement, rate and share of iron only.
+    """
     network = to_network(model)
 
     def force_N(curve: ForceCurve, field_mT: float) -> float:
@@ -47,9 +53,9 @@ def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
 class RowByRow:
     """The thesis's search: one field of a grid after the other from the least, until |F - NN| <= epsilon.
 
-    `predict_N` is how a row is evaluated: `row` of a model, as the thesis did it, or the curve's own `force_N`. With
-    `epsilon_N` = 0 every row is looked at, and the nearest is the answer. It knows no continuity: the last field is
-    checked and not used. Raises `DomainError` on a radius that is none.
+    `predict_N` evaluates a row: `row` of a model, as the thesis did it, or the curve's own `force_N`. Where no row is
+    within `epsilon_N`, the nearest is the answer. The search knows no continuity: the last field is checked, not used.
+    Raises `DomainError` unless `epsilon_N` is a finite number, 0 or more.
     """
 
     def __init__(self, fields_mT: Floats, epsilon_N: float, predict_N: Callable[[ForceCurve, float], float]) -> None:
@@ -59,7 +65,10 @@ class RowByRow:
         self._epsilon_N, self._predict_N = epsilon_N, predict_N
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """See `FieldSolver.solve`; a force within epsilon of what some field gives counts as inside."""
+        """Return the field for `force_N`, as `FieldSolver.solve` does, but not nearest to the last field.
+
+        A force within epsilon of some field's counts as in reach. Raises `DomainError` for numbers not finite.
+        """
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0
         for field_mT in self._fields_mT:

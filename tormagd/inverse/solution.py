@@ -1,4 +1,4 @@
-"""What a search for the field answers, and the interface that every search has."""
+"""The interface of a search for the field, and its answer."""
 
 from enum import StrEnum
 from typing import Final, Protocol, final
@@ -9,7 +9,7 @@ from tormagd.model.force_curve import ForceCurve
 
 
 class Reach(StrEnum):
-    """Whether the fields at hand can give the force that was asked."""
+    """Whether the fields in range can give the force that was asked."""
 
     INSIDE = "inside"
     BELOW = "below"  # less force was asked than the least that any field gives
@@ -18,10 +18,10 @@ class Reach(StrEnum):
 
 @final
 class FieldSolution(Value):
-    """The field for a force, and what the model predicts there.
+    """The field for a force, and the force that the model predicts there.
 
-    `confidence` is 0..1 (see `ForceCurve.confidence`); `iterations` counts evaluations of the curve made one after the
-    other (a pass over a whole grid of fields is one).
+    `confidence` is 0..1 (see `ForceCurve.confidence`). `iterations` counts the evaluations of the curve, one after the
+    other; a pass over a whole grid of fields is one.
     """
 
     def __init__(
@@ -36,8 +36,10 @@ class FieldSolution(Value):
 
 @final
 class Question(Value):
-    """What a search beside the plans is asked at `time_s`: the field at which the brake gives `force_N`, the handle
-    being taken to move so; of several the one nearest `last_field_mT`."""
+    """A question to a search in a process of its own: at which field does the brake give `force_N`?
+
+    Asked at `time_s`, for a handle at this displacement and rate; of several fields the one nearest `last_field_mT`.
+    """
 
     def __init__(
         self, time_s: float, displacement_mm: float, rate_mm_s: float, force_N: float, last_field_mT: float
@@ -51,7 +53,7 @@ class Question(Value):
 
 @final
 class Answer(Value):
-    """What a search beside the plans found for the question of `time_s`."""
+    """The answer of a search in a process of its own to the `Question` of `time_s`."""
 
     def __init__(self, time_s: float, solution: FieldSolution) -> None:
         self.time_s: Final = time_s
@@ -59,24 +61,25 @@ class Answer(Value):
 
 
 TIE: Final = 16.0 * 2.0**-52
-"A sum of as many terms as a network has units is wrong by a few units of rounding: forces that near are the same."
+"Share of a sum's magnitude within which two forces are equal: a network's sum is off by a few units of rounding."
 
 
 class FieldSolver(Protocol):
     """A search for the field at which the brake gives `force_N`."""
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Answer with the field for `force_N`; where several fit, the one nearest `last_field_mT` when that is given.
+        """Return the field for `force_N`; of several, the one nearest `last_field_mT`, or the least where that is None.
 
-        A force out of reach gets the field that comes nearest to it and says so in `reach`.
-        Raises `DomainError` naming the argument that is not finite, or too large.
+        A force out of reach gets the field that comes nearest; `reach` says so. Raises `DomainError` naming an argument
+        that is not finite, or too large.
         """
 
 
 def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float) -> float:
-    """The field from which distance counts: the last one, or `least_mT`, the opener gap, without one.
+    """Check the arguments of a search; return the field that its answer should be near, mT.
 
-    Raises `DomainError` naming the first argument of a solve that is not finite, or too large.
+    That is the last field, or `least_mT`, the opener gap, where it is None. Raises `DomainError` naming the field or
+    the force that is not finite, or too large.
     """
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):
@@ -86,13 +89,13 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
 
 
 def tie_N(curve: ForceCurve) -> float:
-    """Forces of `curve` that differ by less are the same."""
+    """Return the difference of force up to which two forces of `curve` count as equal: its rounding error."""
     return TIE * curve.magnitude_N
 
 
 def answer(
     curve: ForceCurve, field_mT: float, force_N: float, predicted_N: float, iterations: int, reach: Reach
 ) -> FieldSolution:
-    """A field and what `curve` predicts there as the solution for `force_N`, with its confidence."""
+    """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence."""
     trust = curve.confidence(field_mT, force_N - predicted_N)
     return FieldSolution(field_mT, predicted_N, trust, iterations, reach)

@@ -1,1 +1,1 @@
-"""What was learned, as data that the daemon loads: model files, the force curves in them, what their features mean."""
+"""What was learned, as data that the daemon loads: model files, their force curves, and what their features mean."""

@@ -5,16 +5,16 @@ from typing import Final, final
 from firmware_protocol.value import Value
 
 TURN_MM: Final = 0.05
-"A handle motion against the last direction counts as a reversal from here on: 6 counts of its encoder."
+"A handle that goes back by more than this has turned: 6 counts of its encoder."
 MOBILISED_MM: Final = 2.0
 "Displacement saturates here: friction is fully mobilised, whatever the insert."
 MOVING_MM_S: Final = 5.0
-"Slower handles teach no model and no trim, and no force is planned for them: their friction may be static."
+"A slower handle teaches no model and no trim, and no force is planned for it: its friction may be static."
 
 
 @final
 class Turn(Value):
-    """The way the handle goes, 1 or -1, where it last turned, mm, and the furthest it has been since, mm."""
+    """Where a handle last turned, mm, the way it has gone since, 1 or -1, and the furthest it has been, mm."""
 
     def __init__(self, direction: float, turned_mm: float, furthest_mm: float) -> None:
         self.direction: Final = direction
@@ -22,7 +22,10 @@ class Turn(Value):
         self.furthest_mm: Final = furthest_mm
 
     def moved_to(self, position_mm: float) -> "Turn":
-        """The same after the handle moved there. It turned where it was furthest, not where we became sure of it."""
+        """Return the turn after the handle moved to `position_mm`: this one, unless the handle turned back.
+
+        It has turned when it went back by more than TURN_MM. The place of the new turn is the furthest it had been.
+        """
         beyond_mm = position_mm - self.furthest_mm
         if beyond_mm * self.direction >= 0.0:
             return self if beyond_mm == 0.0 else Turn(self.direction, self.turned_mm, position_mm)
@@ -31,5 +34,5 @@ class Turn(Value):
         return self
 
     def displacement_mm(self, position_mm: float) -> float:
-        """Travel from the turn to there, saturating at MOBILISED_MM."""
+        """Return the distance from the turn to `position_mm`, at most MOBILISED_MM."""
         return min(abs(position_mm - self.turned_mm), MOBILISED_MM)

@@ -1,4 +1,4 @@
-"""What the network is fed: the four features of Eq. 43, their units, their scaling, and the check at the border."""
+"""The network's input: the four features of Eq. 43, their units, their scaling, and the check of their values."""
 
 from enum import StrEnum
 from typing import Final
@@ -20,7 +20,7 @@ LARGEST: Final = 1e9
 
 
 class Element(StrEnum):
-    """What the features were measured on: they mean different things on the two, so a model serves one only."""
+    """The element that the features were measured on: brake or tactile pad. A model serves one of them only."""
 
     TORQUE = "torque"
     TACTILE = "tactile"

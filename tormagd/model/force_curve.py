@@ -1,6 +1,6 @@
-"""For one state of the handle, the force over the field: all that searches, portrait and prediction know of a model.
+"""Force curves: the force over the field at one state of the handle. Searches know no more of a model.
 
-What stands behind a curve may be a network, a grey box with memory, or a closed form.
+Behind a curve may stand a network, a grey box with memory, or a closed form.
 """
 
 import math
@@ -18,7 +18,7 @@ RESIDUAL_RATE: Final = 20.0
 """Confidence falls to 1/e when 5% of the training force span remains between force asked and force predicted."""
 
 LARGEST_EXPONENT: Final = 700.0
-"exp() of a little more has no float. A unit that far from its step is shut to the last digit of every force."
+"exp() of a little more overflows. A sigmoid unit this far from its step adds nothing to the last digit of a force."
 
 # compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST
@@ -26,35 +26,35 @@ Floats: TypeAlias = NDArray[np.floating]
 
 
 class ForceCurve(Protocol):
-    """Force over field, the handle's displacement and rate and the share of iron fixed. Fields are finite, in mT."""
+    """Force over field at a fixed displacement and rate of the handle and share of iron. Fields are finite, in mT."""
 
     @property
     def displacement_mm(self) -> float:
-        """The displacement that it is for."""
+        """The handle's displacement that the curve holds for."""
 
     @property
     def rate_mm_s(self) -> float:
-        """The handle's rate that it is for."""
+        """The handle's rate that the curve holds for."""
 
     @property
     def cip_percent(self) -> float:
-        """The elastomer's share of carbonyl iron."""
+        """The elastomer's share of carbonyl iron, percent by volume."""
 
     @property
     def magnitude_N(self) -> float:
-        """The magnitudes, summed, that a force is added up from: what rounding is a share of."""
+        """The sum of the magnitudes of a force's terms: its rounding error is a share of this."""
 
     def force_N(self, field_mT: float) -> float:
-        """Force at one field."""
+        """Return the force at one field."""
 
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """Force, N, and dF/dB, N/mT, at one field."""
+        """Return the force, N, and its slope dF/dB, N/mT, at one field."""
 
     def forces_N(self, fields_mT: Floats) -> Floats:
-        """Force at each field (n), in the precision of the fields."""
+        """Return the force at each field (n), in the precision of the fields."""
 
     def confidence(self, field_mT: float, error_N: float) -> float:
-        """Trust, 0..1, in a field that misses the force asked by `error_N` N."""
+        """Return the trust, 0..1, in a field whose predicted force misses the force asked by `error_N`."""
 
 
 def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> None:
@@ -72,13 +72,13 @@ def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, ci
 
 
 def within(value: float, ends: tuple[float, float]) -> float:
-    """`value`, or the end that it lies beyond: a model is not asked where nothing was shown to it."""
+    """Return `value`, held within the two `ends`: so a model is asked only where it was trained."""
     return min(max(value, ends[0]), ends[1])
 
 
 @final
 class Known:
-    """What a model has been shown: the least and the greatest of each feature, and the span of forces, N."""
+    """What a model was trained on: the least and the greatest of each feature, and the span of the forces, N."""
 
     def __init__(self, ranges: tuple[tuple[float, float], ...], span_N: float) -> None:
         self.lows: Final = [low for low, _ in ranges]
@@ -88,7 +88,10 @@ class Known:
         self.span_N: Final = span_N
 
     def excess(self, place: int, value: float) -> float:
-        """How far the feature at `place` of `FEATURES` lies outside, as a share of its range."""
+        """Return how far feature number `place` of `FEATURES` lies outside its range, as a share of it; 0 inside.
+
+        For a feature that never varied, as a share of its magnitude, of 1 unit at least.
+        """
         outside = max(self.lows[place] - value, value - self.highs[place])
         return outside / self.scales[place] if outside > 0.0 else 0.0
 
@@ -108,7 +111,7 @@ class Network:
         constant_N: float,
         known: Known,
     ) -> None:
-        # sigmoid(z) = 1 / (1 + exp(-z)): the sign is taken into the weights
+        # sigmoid(z) = 1 / (1 + exp(-z)): the weights are kept with the minus sign
         columns: list[list[float]] = [(-weight[:, FEATURES.index(name)]).tolist() for name in FEATURES]
         self.displacement: Final = columns[0]
         self.rate: Final = columns[1]
@@ -119,7 +122,7 @@ class Network:
         outputs: list[float] = output.tolist()
         self.output: Final = outputs
         self.constant_N: Final = constant_N
-        # (1 + tanh(z / 2)) / 2 is the same sigmoid: NumPy's tanh takes many at once, and it cannot overflow
+        # (1 + tanh(z / 2)) / 2 is the same sigmoid: NumPy's tanh takes arrays, and cannot overflow
         self.field_half: Final = weight[:, FIELD] / 2
         self.output_half: Final = output / 2
         self.middle_N: Final = constant_N + math.fsum(outputs) / 2
@@ -127,7 +130,8 @@ class Network:
         self.known: Final = known
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
-        """The curve for a state of the handle. Raises `DomainError` naming what is not finite, or too large."""
+        """Return the force curve at a state of the handle. Raises `DomainError` naming a number that is not finite, or
+        beyond `LARGEST`."""
         require_inputs(displacement_mm, rate_mm_s, 0.0, cip_percent)
         shift = [
             bias + by_mm * displacement_mm + by_mm_s * rate_mm_s + by_percent * cip_percent
@@ -138,7 +142,7 @@ class Network:
 
 @final
 class NetworkCurve:
-    """See `ForceCurve`. Made by `Network.curve`."""
+    """The `ForceCurve` of a network, made by `Network.curve`."""
 
     def __init__(
         self, network: Network, shift: list[float], displacement_mm: float, rate_mm_s: float, cip_percent: float
@@ -186,8 +190,11 @@ class NetworkCurve:
         return forces
 
     def confidence(self, field_mT: float, error_N: float) -> float:
-        """exp(-4 e - 20 r): e is how far each feature lies outside its training range, as a share of that range,
-        summed; r is the error as a share of the force span seen in training."""
+        """Return the trust exp(-4 e - 20 r), 0..1, in a field whose force misses the force asked by `error_N`.
+
+        e sums over the features how far each lies outside its training range, as a share of that range. r is the
+        error as a share of the force span seen in training.
+        """
         known = self._network.known
         excess = (
             known.excess(0, self.displacement_mm)

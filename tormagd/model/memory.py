@@ -1,9 +1,9 @@
-"""What an element remembers, as a model file carries it: its elastomer relaxes, and its field lags behind the gap's.
+"""An element's memory, as a model file carries it: the elastomer relaxes, and its field lags behind the gap's.
 
     F = F0(B - h) less what has relaxed of it      h follows the field's changes towards +-h_max
 
-F0 is the force without memory, which the network knows. What of it is there without field, and what the field adds,
-relax each by a Prony series (`tormagd.physics.relaxation`); a brake's by the same, of a pad's they differ.
+F0 is the force without memory, which the network knows. The part of F0 without field, and the part that the field adds,
+each relax by a Prony series (`tormagd.physics.relaxation`). A brake has one series for both, a pad may have two.
 """
 
 from itertools import pairwise
@@ -18,9 +18,13 @@ LONGEST_S = 1e5
 
 
 class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The fractions g_i and times tau_i of relaxation, the shortest first, `field_fractions` of what the field adds
-    where those differ, and the field's lag h: at most `lag_mT`, which is reached over changes of `turn_mT`. Without any
-    of them an element remembers nothing. Raises `DomainError`."""
+    """Relaxation and field lag of one element; the defaults are an element that remembers nothing.
+
+    `fractions` g_i and `times_s` tau_i of relaxation, the shortest time first; `field_fractions` are those of the force
+    that the field adds, where they differ. The field's lag h is at most `lag_mT`, reached over changes of `turn_mT`.
+    Raises `DomainError` for numbers out of range, more than 8 terms, times that do not rise, and a lag over a quarter
+    of `turn_mT`.
+    """
 
     fractions: tuple[float, ...] = ()
     times_s: tuple[float, ...] = ()
@@ -29,7 +33,7 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     turn_mT: float = 1.0
 
     def __post_init__(self) -> None:
-        for series in (self.free, self.added):  # these refuse what is no series at all
+        for series in (self.free, self.added):  # PronySeries refuses fractions and times that make no series
             require("memory.times_s, count", len(series.times_s), 0, MOST_TERMS)
         for time_s in self.times_s:
             require("memory.times_s", time_s, 1e-3, LONGEST_S)
@@ -45,12 +49,12 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def free(self) -> PronySeries:
-        """How the force without field relaxes."""
+        """The relaxation of the force without field."""
         return PronySeries(self.fractions, self.times_s)
 
     @property
     def added(self) -> PronySeries:
-        """How what the field adds relaxes."""
+        """The relaxation of the force that the field adds."""
         return PronySeries(self._field_fractions, self.times_s)
 
     @property

@@ -38,7 +38,7 @@ from tormagd.physics.errors import DomainError, require_that
 
 Array: TypeAlias = NDArray[np.float64]
 Ranges: TypeAlias = dict[str, tuple[float, float]]
-"The least and the greatest value of each feature, and of `force_N`."
+"By name, the least and the greatest value of each feature and of `force_N`."
 
 FORMAT = "tormagd-force-model-1"
 MAX_HIDDEN = 4096
@@ -50,16 +50,16 @@ TEXT_FIELDS = frozenset({"element", "insert", "training_data_sha256", "created"}
 
 
 class ModelFileError(ValueError):
-    """A model file that is missing, damaged, or meant for something else; the text says which and what to do."""
+    """A model file that is missing, damaged, or meant for another element or insert; the text says which."""
 
 
 class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a force model is and where it came from.
 
-    `insert` names the insert the data were measured on; `ranges` holds the least and the greatest value seen in
-    training for each feature and for `force_N`; `metrics` whatever the trainer measured; `created` is given, never
-    read from a clock; `memory` is what the network leaves out. Where the data are of several inserts, `insert` is what
-    their names begin with, and `boxes` holds the ranges of each. Raises `DomainError` on anything that could not be
+    `insert` names the insert that the data were measured on; of several inserts, it is what their names begin with,
+    and `boxes` holds the ranges of each. `ranges` holds the least and the greatest value seen in training for each
+    feature and for `force_N`. `metrics` are the trainer's figures. `created` is given, never read from a clock.
+    `memory` is the part of the force that the network leaves out. Raises `DomainError` for anything that could not be
     saved and loaded again.
     """
 
@@ -105,6 +105,7 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 def _require_ranges(key: str, ranges: Ranges) -> None:
+    """Raise `DomainError` naming `key` unless each feature and `force_N` has a finite range, the force's not empty."""
     require_that(set(ranges) == set(UNITS), key, sorted(ranges), f"one range for each of {', '.join(UNITS)}")
     for name, (low, high) in ranges.items():
         is_range = -LARGEST <= low <= high <= LARGEST
@@ -127,7 +128,7 @@ class ForceModel:
     """Force of an insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network.
 
     The weights act on scaled values (`metadata.scaling`): hidden_weight (h x 4), hidden_bias (h), output_weight (h).
-    `physical` is the same network with the scaling folded in.
+    `physical` is the same network with the scaling folded in. Weights are copied, and the copies cannot be written.
     Raises `DomainError` when metadata and weights do not fit together, or a number is not finite.
     """
 
@@ -138,7 +139,7 @@ class ForceModel:
     output_bias: float
     physical: PhysicalLayers = field(init=False, repr=False)
     network: Network = field(init=False, repr=False)
-    "The same again, on floats alone: its curves are what plans ask."
+    "The network once more, on lists of floats: its curves are what plans ask."
 
     def __post_init__(self) -> None:
         hidden = self.metadata.hidden
@@ -151,6 +152,7 @@ class ForceModel:
         object.__setattr__(self, "network", Network(weight, bias, output, constant, known))
 
     def _fold(self) -> PhysicalLayers:
+        """Return the network with the scaling folded in. Raises `DomainError` where a folded number is not finite."""
         scaling = self.metadata.scaling
         gain, offset = np.array(scaling.input_gain), np.array(scaling.input_offset)
         weight = self.hidden_weight * gain
@@ -170,22 +172,26 @@ class ForceModel:
 
     @property
     def field_range_mT(self) -> tuple[float, float]:
-        """Least and greatest field seen in training."""
+        """Least and greatest field seen in training, mT."""
         return self.metadata.ranges["field_mT"]
 
     @property
     def force_span_N(self) -> float:
-        """Greatest less least force seen in training."""
+        """Greatest less least force seen in training, N."""
         low, high = self.metadata.ranges["force_N"]
         return high - low
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that the file holds, 64 hexadecimal digits: which model it is."""
+        """SHA-256 of metadata and weights, 64 hexadecimal digits: it identifies the model."""
         return _checksum(_header(self.metadata), _tensors(self))
 
     def of(self, insert: str) -> "ForceModel":
-        """The same network for one of the inserts it was trained on, in that one's box; the field lags to its scale."""
+        """Return the model of one of its several inserts: ranges of that insert alone, the field's lag to their scale.
+
+        Scaled by the insert's greatest field over that of all inserts. Returns this model itself where it holds no
+        ranges for `insert`.
+        """
         whole, memory = self.metadata, self.metadata.memory
         ranges = (whole.boxes or {}).get(insert)
         if ranges is None:
@@ -196,11 +202,17 @@ class ForceModel:
         return replace(self, metadata=own)
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
-        """The force over the field for one state of the handle. Raises `DomainError` on a non-finite input."""
+        """Return the force over the field at one state of the handle.
+
+        Raises `DomainError` naming an input that is not finite, or beyond `LARGEST`.
+        """
         return self.network.curve(displacement_mm, rate_mm_s, cip_percent)
 
     def predict(self, features: ArrayLike) -> Array:
-        """Force in N (n) for `features` (n x 4, order of `FEATURES`). Raises `DomainError` on a wrong shape or NaN."""
+        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`).
+
+        Raises `DomainError` for another shape, and for a number that is not finite, or beyond `LARGEST`.
+        """
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
         weight, bias, output, constant = self.physical
@@ -209,7 +221,10 @@ class ForceModel:
         return np.asarray(forces_N, dtype=np.float64)
 
     def predict_one(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Force in N at one point, as plans know it. Raises `DomainError` on a non-finite input."""
+        """Return the force, N, at one point, by the curve that plans use.
+
+        Raises `DomainError` naming an input that is not finite, or beyond `LARGEST`.
+        """
         require_number("field_mT", field_mT)
         return self.curve(displacement_mm, rate_mm_s, cip_percent).force_N(field_mT)
 
@@ -224,7 +239,10 @@ class ForceModel:
 
 
 def save_model(path: Path | str, model: ForceModel) -> None:
-    """Write `model` to `path`; the same model gives the same bytes. Readers see the old file or the whole new one."""
+    """Write `model` to `path`; equal models give equal bytes. Readers see the old file or the whole new one.
+
+    Raises OSError.
+    """
     tensors = _tensors(model)
     header = _header(model.metadata)
     header["checksum"] = _checksum(header, tensors)
@@ -233,7 +251,7 @@ def save_model(path: Path | str, model: ForceModel) -> None:
 
 
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
-    """Read a model meant for `element` and, when given, trained on `insert`: of several inserts, for that one.
+    """Read a model file for `element` and `insert`; None accepts any insert. Of several inserts, return that one's.
 
     Raises `ModelFileError` when the file cannot be read, is truncated or altered, holds anything but a finite 4-h-1
     network in the features and units of this program, or belongs to another element or insert.
@@ -258,6 +276,11 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
 
 
 def _decode(data: bytes) -> ForceModel:
+    """Return the model in a file's bytes.
+
+    Raises ModelFileError for another format, checksum or set of tensors, DomainError for values that make no model, and
+    the errors of safetensors and msgspec.
+    """
     # the library proves that the header is whole and that the tensors lie inside the file
     tensors = {name: _tensor(name, content) for name, content in safetensors.deserialize(data)}  # type: ignore[no-untyped-call]
     header = _json_header(data).get("__metadata__", {})
@@ -281,13 +304,17 @@ def _decode(data: bytes) -> ForceModel:
 
 
 def _tensor(name: str, content: dict[str, Any]) -> Array:
+    """Return a tensor as an array. Raises ModelFileError unless its numbers are float64."""
     if content["dtype"] not in ("F64", "float64"):
         raise ModelFileError(f"tensor {name} is {content['dtype']}; needed is F64")
     return np.frombuffer(content["data"], dtype="<f8").reshape(content["shape"])
 
 
 def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return `value` as an unwritable float64 copy; raise `DomainError` on another shape or a number not finite."""
+    """Return `value` as a read-only float64 copy.
+
+    Raises `DomainError` for numbers that are not floating-point, not finite or beyond `LARGEST`, and for another shape.
+    """
     source = np.asarray(value)
     require_that(source.dtype.kind == "f", name, source.dtype, "floating-point numbers")
     array = source.astype(np.float64)
@@ -315,6 +342,7 @@ def _header(metadata: ModelMetadata) -> dict[str, str]:
 
 
 def _checksum(header: dict[str, str], tensors: dict[str, Array]) -> str:
+    """Return the SHA-256 of header and tensors, as hexadecimal digits; their order does not matter."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -329,7 +357,7 @@ def _json_header(data: bytes) -> dict[str, dict[str, Any]]:
 
 
 def _canonical(data: bytes) -> bytes:
-    """Return safetensors bytes with the header's keys sorted: the library writes its metadata in random order."""
+    """Return safetensors bytes with the header's keys sorted: the library writes them in random order."""
     (length,) = struct.unpack_from("<Q", data)
     header = json.dumps(_json_header(data), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)

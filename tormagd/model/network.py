@@ -33,7 +33,7 @@ class ForceNetwork(nn.Module):
         def uniform(*shape: int) -> Tensor:
             return 2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1
 
-        # A feature with gain 0 never reaches the units: its weights stay 0, and it does not count as a dimension.
+        # A feature with gain 0 never reaches the hidden units: its weights stay 0, and it is no dimension to cover.
         # The 2 turns the rule, made for tanh, into one for the sigmoid.
         varying = (self.input_gain != 0).to(torch.float64)
         reach = 2 * 0.7 * hidden ** (1 / max(int(varying.sum()), 1))
@@ -63,7 +63,10 @@ class ForceNetwork(nn.Module):
 
 
 def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
-    """Freeze `network` into the form that is saved and used. Raises `DomainError` when `metadata` does not fit it."""
+    """Copy the weights of `network` into a model, to be saved and used.
+
+    Raises `DomainError` when `metadata` does not fit them, or a weight is not finite.
+    """
     return ForceModel(
         metadata=metadata,
         hidden_weight=network.hidden_weight.detach().double().numpy(),
@@ -74,7 +77,7 @@ def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
 
 
 def to_network(model: ForceModel) -> ForceNetwork:
-    """Return the float64 network of `model`, for further training or as an oracle."""
+    """Return a float64 network with the weights of `model`, for further training or as a reference."""
     network = ForceNetwork(model.metadata.scaling, model.metadata.hidden)
     with torch.no_grad():
         network.hidden_weight.copy_(torch.tensor(model.hidden_weight))

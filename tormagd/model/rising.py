@@ -9,8 +9,11 @@ from tormagd.model.model_file import ForceModel
 def falling_at(
     model: ForceModel, fields_mT: tuple[float, float], displacement_mm: float, points: int = 33
 ) -> float | None:
-    """The first rate, mm/s, of a grid over the rates seen in training at which the force at this displacement does not
-    rise with the field, somewhere between two fields; None where it rises everywhere."""
+    """Return a rate of the handle, mm/s, at which the model's force does not rise with the field everywhere.
+
+    Looked at are `points` rates over those seen in training, the least first, and as many fields between the two
+    `fields_mT`, at one displacement and the least share of iron. None where the force rises at all of them.
+    """
     _, (slowest, fastest), _, (cip_percent, _) = model.feature_ranges
     fields = np.linspace(*fields_mT, points)
     for rate_mm_s in np.linspace(slowest, fastest, points).tolist():

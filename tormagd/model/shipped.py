@@ -6,13 +6,16 @@ from pathlib import Path
 from tormagd.named_file import named, shipped
 
 AUTO = "auto"
-"The shipped model of the insert that is fitted: one of its own, or that of all inserts of its matrix."
+"In a scene, the shipped model for its insert: the insert's own, or that of all inserts of its matrix."
 _FOLDER, _ENDING = resources.files(__package__) / "models", ".safetensors"
 
 
 def model_path(name_or_path: str, beside: Path, insert: str = "") -> Path:
-    """The file of a shipped model's name, or a path, relative to `beside`; of AUTO, that of the `insert`. Raises
-    ConfigError naming the shipped."""
+    """Return the path of a model file: a shipped one by its name, else a path relative to `beside`.
+
+    AUTO stands for the shipped model of `insert`, or of all inserts of its matrix. Raises ConfigError, naming the
+    shipped models, where there is no such file.
+    """
     if name_or_path == AUTO:
         own = f"torque_{insert.lower().replace('-', '_')}"
         name_or_path = own if own in shipped(_FOLDER, _ENDING) else own.rpartition("_")[0]
