@@ -47,12 +47,12 @@ _SCALAR = SimpleNamespace(
 
 
 def functions(value: Any) -> SimpleNamespace | ModuleType:
-    """The elementary functions that fit the value's type."""
+    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for an array."""
     return _SCALAR if isinstance(value, float | int) else np
 
 
 class BrakeCurve(NamedTuple):
-    """The curve of one wall ratio and body-force weight; all arguments and results dimensionless, unchecked."""
+    """The brake curve of one wall ratio and body-force weight. Arguments and results are dimensionless, unchecked."""
 
     wall: float
     a: float
@@ -60,25 +60,25 @@ class BrakeCurve(NamedTuple):
 
     @classmethod
     def of(cls, wall: float, body_force: float) -> "BrakeCurve":
-        """From w = (R_o - R_i) / R_i > 0 and tau = t (mu_r - 1) >= 0."""
+        """Return the curve for w = (R_o - R_i) / R_i > 0 and tau = t (mu_r - 1) >= 0."""
         return cls(wall, 1.0 - 0.5 * wall * body_force, wall * (1.0 + 1.5 * body_force))
 
     def compression(self, load: Real) -> Real:
-        """eps = 1 - lambda1 at the load y >= 0."""
+        """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq. 29)."""
         fn = functions(load)
         p = 1.0 - self.a * load
         larger = fn.sqrt(p * p + 2.0 * self.b * load) + abs(p)
-        # a thin wall under a high load has p < 0, where the plain difference is the one that does not cancel
+        # a thin wall under a high load has p < 0, where the plain difference r - p does not cancel
         compression: Real = fn.where(p < 0.0, larger, 2.0 * self.b * load / larger)
         return compression
 
     def load(self, compression: Real) -> Real:
-        """The load y that compresses by eps: inverse of `compression`."""
+        """Return the load y that compresses by eps: the inverse of `compression`."""
         load: Real = 0.5 * compression * (2.0 + compression) / (self.b + self.a * compression)
         return load
 
     def force(self, compression: Real, load: Real) -> Real:
-        """phi at a load and the compression it gives."""
+        """Return the force phi at a load and the compression that it gives (Eq. 33, 34)."""
         fn = functions(load)
         stretch = 1.0 - compression
         elastic: Real = fn.expm1(-4.0 * fn.log1p(-compression))

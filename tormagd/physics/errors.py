@@ -11,7 +11,7 @@ Real = TypeVar("Real", float, FloatArray)
 
 
 class DomainError(ValueError):
-    """A value outside the range in which the model holds: names the variable, the value and what is allowed."""
+    """A value outside the range in which a model holds. The text names the variable, the value and what is allowed."""
 
     def __init__(self, variable: str, value: object, allowed: str) -> None:
         super().__init__(f"{variable} = {value} is not allowed: {allowed}")
@@ -25,13 +25,16 @@ class DomainError(ValueError):
 
 
 def require_that(condition: bool, variable: str, value: object, allowed: str) -> None:
-    """Raise `DomainError` unless the condition holds."""
+    """Raise `DomainError` for `variable` unless `condition` is true."""
     if not condition:
         raise DomainError(variable, value, allowed)
 
 
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:
-    """Raise `DomainError` unless every element of `value` is a number in [low, high]; NaN never is."""
+    """Raise `DomainError` unless `value`, or every element of it, is in [low, high]; NaN never is.
+
+    Also for an array that is not of float32 or float64.
+    """
     if isinstance(value, float | int):
         if low <= value <= high:
             return

@@ -1,9 +1,9 @@
 """Field laws: the radial moment of the magnets' field as a function of their gap.
 
 The field in the elastomer is taken as radial, b = (mu_r / 4) a / R (thesis Eq. 6 and 8). The *radial moment* a, in
-T m, carries the whole dependence on the gap; the factor mu_r / 4 is left out of it, so that one law serves every
-insert. Reading b as independent of mu_r, as Eq. 6 literally says, would make the weakly filled inserts the strongest,
-which is the opposite of what table 2.4 measured.
+T m, carries the whole dependence on the gap. The factor mu_r / 4 is left out of a, so that one law serves every
+insert. With b independent of mu_r, as Eq. 6 literally says, the weakly filled inserts would be the strongest: table
+2.4 measured the opposite.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,10 @@ REFERENCE_PERMEABILITY = 4.0
 """Relative permeability at which both field laws were fitted: b = (mu_r / 4) a / R."""
 
 PAD_RADIUS_M = 8.55e-3
-"""The mean field in a tactile pad between the magnets is that of a / R here: 365 mT, the greatest that the thesis
-states, at the least gap by the power law. How it falls over the gap is then the law's, which is an assumption."""
+"""Radius R at which a / R is taken for the mean field in a tactile pad between the magnets.
+
+By the power law it gives 365 mT at the least gap, the greatest field that the thesis states. That the pad's field falls
+over the gap as the law does is an assumption."""
 
 _TM_PER_MT_MM = 1e-6
 _EQ7_C1, _EQ7_C2, _EQ7_P = 1.206, 1256.0, 1.867
@@ -25,10 +27,10 @@ _EQ7_MIN_MM, _EQ7_MAX_MM = 45.0, 95.0
 
 @dataclass(frozen=True, slots=True)
 class ThesisFieldLaw:
-    """Thesis Eq. 7: a = c1 (95 - gap)^p + c2, in mT mm, on 45..95 mm.
+    """The field law of the thesis's Eq. 7: a = c1 (95 - gap)^p + c2, in mT mm, on 45..95 mm. A `FieldLaw`.
 
-    The printed equation carries no unit; mT mm is the one that gives the measured field ("up to 800 mT"). It must not
-    be stretched beyond 95 mm: a larger s_max in Eq. 7 raises the field at *every* gap.
+    The printed equation carries no unit; mT mm gives the measured field ("up to 800 mT"). It must not be stretched
+    beyond 95 mm: a larger s_max in Eq. 7 raises the field at *every* gap.
 
     At 95 mm the slope is zero, so the inverse loses half of its digits there.
     """
@@ -37,26 +39,29 @@ class ThesisFieldLaw:
     "Smallest and largest gap for which the law holds, mm."
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
+        """Return the radial moment at a gap, T m."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return _TM_PER_MT_MM * (_EQ7_C1 * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P) + _EQ7_C2)
 
     def gap_mm(self, radial_moment_Tm: Real) -> Real:
+        """Return the gap that gives a radial moment, mm."""
         _require_moment(radial_moment_Tm, self)
         # abs(): the weakest moment itself, times 1e6, may round to just under c2
         excess = abs(radial_moment_Tm / _TM_PER_MT_MM - _EQ7_C2)
         return _EQ7_MAX_MM - _power(excess / _EQ7_C1, 1.0 / _EQ7_P)
 
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
+        """Return the slope of the radial moment at a gap, T m / mm, negative."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return -_TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class PowerFieldLaw:
-    """Power law of the thesis's appendix: a = coefficient * gap^exponent, T m with the gap in mm.
+    """The power law of the thesis's appendix: a = coefficient * gap^exponent, T m with the gap in mm. A `FieldLaw`.
 
-    It agrees with Eq. 7 within about 10% on 45..95 mm, and is the one to use beyond. It is accepted from 1 mm, under
-    which its pole at zero takes over, to 10 m.
+    It agrees with Eq. 7 within about 10% on 45..95 mm, and serves beyond. Gaps are accepted from 1 mm, under which the
+    pole at zero takes over, to 10 m.
     Raises `DomainError` unless 1e-6 <= coefficient <= 1e3 and -6 <= exponent <= -0.1.
     """
 
@@ -69,14 +74,17 @@ class PowerFieldLaw:
         require("exponent", self.exponent, -6.0, -0.1)
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
+        """Return the radial moment at a gap, T m."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * _power(gap_mm, self.exponent)
 
     def gap_mm(self, radial_moment_Tm: Real) -> Real:
+        """Return the gap that gives a radial moment, mm."""
         _require_moment(radial_moment_Tm, self)
         return _power(radial_moment_Tm / self.coefficient, 1.0 / self.exponent)
 
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
+        """Return the slope of the radial moment at a gap, T m / mm, negative."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * self.exponent * _power(gap_mm, self.exponent - 1.0)
 
@@ -84,13 +92,16 @@ class PowerFieldLaw:
 FieldLaw: TypeAlias = ThesisFieldLaw | PowerFieldLaw
 """A strictly falling map from gap (mm) to radial moment (T m), with its inverse and slope.
 
-Every method takes a float or an array, returns the same kind and shape, and raises `DomainError` for a gap outside
+Every method takes a float or an array and returns the same kind and shape. It raises `DomainError` for a gap outside
 `gap_range_mm`, or a radial moment that no gap in that range gives.
 """
 
 
 def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_m: float) -> Real:
-    """Radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq. 6 with the permeability of Eq. 8)."""
+    """Return the radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq. 6 with Eq. 8's permeability).
+
+    Raises `DomainError` unless 0 <= a <= 1e6 T m, 1 <= mu_r <= 1000 and 10 um <= R <= 1 m.
+    """
     require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e6)
     require("relative_permeability", relative_permeability, 1.0, 1e3)
     require("radius_m", radius_m, 1e-5, 1.0)
@@ -98,6 +109,7 @@ def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_
 
 
 def _require_moment(radial_moment_Tm: Real, law: FieldLaw) -> None:
+    """Raise `DomainError` for a radial moment that no gap in the law's range gives."""
     nearest_mm, farthest_mm = law.gap_range_mm
     weakest_Tm, strongest_Tm = law.radial_moment_Tm(farthest_mm), law.radial_moment_Tm(nearest_mm)
     require("radial_moment_Tm", radial_moment_Tm, weakest_Tm, strongest_Tm)

@@ -1,16 +1,16 @@
 """The magnetoelastic brake force: from the radial moment of the field to the friction force at the roller.
 
-This is the thesis's chain (Eq. 29..34, with Gamma_1 and Gamma_2 as its appendix has them) with units; the dimensionless
-curve it reduces to, and why it is written so, is in `tormagd.physics.brake_curve`:
+This is the thesis's chain (Eq. 29..34, with Gamma_1 and Gamma_2 as its appendix has them) with units. The dimensionless
+curve under it, and why it is written so, is in `tormagd.physics.brake_curve`:
 
     y = (mu_r a / 4)^2 / (4 mu0 mu_r G0 R_o R_i)                   magnetic over elastic stress
     F = 2 pi t R_i^2 mu_d G0 / R_w * curve(y)                      Eq. 33 and 34
 
-The radial moment a (`radial_moment_Tm`) is that of `tormagd.physics.field`, without mu_r / 4. F rises strictly with it,
+The radial moment a (`radial_moment_Tm`) is that of `tormagd.physics.field`, without mu_r / 4. F rises strictly with a,
 so the inverse is unique; `tormagd.lab.design.force_law` has it. The model is used for a stretch lambda1 >= 0.05 only.
 
-Every function takes a float (and returns one; about ten times faster), or an array of float32 or float64 whose shape
-and type the result keeps. All raise `DomainError` for NaN and for values outside the stated domain.
+Every function takes a float and returns one, about ten times faster, or takes an array of float32 or float64 whose
+shape and type the result keeps. All raise `DomainError` for NaN and for values outside the stated domain.
 """
 
 import math
@@ -70,19 +70,25 @@ class Elastomer:
 
 
 def max_radial_moment_Tm(elastomer: Elastomer, geometry: Geometry) -> float:
-    """Largest admissible radial moment, T m: the one that compresses the elastomer to lambda1 = 0.05."""
+    """Return the largest admissible radial moment, T m: it compresses the elastomer to lambda1 = 0.05."""
     return reduced(elastomer, geometry).max_moment_Tm
 
 
 def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34)."""
+    """Return the kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34).
+
+    Raises `DomainError` unless the radial moment is from 0 to `max_radial_moment_Tm`.
+    """
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return law.force(radial_moment_Tm)
 
 
 class Reduced(NamedTuple):
-    """One elastomer in one geometry: the dimensionless curve and the two scales that give it units."""
+    """The force law of one elastomer in one geometry: the dimensionless curve and the two scales that give it units.
+
+    Nothing is checked here.
+    """
 
     curve: BrakeCurve
     load_root_per_Tm: float
@@ -90,17 +96,19 @@ class Reduced(NamedTuple):
     max_moment_Tm: float
 
     def load(self, moment_Tm: Real) -> Real:
+        """Return the dimensionless load y at a radial moment."""
         root = self.load_root_per_Tm * moment_Tm
         return root * root
 
     def force(self, moment_Tm: Real) -> Real:
+        """Return the friction force at the roller, N, at a radial moment."""
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
 
 
 @lru_cache(maxsize=64)
 def reduced(elastomer: Elastomer, geometry: Geometry) -> Reduced:
-    """The law of one elastomer in one geometry."""
+    """Return the force law of one elastomer in one geometry. The last 64 are kept, not computed again."""
     g0, mu_r = elastomer.shear_modulus_Pa, elastomer.relative_permeability
     inner, outer, thickness = geometry.inner_radius_m, geometry.outer_radius_m, geometry.thickness_m
     curve = BrakeCurve.of(wall=(outer - inner) / inner, body_force=thickness * (mu_r - 1.0))

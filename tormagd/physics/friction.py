@@ -1,7 +1,7 @@
 """Friction between elastomer and shaft: pre-sliding stiffness, Stribeck level, viscous part.
 
-A LuGre model without micro-damping. Its state is the bristle deflection z, in mm at the roller surface, positive when
-the handle last moved in the positive direction:
+A LuGre model (Canudas de Wit et al. 1995) without micro-damping. Its state is the bristle deflection z, in mm at the
+roller surface, positive when the handle last moved in the positive direction:
 
     dz/dt = v - sigma0 |v| z / g(v)              g(v) = F_kinetic (1 + (ratio - 1) exp(-(v / v_s)^2))
     F     = sigma0 z + sigma2 v
@@ -38,16 +38,16 @@ class Friction(Value):
         self.stribeck_speed_mm_s: Final = stribeck_speed_mm_s
 
     def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
-        """Steady level g(v) of the dry part at that speed, N."""
+        """Return the steady level g(v) of the dry part at a speed, N."""
         ratio = speed_mm_s / self.stribeck_speed_mm_s
         return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))
 
     def advance(self, deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> tuple[float, float]:
-        """One step at constant speed and level: (force_N, deflection_mm) at its end.
+        """Return force, N, and deflection, mm, at the end of a step of `dt_s` at constant speed and kinetic level.
 
-        Exact in z for any dt. A deflection above what the level now carries (the field fell) slips back to that
+        Exact in z for any `dt_s`. A deflection above what the level now carries (the field fell) slips back to that
         level first, so the dry force never exceeds g(v). Passive: z moves with v, so the returned force times the
-        step's displacement is at least the exact work, and sigma0 z^2 / 2 is all that the hand can get back.
+        step's displacement is at least the exact work. The hand gets back sigma0 z^2 / 2 at most.
         """
         viscous_N = self.viscous_N_s_mm * speed_mm_s
         reach_mm = self.level_N(speed_mm_s, kinetic_N) / self.presliding_stiffness_N_mm

@@ -25,13 +25,19 @@ _Force = Annotated[float, Meta(ge=0.0, le=1e3)]
 
 
 def relative_permeability(cip_fraction: float) -> float:
-    """Relative permeability mu_r over the CIP volume fraction, 0.10..0.40 (Eq. 5); `DomainError` outside."""
+    """Return the relative permeability mu_r at a CIP volume fraction (Eq. 5).
+
+    Raises `DomainError` for a fraction outside 0.10..0.40.
+    """
     require("cip_fraction", cip_fraction, 0.10, 0.40)
     return 2.0 + 2.0 * (cip_fraction - 0.10) / 0.30
 
 
 class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
-    """Force at 45 mm less force at 95 mm, N: measured mean and deviation, and the estimate made beforehand, if any."""
+    """The force at a gap of 45 mm less that at 95 mm, N: mean and deviation as measured, and the thesis's estimate.
+
+    `estimate_N` is None for inserts that are not the thesis's.
+    """
 
     measured_N: Annotated[float, Meta(ge=1e-6, le=1e3)]
     deviation_N: _Force
@@ -39,7 +45,7 @@ class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def thesis_estimate_N(self) -> float:
-        """The estimate; `DomainError` if there is none, as for inserts that are not the thesis's."""
+        """The thesis's estimate, N. Raises `DomainError` where there is none."""
         if self.estimate_N is None:
             raise DomainError("estimate_N", None, "stated for the thesis's inserts only")
         return self.estimate_N
@@ -55,7 +61,11 @@ class Matrix(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Insert(Struct, frozen=True, forbid_unknown_fields=True):
-    """One fabricated insert. Fractions are of volume; the shear modulus is without field."""
+    """One fabricated insert. Fractions are of volume; the shear modulus is without field.
+
+    None for friction stands for the matrix's, for permeability for that of Eq. 5; `measured` is None where the force
+    range has not been measured.
+    """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
     shore_hardness: _Hardness
@@ -69,7 +79,11 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def elastomer(self) -> Elastomer:
-        """Modulus, permeability and friction; of these, Eq. 5 and the matrix tell what the insert does not state."""
+        """Shear modulus, permeability and friction of the insert.
+
+        What the insert does not state comes from Eq. 5 and from its matrix. Raises `DomainError` outside Eq. 5's range
+        and `Elastomer`'s, KeyError where the friction is needed from a matrix that is not in `MATRICES`.
+        """
         mu_r, friction = self.relative_permeability, self.friction_coefficient
         return Elastomer(
             self.shear_modulus_Pa,
@@ -79,19 +93,22 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def shear_modulus_Pa(self) -> float:
-        """G0, Pa."""
+        """Shear modulus G0 without field, Pa."""
         return self.shear_modulus_kPa * 1e3
 
     @property
     def force_range(self) -> MeasuredForceRange:
-        """The measured range; `DomainError` for an insert that has not been measured."""
+        """The measured force range. Raises `DomainError` for an insert that has not been measured."""
         if self.measured is None:
             raise DomainError("insert", repr(self.name), "one whose force range has been measured")
         return self.measured
 
     @property
     def masses_g(self) -> dict[str, float]:
-        """Mass in 100 cc of each content, g: matrix, cip, slacker, thinner; the matrix is what the others leave."""
+        """Mass of each content in 100 cc, g: matrix, cip, slacker, thinner. The matrix fills what the others leave.
+
+        Raises KeyError where the insert's matrix is not in `MATRICES`.
+        """
         matrix_fraction = 1.0 - self.cip_fraction - self.slacker_fraction - self.thinner_fraction
         return {
             "matrix": 100.0 * matrix_fraction * MATRICES[self.shore_hardness].density_g_cc,
@@ -112,6 +129,6 @@ INSERTS = {item.name: item for item in _FILE.insert}
 
 
 def insert(name: str) -> Insert:
-    """The insert of that name, such as "MRE-50-40"; `DomainError` listing the names if there is none."""
+    """Return an insert by its name, such as "MRE-50-40". Raises `DomainError` listing the names if there is none."""
     require_that(name in INSERTS, "insert", repr(name), "one of " + ", ".join(INSERTS))
     return INSERTS[name]

@@ -2,8 +2,8 @@
 
 Closed form for two parallel, uniformly magnetised cuboids (G. Akoun and J.-P. Yonnet, "3D analytical calculation of the
 forces exerted between two cuboidal magnets", IEEE Trans. Magn. 20 (1984) 1962-1964), for identical, coaxial blocks. On
-the axis the 64 corner terms fold to 12, and the logarithms ln(r - U) become inverse hyperbolic sines: their even part
-cancels over the pair of corners at U and -U, and what is left has no difference of nearly equal numbers.
+the axis the 64 corner terms fold to 12. The logarithms ln(r - U) become inverse hyperbolic sines: their even part
+cancels over the pair of corners at U and -U. What is left has no difference of nearly equal numbers.
 
 Free space is assumed: the iron shaft and the elastomer between the magnets are left out.
 """
@@ -41,10 +41,11 @@ class CuboidMagnet:
 
 
 def attraction_N(gap_mm: Real, magnet: CuboidMagnet) -> Real:
-    """Attraction between two identical coaxial blocks at a face-to-face gap, N, >= 0; float or array, kind kept.
+    """Return the attraction between two identical coaxial blocks at a face-to-face gap, N, >= 0.
 
-    Raises `DomainError` unless the gap is from 0.01 mm to 50 times the shortest edge. The force falls with gap^-4 while
-    the corner terms grow: for a 40 x 40 x 20 mm block the relative error is 1e-12 up to 100 mm and 1e-6 at 1000 mm.
+    A float gives a float, an array one of its shape and type. Raises `DomainError` unless the gap is from 0.01 mm to 50
+    times the shortest edge. The force falls with gap^-4 while the corner terms grow: for a 40 x 40 x 20 mm block the
+    relative error is 1e-12 up to 100 mm and 1e-6 at 1000 mm.
     """
     edges_m = (magnet.width_m, magnet.depth_m, magnet.thickness_m)
     require("gap_mm", gap_mm, MIN_GAP_MM, MAX_GAP_PER_EDGE * min(edges_m) * 1e3)

@@ -3,8 +3,8 @@
     F = (1 - sum g_i) F0 + sum g_i h_i           dh_i/dt = dF0/dt - h_i / tau_i
 
 F0 is the force the elastomer would give without memory. After a step F0 the force starts at F0 and relaxes to
-(1 - sum g_i) F0. After a long rest at a high F0, a fall to a low one undershoots and can leave F below zero: contact is
-then lost, and it is the caller who says that a brake's level is not negative.
+(1 - sum g_i) F0. After a long rest at a high F0, a fall to a low F0 undershoots and can leave F below zero. Contact is
+then lost: the caller has to bound a brake's level at zero.
 """
 
 import math
@@ -22,7 +22,10 @@ MAX_STEP_S: Final = 1e9
 
 @final
 class PronyStep(Value):
-    """The exact update of a `PronySeries` over one step length, for a driving force linear over the step."""
+    """The exact update of a `PronySeries` over one length of step, for a driving force that is linear in the step.
+
+    `decays` are exp(-dt / tau_i), `gains` their means over the step.
+    """
 
     __match_args__ = ("fractions", "decays", "gains")
 
@@ -36,9 +39,9 @@ class PronyStep(Value):
         self.gains: Final = gains
 
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
-        """(force_N, next state) at the end of the step, at which the driving force is `driving_N`.
+        """Return the force, N, and the state at the end of a step; `driving_N` is the driving force there.
 
-        Raises `DomainError` if `driving_N` is not finite or the state does not fit the series.
+        Raises `DomainError` if `driving_N` is not finite or beyond MAX_FORCE_N, or the state has another length.
         """
         if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
             require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
@@ -54,13 +57,16 @@ class PronyStep(Value):
         return force_N, tuple(following)
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
-        """The same step of a series of the same times with other fractions."""
+        """Return the step, of equal length, of a series with equal times and other fractions."""
         return PronyStep(fractions, self.decays, self.gains)
 
 
 @final
 class PronySeries(Value):
-    """Relaxing fractions g_i (each >= 0, sum < 1) and their time constants tau_i, s; raises `DomainError` otherwise."""
+    """Relaxing fractions g_i (0..1, sum < 1), each with its time constant tau_i, 1e-6..1e9 s.
+
+    Raises `DomainError` for others.
+    """
 
     def __init__(self, fractions: tuple[float, ...], times_s: tuple[float, ...]) -> None:
         if len(fractions) != len(times_s):
@@ -75,13 +81,19 @@ class PronySeries(Value):
         self.times_s: Final = times_s
 
     def relaxed(self, driving_N: float) -> PronyState:
-        """State after an endless rest at that driving force; at 0 N, the state of an element never loaded."""
+        """Return the state after an endless rest at a driving force; at 0 N, of an element that was never loaded.
+
+        Raises `DomainError` if `driving_N` is not finite or beyond MAX_FORCE_N.
+        """
         require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         return (driving_N, *[0.0 for _ in self.fractions])
 
     def discretise(self, dt_s: float) -> PronyStep:
-        """The update for steps of `dt_s` (0 is a jump of the driving force); keep it where the step is constant."""
-        if not 0.0 <= dt_s <= MAX_STEP_S:  # here already: it stands in every plan
+        """Return the update for steps of `dt_s`; 0 is a jump of the driving force. Keep it where the step is constant.
+
+        Raises `DomainError` unless 0 <= dt_s <= MAX_STEP_S.
+        """
+        if not 0.0 <= dt_s <= MAX_STEP_S:  # spares every plan the call of `require`
             require("dt_s", dt_s, 0.0, MAX_STEP_S)
         ratios = [dt_s / time_s for time_s in self.times_s]
         return PronyStep(
