@@ -1,4 +1,4 @@
-"""Two kinds of codes. A *fault* is latched and needs an explicit clear. A *limit* says: running, but held back by."""
+"""Faults and limits by their codes. A *fault* is latched and needs a clear. A *limit* says: running, but held back."""
 
 from enum import StrEnum
 from typing import NamedTuple
@@ -7,7 +7,7 @@ from firmware_protocol.codec import DeviceFault
 
 
 class Reaction(StrEnum):
-    """How it ends: what is safe in view of a code."""
+    """The safe reaction to a fault or limit."""
 
     OPENING = "opening"
     "The gap opens at a bounded speed, and the drives go off there."
@@ -18,39 +18,39 @@ class Reaction(StrEnum):
 
 
 class Position(StrEnum):
-    """What is known of the carriages' places afterwards."""
+    """What is known of the carriages' positions after a fault."""
 
     KEPT = "kept"
     LOST_HERE = "lost"
-    "Not what the encoders say. The device does not know, and goes on calling itself homed."
+    "An encoder's counts are wrong. The device does not know, and goes on calling itself homed."
     LOST_THERE = "given up by the device"
     "A device that has latched, or was reset, does not call itself homed."
 
 
 class Explanation(NamedTuple):
-    """What a person needs to know about a code, and how soon what is safe is on its way."""
+    """What a person needs to know about a fault or limit, and how soon the safe reaction begins."""
 
     cause: str
     remedy: str
     reaction: Reaction = Reaction.HELD
     safe_ms: float = 100.0
-    "The longest from its being there, and showing, to the beginning of the reaction. 50 ms are the device's timeout."
+    "The longest time from when the cause shows to when the reaction begins. 50 ms of it are the device's timeout."
     shows: str = "at once"
-    "What it takes to be seen: many faults hide from a device at rest."
+    "When the cause shows: many faults hide from a device at rest."
     position: Position = Position.KEPT
 
     @property
     def clears(self) -> str:
-        """What takes a fault with this explanation away, and what is wanted before `enable`."""
+        """The commands that clear a fault with this explanation and allow `enable` again, in words."""
         return "clear-fault" if self.position is Position.KEPT else "clear-fault, then home"
 
 
 class Fault(StrEnum):
-    """Why the device was opened. Latched until `clear-fault`.
+    """Why the gap was opened. A fault is latched until `clear-fault`.
 
-    In the order in which those are named that show at once: what somebody did and what stopped the loop, a motor that
-    goes the wrong way, what the device says of itself, which readings are not to be believed, and last what is
-    concluded from readings: causes before what follows of them.
+    Faults that show together are named in this order, causes before consequences. First comes what somebody did and
+    what stopped the loop, then a motor that goes the wrong way, then the device's own faults. Then come readings that
+    are not believed, and last what is concluded from readings.
     """
 
     STOPPED = "STOPPED"
@@ -87,7 +87,7 @@ class Fault(StrEnum):
 
 
 class Limit(StrEnum):
-    """What holds the rendered force away from the one asked for. Comes and goes by itself."""
+    """What holds the rendered force away from the force asked for. A limit comes and goes by itself."""
 
     NO_SETPOINT = "NO_SETPOINT"
     STALE = "STALE"
@@ -556,7 +556,10 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
-    """The faults that the firmware's bits stand for. With `is_host_stall` it was this process that gave no command."""
+    """Return the faults for the firmware's fault bits.
+
+    With `is_host_stall` the device's command timeout is the fault HOST_STALL: the daemon itself had sent no Drive.
+    """
     found = tuple(fault for bit, fault in _BY_DEVICE_FAULT.items() if bit in bits)
     if not is_host_stall:
         return found

@@ -1,8 +1,8 @@
 """The operating state: armed on purpose, opened on every fault, never re-armed by itself.
 
-Which event leads where, what guards it and what the device is asked then stands in one table, TRANSITIONS, and nothing
-else changes the state. The safe state is *gap open*: friction holds the force when power goes, and the magnets pull
-shut. Opening is the device's own routine, because it must also work when this process is gone. Pure functions.
+One table, TRANSITIONS, says where each event leads, what guards it and what the device is then asked for; nothing else
+changes the state. The safe state is *gap open*: friction holds the force when power goes, and the magnets pull shut.
+Opening is the device's own routine, because it must also work when this process is gone. All functions are pure.
 """
 
 import math
@@ -16,8 +16,7 @@ from tormagd.safety.codes import FAULTS, Fault, Position
 CLEARING_S = 0.5
 "How long the device may take to report that a cleared fault is gone."
 LOST_POSITION = frozenset({fault for fault, row in FAULTS.items() if row.position is Position.LOST_HERE})
-"""After these faults the counts of an encoder are not believed any more. The device does not know, and goes on calling
-itself homed; where it has latched a fault of its own it does not."""
+"""Faults after which an encoder's counts are not believed any more, though the device goes on calling itself homed."""
 
 
 class OperatingState(StrEnum):
@@ -47,7 +46,7 @@ class Event(StrEnum):
 
 
 class DeviceRequest(StrEnum):
-    """What the daemon asks of the firmware, once per request number."""
+    """A routine that the daemon asks the firmware for, once per request number."""
 
     NONE = "none"
     HOME = "home"
@@ -56,7 +55,7 @@ class DeviceRequest(StrEnum):
 
 
 class RefusedError(Exception):
-    """A command that the present state does not allow."""
+    """A command that the present state does not allow. `code` names the reason, `hint` says what to do."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(message)
@@ -65,7 +64,21 @@ class RefusedError(Exception):
 
 @final
 class Conditions(Value):
-    """What the decisions depend on."""
+    """The conditions on which a command is taken or refused.
+
+    connected         the device runs and is measured
+    fresh             its State, Sense and Status are recent
+    homed             the positions of its carriages are known
+    busy              it homes or opens, or was asked to
+    device_latched    it holds a fault of its own
+    requested_N       the force of the newest setpoint; None where none is valid
+    neutral_N         the greatest setpoint at which `enable` is taken
+    sensor_doubted    the force sensor is not believed
+    remedy            what to do about `cause`
+    clock_drift       by which share the device's clock runs fast
+    apart_mm          how far the carriages are apart
+    most_*            the bounds above which `enable` is refused
+    """
 
     def __init__(
         self,
@@ -109,7 +122,8 @@ class Conditions(Value):
 class SafetyState(Value):
     """Operating state, latched faults, and the newest request to the device.
 
-    `needs_homing`: the device's word that it is homed does not count, until it has begun homing and so taken it back.
+    `clearing_until_s`: until then the device may still report a fault that was cleared. `needs_homing`: a fault took
+    the positions away; the device's HOMED does not count until the device has dropped it, as it does when it homes.
     """
 
     def __init__(
@@ -130,16 +144,16 @@ class SafetyState(Value):
 
     @property
     def is_driven(self) -> bool:
-        """Whether the device follows the plan, or holds what it followed last."""
+        """Tell whether the device is driven: it follows the plan (ENABLED) or holds its gap (PAUSED)."""
         return self.operating_state is OperatingState.ENABLED or self.operating_state is OperatingState.PAUSED
 
     def ask(self, request: DeviceRequest) -> "SafetyState":
-        """The same state with a new request to the device."""
+        """Return this state with a new request to the device, under the next request number."""
         return self.replaced(request=request, request_number=self.request_number + 1)
 
 
 Refuses = Callable[[SafetyState, Conditions], str]
-"""Of a guard: what is wrong, in a sentence with the figures; empty where nothing is."""
+"""The check of a guard. It returns what is wrong, in a sentence with the figures; empty where nothing is."""
 
 
 class Guard(NamedTuple):
@@ -147,7 +161,7 @@ class Guard(NamedTuple):
 
     code: str
     wants: str
-    "What has to be so, for the page of the table."
+    "The condition in words, for docs/states.md."
     refuses: Refuses
     remedy: str
 
@@ -159,15 +173,15 @@ class Transition(NamedTuple):
     source: OperatingState
     target: OperatingState
     reason: str
-    "What the log says of it."
+    "What the transition means, for the log."
     guards: tuple[Guard, ...] = ()
     "In the order in which they are asked; the first that does not hold is told."
     request: DeviceRequest = DeviceRequest.NONE
-    "What the device is asked for. CLEAR is asked only of a device that has latched something."
+    "What the device is asked for. CLEAR is asked only of a device that has latched a fault."
 
 
 class Refusal(NamedTuple):
-    """The other kind of row: `event` is not taken in `source`."""
+    """A row of the table for an `event` that is refused in `source`, with `code`."""
 
     event: Event
     source: OperatingState
@@ -216,6 +230,7 @@ def _apart(state: SafetyState, present: Conditions) -> str:
 
 
 def _slow(state: SafetyState, present: Conditions) -> str:
+    """Return what is wrong with the round trip to the device; empty where the position loop bears it."""
     if present.round_trip_s <= present.most_round_trip_s:
         return ""
     return (
@@ -270,7 +285,7 @@ READY: tuple[Guard, ...] = (
         "check the firmware's timer and its clock source",
     ),
 )
-"What is wanted before anything is driven."
+"The guards of `enable`: what must hold before anything is driven."
 
 DISABLED: Final = OperatingState.DISABLED
 ENABLED: Final = OperatingState.ENABLED
@@ -311,26 +326,26 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Refusal(Event.HOME, ENABLED, "not_disabled", "tormagctl disable"),
     Refusal(Event.HOME, PAUSED, "not_disabled", "tormagctl disable"),
     Refusal(Event.HOME, FAULTED, "fault", CLEAR_FIRST),
-    # stop is never refused, and needs no device: whatever comes back finds a fault that somebody has to clear
+    # stop is never refused, and needs no device: a device that comes back finds a fault that somebody has to clear
     *[Transition(Event.STOP, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
-    # nothing of ours is latched here; a device may hold what it latched while nobody was there to see it
+    # the daemon has latched nothing here; a device may hold what it latched while nobody was there to see it
     Transition(Event.CLEAR_FAULT, DISABLED, DISABLED, _UNLATCHED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
-    # what the device latches meanwhile is news, and must not be passed over
+    # a fault that the device latches meanwhile is news, and must not be cleared unseen
     Transition(Event.CLEAR_FAULT, ENABLED, ENABLED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
     Transition(Event.CLEAR_FAULT, PAUSED, PAUSED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
     Transition(Event.CLEAR_FAULT, FAULTED, DISABLED, _CLEARED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
     *[Transition(Event.FAULT, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
-"""All there are. A fault that is latched already is no event; `stop` is one as a fault, STOPPED, is."""
+"""All transitions and refusals, by event and state. A fault that is latched already is no event."""
 COMMANDS: tuple[str, ...] = tuple([str(event) for event in Event if event is not Event.FAULT])
 _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
 
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
-    """`state` with `faults` latched and the device asked to open; unchanged where there is nothing new.
+    """Return `state` with `faults` latched and the device asked to open; `state` itself where none of them is new.
 
-    Those that show at once are latched, and so named, in the order of their table, causes before what follows of them.
+    Faults that show together are latched in the order of `Fault`: causes before their consequences.
     """
     if not faults:  # as nearly always, a thousand times a second
         return state
@@ -348,18 +363,25 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
 
 
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
-    """`state` after the device has said whether it is homed; one that says no has begun anew and is believed again."""
+    """Return `state` after the device said whether it is homed: a device that is not homed ends `needs_homing`.
+
+    It has begun to home or was reset, so that its next HOMED is of a new origin.
+    """
     return state if is_homed or not state.needs_homing else state.replaced(needs_homing=False)
 
 
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
-    """The state after an operator's command. Raises RefusedError with code, message and what to do."""
+    """Return the state after an operator's command, with a request to the device where the table has one.
+
+    Raises RefusedError for an unknown command, for one that the table refuses in this state, and for the first of its
+    guards that does not hold. `stop` latches the fault STOPPED.
+    """
     if name not in COMMANDS:
         raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
     event = Event(name)
     row = TRANSITIONS[event, state.operating_state]
     if isinstance(row, Refusal):
-        if not conditions.connected:  # whatever else is in the way, this is first
+        if not conditions.connected:  # a missing device is told first, whatever else is in the way
             _ask(CONNECTED, state, conditions)
         raise RefusedError(row.code, _refused(row, state), row.remedy)
     for guard in row.guards:
@@ -379,8 +401,10 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 
 
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
-    """The commands that lead from `state` to one in which the force follows the setpoint, in their order; none where
-    it does. They are taken once the causes of its faults have gone."""
+    """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED.
+
+    The daemon takes them once the causes of the latched faults have gone.
+    """
     if state.operating_state is ENABLED:
         return ()
     if state.operating_state is PAUSED:
@@ -399,18 +423,25 @@ def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
 
 
 def reason(name: str, source: OperatingState) -> str:
-    """What the log says of a command that was taken in `source`: where it led, and why. Empty where none is taken."""
+    """Return the log's line for a command that was taken in the state `source`: where it led, and why.
+
+    Empty where the table refuses the command there. Raises ValueError for an unknown command.
+    """
     row = TRANSITIONS[Event(name), source]
     return f"{source} to {row.target}: {row.reason}" if isinstance(row, Transition) else ""
 
 
 def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -> SafetyState:
-    """The only place where the operating state changes."""
+    """Return `state` in the operating state `target`, with a new `request` unless it is NONE.
+
+    Nothing else changes the operating state.
+    """
     after = state.replaced(operating_state=target)
     return after if request is DeviceRequest.NONE else after.ask(request)
 
 
 def _ask(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
+    """Raise RefusedError where the guard does not hold; the connection's own remedy replaces CONNECTED's."""
     message = guard.refuses(state, conditions)
     if message:
         is_told_better = guard is CONNECTED and conditions.remedy
@@ -418,6 +449,7 @@ def _ask(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
 
 
 def _refused(row: Refusal, state: SafetyState) -> str:
+    """Return the message of a refusal; in FAULT it names the latched faults."""
     if row.source is FAULTED:
         return f"cannot {row.event} in {row.source}: {', '.join(state.faults)}"
     already = f"already {row.source}"
