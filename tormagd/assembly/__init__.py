@@ -1,1 +1,1 @@
-"""Assembly: the core built for a scene, what commands are decided on, and what is kept of a core."""
+"""Assembly: the core built for a scene, the conditions of commands, and the core's journal, profile and beliefs."""

@@ -1,4 +1,4 @@
-"""All that is believed of the device, as one table for whoever looks: status, `top`, the page."""
+"""What the core believes of the device, as one table for `status`, `top` and the dashboard."""
 
 from tormagd.control.believe.believe import MIN_FORESIGHT
 from tormagd.control.core import Planner, Stepper
@@ -7,8 +7,11 @@ from tormagd_client.messages import BeliefReport
 
 
 def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> dict[str, BeliefReport]:
-    """What is believed at `now_s`, by name: the device's force is `scale` times the model's plus `offset`, at a creep
-    times `low_speed_factor`; docs/messages.md says what each is."""
+    """Return what is believed of the device at `now_s`, by name; docs/messages.md says what each value is.
+
+    The device's force is `scale` times the model's plus `offset`, at a creep times `low_speed_factor`. `terms` are the
+    scene's: a belief about a term that is left out does not act.
+    """
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
     is_ahead = plan.foresight >= MIN_FORESIGHT

@@ -1,6 +1,6 @@
-"""The core put together for one scene, and the refusals where scene, model and configuration do not fit each other.
+"""The core built for one scene, and the refusals where scene, model and configuration do not fit each other.
 
-The daemon, the virtual-time simulation and the tests build it here, so that all of them run the same one.
+The daemon, the virtual-time simulation and the tests build the core here, so that all of them run the same one.
 """
 
 import hashlib
@@ -59,7 +59,7 @@ BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most e
 
 
 class Core(NamedTuple):
-    """What one scene's control needs; nothing in it changes. `planner` and `stepper` begin with it."""
+    """All that control of one scene needs, immutable. `planner` and `stepper` make the parts that keep state."""
 
     config: Config
     "With the scene's own gap speed."
@@ -76,28 +76,29 @@ class Core(NamedTuple):
 
     @property
     def gap_speed_mm_s(self) -> float:
-        """The fastest that the gap is moved."""
+        """The fastest that the gap is moved, mm/s: the scene's gap speed where that is below the configured one."""
         return self.config.position.gap_speed_mm_s
 
     @property
     def portrait(self) -> Portrait:
-        """Force over gap, of the nominal device without memory."""
+        """The force over the gap of the nominal device, without memory."""
         return self.element.portrait
 
     def planner(self, now_s: float = 0.0) -> Planner:
-        """Planning that begins at `now_s`: gap open, nothing known of the device."""
+        """Return a planner that begins at `now_s`, with the gap open and nothing known of the device."""
         return Planner(self.config, self.scene, self.element, now_s)
 
     def stepper(self, now_s: float = 0.0) -> Stepper:
-        """Steps that begin at `now_s`: disabled."""
+        """Return a stepper that begins at `now_s`, DISABLED."""
         return Stepper(self.config, self.scene, now_s)
 
 
 def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
-    """The core for `config.scene`. Raises ConfigError where scene, model and configuration do not fit each other.
+    """Build the core for `config.scene`; reads the scene's file and its model's.
 
-    A given `scene` takes the place of the one in the file; its files are beside that one, or its model in the folder
-    `models`: then it has been checked, and its signal is not looked for.
+    `scene` replaces the scene in the file; None reads the file. `models` is the folder of the scene's model; None takes
+    the folder of the scene's file. With `models` given the scene's signal is not checked: it was before. Raises
+    ConfigError where scene, model and configuration do not fit each other, or a file is refused.
     """
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
@@ -124,7 +125,10 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
-    """The scene's element as the model has it, and how its field is searched for."""
+    """Return the scene's element as the model describes it, and the search for its field.
+
+    Raises DomainError where the model does not fit the scene's insert and gaps, or the search does not fit the model.
+    """
     terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
     require("insert.name, cip_percent", cip_percent, *model.feature_ranges[FEATURES.index("cip_percent")])
@@ -141,7 +145,10 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
 
 
 def sources_hash() -> str:
-    """SHA-256 of the sources that decide: all that `plan` and `step` run. Both builds of them have the same."""
+    """Return the SHA-256 of all sources that `plan` and `step` run; the compiled build gives the same.
+
+    Reads the files of the rooms in SOURCES.
+    """
     root, digest = Path(__file__).parents[2], hashlib.sha256()
     for room in SOURCES:
         for path in sorted((root / room).glob("**/*.py")):
@@ -151,25 +158,34 @@ def sources_hash() -> str:
 
 
 def platform_name() -> str:
-    """What else the bits of a result depend on: the processor's kind, Python and NumPy."""
+    """Return what else the bits of a result depend on, in words: the processor's kind, Python and NumPy."""
     return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
 def _brake(scene: Scene) -> tuple[Contact, FieldOfGap, float]:
-    """How the brake is touched, the field in its elastomer over the gap, and how much of that is iron, percent."""
+    """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent.
+
+    Raises DomainError for an unknown insert.
+    """
     fitted = insert(scene.insert.name)
     permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
     return Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction
 
 
 def _pad(finger: Finger, model: ForceModel) -> tuple[Contact, FieldOfGap, float]:
-    """The same of a pad."""
+    """Return a tactile pad's contact, the mean field in the pad over the gap, and its share of iron, percent.
+
+    The share of iron is the least that the model was trained on.
+    """
     *_, (cip_percent, _) = model.feature_ranges
     return Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
 
 
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
-    """The force law beside the brake's model; of a pad none is printed that could judge one."""
+    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`, to hold the model against.
+
+    Raises DomainError where the law does not hold for the gaps. The thesis prints no law for a pad.
+    """
     fitted, metres = scene.insert, 1e-3
     geometry = Geometry(
         fitted.inner_radius_mm * metres,
@@ -183,8 +199,11 @@ def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
 def _known_fields_mT(
     scene: Scene, model: ForceModel, contact: Contact, field: FieldOfGap
 ) -> tuple[tuple[float, float], bool]:
-    """The fields of the scene's gaps, as far as the model knows them; and whether it knows that they give more force
-    however the element is touched. Where it is touched as the portrait is, they have to."""
+    """Return the range of fields, mT, that the scene's gaps give and the model knows, and whether its force rises.
+
+    False: it may fall somewhere when a pad is pressed to another depth than the portrait's. Raises DomainError where no
+    such range is left, and where the force falls at the portrait's depth or displacement.
+    """
     low_mT, high_mT = model.field_range_mT
     low_mT = max(low_mT, field.field_mT(scene.insert.gap_open_mm))
     high_mT = min(high_mT, field.field_mT(scene.insert.gap_closed_mm))
@@ -205,6 +224,7 @@ def _known_fields_mT(
 
 
 def _refuse_unstable(config: Config) -> Margins:
+    """Return the position loop's stability margins. Raises ConfigError where one of them is too small."""
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
     if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
         raise ConfigError(
@@ -216,6 +236,7 @@ def _refuse_unstable(config: Config) -> Margins:
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
+    """Raise ConfigError where half of the allowed voltage cannot open the scene's closed gap against the magnets."""
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
     needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
     most_V = config.position.duty_limit * motor.supply_V / 2.0
@@ -227,6 +248,10 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
 
 
 def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
+    """Raise ConfigError where the gaps do not reach the scene's greatest force, or its standby force is not allowed.
+
+    Standby has to be above the open gap's force, by STANDBY_N at most, and not above the scene's greatest force.
+    """
     # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
     between = f"allowed is {reach.min_N:.2f}..{reach.max_N:.2f}, what model {scene.insert.model} gives in these gaps"
     if not reach.min_N < scene.force.most_N <= reach.max_N:
@@ -240,7 +265,10 @@ def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:
-    """The configuration with the rates that the scene needs, where `rates.of_scene` says so. Raises ConfigError."""
+    """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`.
+
+    Raises ConfigError for rates that a configuration may not have.
+    """
     if not config.rates.of_scene:
         return config
     needed = scene.bandwidth
@@ -253,7 +281,7 @@ def at_rates_of(scene: Scene, config: Config) -> Config:
 
 
 def _slowed(config: Config, scene: Scene) -> Config:
-    """The configuration with the scene's gap speed, where that is the lower one."""
+    """Return the configuration with the scene's gap speed; `config` itself unless the scene's is lower."""
     position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
     if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
         return config
@@ -261,8 +289,11 @@ def _slowed(config: Config, scene: Scene) -> Config:
 
 
 def approaches_s(core: Core) -> list[tuple[float, float]]:
-    """What a brake may wait at, N, and how long its gap takes from there to the middle of the scene's forces, s: where
-    the scene lets it wait, and with STANDBY_N in three steps. Of a pad there is nothing to tell."""
+    """Return forces at which a brake may wait, N, each with the time of its gap to the middle of the scene's forces, s.
+
+    First the force at which the scene lets it wait; then a third, two thirds and all of STANDBY_N above the least.
+    Empty for a pad.
+    """
     if core.scene.element == "tactile":
         return []
     reach, force = core.portrait, core.scene.force
@@ -272,11 +303,12 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
-    """The smallest difference of force that the device makes and measures, up to this force."""
+    """Return the smallest difference of force, N, that the device makes and measures at forces up to `most_N`."""
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
 def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
+    """Raise ConfigError where the scene's resolution is finer than the device makes and measures."""
     least_N = least_resolution_N(reach, scene.force.most_N)
     if scene.force.resolution_N < least_N:
         raise ConfigError(
@@ -286,6 +318,7 @@ def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
 
 
 def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
+    """Raise ConfigError where the hand's rate, or a finger's depth and rate, are not what the model was trained on."""
     depths_mm, rates_mm_s, *_ = model.feature_ranges
     handle, finger = scene.handle, scene.finger
     stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
@@ -300,6 +333,10 @@ def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
 
 
 def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
+    """Return what the gap's speed leaves of the scene's signal; None where the scene states no signal.
+
+    The signal's file is read from the folder `beside`. Raises ConfigError where the scene tolerates less.
+    """
     if scene.signal is None:
         return None
     force, speed_mm_s = scene.force, config.position.gap_speed_mm_s
@@ -322,6 +359,7 @@ def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path
 
 
 def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
+    """Raise ConfigError where an opening gap would release the force faster than the scene allows."""
     # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
     # ceiling lets no gap make more than CEILING times the scene's greatest
     opening_mm_s, key = max(
@@ -340,8 +378,11 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    """The search that `scene` names; else the portrait where the rate is no term, the k-nearest where the force is not
-    known to rise, or Newton's method. Raises DomainError."""
+    """Return the search that `scene` names, with its settings. Raises DomainError for settings that it does not have.
+
+    Where the scene leaves the choice: the portrait where the handle's rate is no term, Newton's method where the force
+    `rises` with the field, else the k-nearest search.
+    """
     wanted = scene.solver
     if wanted.name == AUTO:
         if not scene.terms.rate:

@@ -1,4 +1,4 @@
-"""What an operator's command is decided on: what the device says, what was asked of it, and what is asked of us."""
+"""The conditions on which operators' commands are taken: of the device, its requests and the setpoint."""
 
 from tormagd.config import Config
 from tormagd.control.core import Stepper
@@ -10,15 +10,18 @@ from tormagd.safety.operating_state import Conditions, DeviceRequest
 
 
 def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool:
-    """Whether the carriages' positions are known; the device's word alone is not enough."""
+    """Tell whether the carriages' positions are known: the device says so, and a step has taken them.
+
+    `measurement` and `measured` are None where there is none; then they are not known.
+    """
     return measurement is not None and measured is not None and measured.is_homed
 
 
 def is_busy(measurement: Measurement | None, pending: DeviceRequest, stepper: Stepper, output: Duty | None) -> bool:
-    """Whether the device homes or opens, or was asked to and has not said yet that it does.
+    """Tell whether the device homes or opens, or was asked to and has not acknowledged it yet.
 
-    `output` is the newest step's, `pending` the request that the device has not acknowledged. A homing ends when a step
-    has taken the positions that it made known: until then the device is busy.
+    `output` is the newest step's, None before the first; `pending` is the unacknowledged request. A device that has
+    homed is busy until a step has taken its positions. Without a `measurement` (None) it is not busy.
     """
     if measurement is None:
         return False
@@ -40,7 +43,11 @@ def conditions(
     *,
     sensor_doubted: bool,
 ) -> Conditions:
-    """The conditions at `now_s`. `least_N` is F_min of this device."""
+    """Return the conditions at `now_s`.
+
+    `output` is the newest step's, None before the first. `setpoint` is the newest, None without a publisher; one that
+    is older than its validity does not count. `least_N` is F_min of this device.
+    """
     measurement = connection.measurement
     is_current = setpoint is not None and now_s - setpoint.stamp_s <= setpoint.valid_for_s
     old = "" if measurement is None else _old(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
@@ -61,7 +68,10 @@ def conditions(
 
 
 def _old(now_s: float, measurement: Measurement, timeout_s: float) -> str:
-    """Which of the three streams has stopped, as in "no Sense for 312 ms"; empty where none has."""
+    """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has.
+
+    State is late after `timeout_s`, Sense and Status after the times of their faults.
+    """
     for name, came_s, longest_s in (
         ("State", measurement.received_s, timeout_s),
         ("Sense", measurement.sensed_s, SENSE_FAULT_S),

@@ -1,8 +1,8 @@
-"""What the core was given, in the order in which it was given that: with it and a beginning, all can be run again.
+"""The journal: all inputs of the core, in their order. From them and a snapshot of the core a replay runs it again.
 
-`plan` and `step` are deterministic, so nothing that they gave has to be kept: it stands in the tick's record, to
-compare with. So is the conversation with the device, once it is known what was read and when: what was written is kept
-to compare.
+`plan` and `step` are deterministic, so their results need not be kept; they stand in the tick's record, for
+comparison. The conversation with the device is deterministic too, given what was read and when. What was written is
+kept for comparison.
 """
 
 import struct
@@ -31,109 +31,113 @@ from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingS
 from tormagd_client.messages import TickRecord
 
 FORMAT = 7
-"Of the entries and of the states in them: raised when one comes, is removed or changes its meaning. No other is rerun."
+"Version of the entries and their states: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
     *(Measured, Handle, Travel, Turn, Wall, Leap, Reference, Plan, Outside),
     *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
 )
-"All records that stages keep, or that were given to them: what `exact` reads back."
+"All records that stages keep or are given: the types that `exact` reads back."
 STEP = "step"
-"The step ran here; what it was given stands in the next record."
+"A step ran; its inputs stand in the next record."
 PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
-"Besides READ and WROTE, which the process that keeps them knows, too."
+"A conversation began or ended. READ and WROTE, its other entries, are in `keeping`, for the black box's process."
 STATE, MISSING = "state", "missing"
 MOST_ENTRIES = 4_096
-"That nobody took: then the journal begins anew, and says that something is missing."
+"So many entries that nobody took are dropped, and MISSING stands in their place."
 
 _LENGTH = struct.Struct(">I")
 _NONE = b"\xdd" + _LENGTH.pack(0)
-"An array of none, in msgpack's form whose length has four bytes."
+"An empty array, in msgpack's form whose length has four bytes."
 
 Entry = str | TickRecord | tuple[Any, ...]
 
 
 class Journal:
-    """Entries that wait to be taken. Writing one is a reference in a list: records do not change, and stages are
-    written out at once. A journal that is not kept takes no note of anything."""
+    """The core's inputs since the last `take`, in their order. Every method but `take` adds an entry.
+
+    An entry costs a reference in a list: records do not change, and states are written out at once. With `is_kept`
+    False nothing is added.
+    """
 
     def __init__(self, *, is_kept: bool = True) -> None:
         self.is_kept = is_kept
         self._entries: list[Entry] = []
 
     def stepped(self) -> None:
-        """A step ran."""
+        """Note that a step ran."""
         self._add(STEP)
 
     def ticked(self, record: TickRecord) -> None:
-        """The control period is over in which the last step ran: its record."""
+        """Note the record of a control period that is over; it has the inputs and results of the last step."""
         self._add(record)
 
     def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """A plan begins, with what was measured last. Whether it can be made is found out again."""
+        """Note that a plan begins for `setpoint`, None without a publisher; it uses the newest measurement."""
         self._add((PLAN, now_s, setpoint))
 
     def foresaw(self) -> None:
-        """What comes was looked for, and found anew."""
+        """Note that a new forecast was made."""
         self._add((FORESEE,))
 
     def began_afresh(self, now_s: float) -> None:
-        """The plan could not be made: planning began anew."""
+        """Note that a plan or forecast failed, and that planning began anew."""
         self._add((AFRESH, now_s))
 
     def taught(self, learned: Learned) -> None:
-        """What is known of the device from another day was put in the place of what was believed."""
+        """Note that the estimators were set to what is known of the device from another day."""
         self._add((TEACH, learned))
 
     def confirmed(self, what: str) -> None:
-        """The operator said who is right, the device or its sensor."""
+        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong."""
         self._add((CONFIRM, what))
 
     def answered(self, answer: Answer) -> None:
-        """The search beside the plans has found something, for the next plan."""
+        """Note an answer of the search in its own process, for the next plan."""
         self._add((ANSWER, answer))
 
     def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
-        """An operator's command was given, and taken or refused."""
+        """Note an operator's command, the conditions it was decided on, and whether it was refused."""
         self._add((COMMAND, name, now_s, is_refused, conditions))
 
     def latched(self, fault: Fault) -> None:
-        """A fault was latched that was found outside the step."""
+        """Note that a fault was latched that was found outside the step."""
         self._add((LATCH, str(fault)))
 
     def lost_link(self) -> None:
-        """The link to the device broke."""
+        """Note that the link to the device broke."""
         self._add((LOSE_LINK,))
 
     def read(self, now_s: float, raw: Received) -> None:
-        """This was read from the device, and taken in at this time."""
+        """Note what was read from the device at `now_s`, as `connection.Traffic`."""
         self._add((READ, now_s, raw))
 
     def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        """This was written to it in one period, after a step; what the port did not take at once is counted."""
+        """Note what was written to the device in one period, as `connection.Traffic`."""
         self._add((WROTE, now_s, raw, unsent))
 
     def connected(self, memory: Any) -> None:
-        """A conversation with the device begins, which remembers this; None: it has ended."""
+        """Note that a conversation begins from the state `memory`; None: that it is over. As `connection.Traffic`."""
         self._add((CONNECTED, memory))
 
     def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
-        """All that the core and the conversation remember now: a replay may begin here."""
+        """Note the whole state of the core and of the conversation (None without one): a replay may begin here."""
         if self.is_kept:
             self._add((STATE, plain(stepper), plain(planner), connection))
 
     def missed(self) -> None:
-        """Entries before this were lost."""
+        """Note that entries before this one were lost."""
         self._add((MISSING,))
 
     def take(self) -> list[Entry]:
-        """The entries since the last time."""
+        """Return the entries since the last `take`, and remove them from the journal."""
         entries, self._entries = self._entries, []
         return entries
 
     def _add(self, entry: Entry) -> None:
+        """Add an entry if the journal is kept; MOST_ENTRIES that nobody took are first replaced by MISSING."""
         if not self.is_kept:
             return
         if len(self._entries) >= MOST_ENTRIES:
@@ -142,20 +146,22 @@ class Journal:
 
 
 class Packer:
-    """msgpack: an array of entries, which grows tick by tick. Values in it are as `exact` writes them; a setpoint is
-    its fields alone, in the order of its constructor."""
+    """Writer of entries as one growing msgpack array.
+
+    Values are written as `exact.plain` gives them; a setpoint is a list of its fields, in its constructor's order.
+    """
 
     def __init__(self) -> None:
         self._bytes, self._count = bytearray(_NONE), 0
 
     def add(self, entries: Sequence[Entry]) -> None:
-        """Writes some more. Raises TypeError, ValueError or OverflowError for what cannot be written."""
+        """Append entries. Raises TypeError, ValueError or OverflowError for one that cannot be written."""
         for entry in entries:
             _ENCODER.encode_into(entry, self._bytes, -1)
             self._count += 1
 
     def take(self) -> bytes:
-        """The array, and begins a new one."""
+        """Return the array's bytes, and begin an empty array."""
         _LENGTH.pack_into(self._bytes, 1, self._count)
         packed = bytes(self._bytes)
         self._bytes, self._count = bytearray(_NONE), 0
@@ -163,6 +169,7 @@ class Packer:
 
 
 def _of_value(thing: Any) -> Any:
+    """Return a value as msgpack can write it. Raises TypeError for one that `exact.plain` refuses."""
     if type(thing) is TimedSetpoint:
         return [getattr(thing, name) for name in thing.__match_args__]
     return plain(thing)

@@ -1,7 +1,7 @@
-"""What is known of one device with one insert, kept for the next time: a JSON file of a few lines.
+"""Profiles: what is known of one device with one insert, kept from session to session in a small JSON file.
 
-What a fit has learned of a scale lasts from day to day, but for the warmth of the room; what the elastomer had relaxed
-and how far the sensor's zero had drifted do not. So a profile that is read again is less sure than when it was kept.
+The learned scale lasts from day to day, but for the warmth of the room. The elastomer's relaxation and the drift of the
+sensor's zero do not last. So a profile is less sure when it is read again than when it was written.
 """
 
 import math
@@ -19,21 +19,23 @@ from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceBounds
 VERSION = 1
 MAX_BYTES = 4_096
 WARMTH_SD = 0.04
-"Of the scale, from one day to another: 0.7 % for each kelvin of a room that is 6 warmer or colder (plant card)."
+"Deviation of the scale between two days: 0.7 % a kelvin, for a room 6 K warmer or colder (plant card)."
 RELAXED_SD_N = 0.06
-"Of the offset, of an elastomer that has rested since."
+"Deviation of the offset for an elastomer that has rested since."
 ZERO_LASTS_S = 600.0
-"An older zero is forgotten: the sensor has drifted, or was tared, and is taken for tared as at any start."
+"An older zero of the sensor is not used: the sensor may have drifted, or was tared; it is taken for tared."
 
 
 class ProfileError(ValueError):
-    """A profile that cannot be used, and why."""
+    """A profile that cannot be used. The text says why."""
 
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A device, by its serial number, with an insert, as a model sees it. `saved_ns` is CLOCK_REALTIME; the others are
-    those of `Learned`, with standard deviations for variances. Profiles from before the carriages' lag was kept have no
-    `lag_s`: none is known of the device."""
+    """What is known of a device, by its serial number, with an insert and a model, by its fingerprint.
+
+    `saved_ns` is CLOCK_REALTIME. The other fields are those of `Learned`, with a standard deviation for the variance.
+    Old profiles have no `lag_s`: it is 0, nothing known of the carriages' lag.
+    """
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
@@ -49,7 +51,10 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     lag_s: Annotated[float, Meta(ge=0.0, le=MAX_LAG_S)] = 0.0
 
     def learned(self, now_ns: int) -> Learned:
-        """What is known of the device at CLOCK_REALTIME `now_ns`."""
+        """Return what is still known of the device at CLOCK_REALTIME `now_ns`.
+
+        Scale and offset become as uncertain as a day makes them, and a sensor's zero older than ZERO_LASTS_S is 0.
+        """
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
         is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
@@ -58,7 +63,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
-    """The profile to keep of a device of which this is known."""
+    """Return the profile that keeps `learned` of a device. `model` is the model's fingerprint."""
     return Profile(
         v=VERSION,
         serial_number=serial_number,
@@ -76,8 +81,11 @@ def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str,
 
 
 def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: DeviceBounds) -> Profile:
-    """The profile in `data`. Raises ProfileError for what is damaged, of another device, insert or model, or beyond the
-    `bounds` of a device."""
+    """Return the profile in a file's bytes.
+
+    Raises ProfileError for data over MAX_BYTES, for data that are no profile, for a profile of another device, insert
+    or model, and for values beyond the `bounds` of a device.
+    """
     if len(data) > MAX_BYTES:
         raise ProfileError(f"{len(data)} bytes: allowed is {MAX_BYTES}")
     try:

@@ -1,4 +1,4 @@
-"""Whether a device can follow a force at all: carriages that lose no time to anything but their top speed."""
+"""Whether a device's gap speed alone lets it follow a force: ideal carriages, which only their top speed bounds."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ SHOWN = 3
 
 
 class Point(NamedTuple):
-    """A force, N, the rate that is asked there, N/s, and the greatest that the device gives there."""
+    """A force, the rate that a signal asks there, and the greatest rate that the device gives there, N/s."""
 
     force_N: float
     asked_N_s: float
@@ -17,8 +17,11 @@ class Point(NamedTuple):
 
 
 class Missed(NamedTuple):
-    """What such carriages miss of a signal: RMS, N; the share of time in which it is faster than they are; and of that
-    the points furthest out, each of another tenth of the signal's range, worst first."""
+    """What ideal carriages miss of a signal.
+
+    `rms_N` is the RMS error, `share` the share of the steps in which the signal is faster than the device. `worst` are
+    the SHOWN points where it is too fast by the largest factor, one a tenth of the signal's range, worst first.
+    """
 
     rms_N: float
     share: float
@@ -26,7 +29,10 @@ class Missed(NamedTuple):
 
 
 def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_speed_mm_s: float) -> Missed:
-    """What carriages miss of forces (n, N) at rising times (n, s), from the first on. They do not know what comes."""
+    """Return what ideal carriages miss of forces (n, N) at rising times (n, s), which they follow without preview.
+
+    They begin at the first force. `shown` gives the force over the gap, `gap_speed_mm_s` is their top speed.
+    """
     tenth_N = max(max(forces_N) - min(forces_N), 1e-9) / 10.0
     furthest: dict[int, Point] = {}
     at_N, squares, outside = forces_N[0], 0.0, 0
