@@ -1,9 +1,9 @@
 """Which build of the core runs: compiled, or the very same files interpreted.
 
 Both give the same results to the bit. `pip install` compiles where a compiler and Python's headers are (setup.py), and
-leaves a record of what it compiled. Whoever edits a file after that runs what he wrote: a source that is not the one
-that was compiled makes all of the core interpreted, with a warning, because compiled modules know each other's insides.
-TORMAG_COMPILED=0 does the same for one process. `tormagd --version`, `status` and `doctor` say which build runs.
+records what it compiled. After an edit of any source all of the core is interpreted, with a warning, because compiled
+modules know each other's insides. TORMAG_COMPILED=0 does so for one process, without a warning. `tormagd --version`,
+`status` and `doctor` say which build runs.
 """
 
 import importlib.machinery
@@ -23,7 +23,7 @@ SWITCH = "TORMAG_COMPILED"
 _HERE = Path(__file__).parent
 REMEDY = "install it again with pip where a C compiler and Python's headers are"
 COST = "a tick takes about five times as long as compiled"
-"What an interpreted core costs: the results are the same."
+"What an interpreted core costs; its results are the same."
 
 
 class Build(NamedTuple):
@@ -37,9 +37,9 @@ class Build(NamedTuple):
 
 
 class FromSource:
-    """Finds the sources of these modules, and not what was once compiled from them: a finder for `sys.meta_path`.
+    """A finder for `sys.meta_path` that loads the given modules from their sources, never from what was compiled.
 
-    It does not derive from `MetaPathFinder`: what that brings is a tenth of the time that a command takes to answer.
+    It does not derive from `MetaPathFinder`, whose import takes a tenth of the time that a command takes to answer.
     """
 
     def __init__(self, modules: frozenset[str]) -> None:
@@ -48,7 +48,10 @@ class FromSource:
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """See `importlib.abc.MetaPathFinder.find_spec`."""
+        """Return the spec of a module's source file; None for another module, and where the source is missing.
+
+        As `importlib.abc.MetaPathFinder.find_spec`.
+        """
         if fullname not in self._modules or path is None:
             return None
         sources = [Path(folder, fullname.rpartition(".")[2]).with_suffix(".py") for folder in path]
@@ -57,7 +60,11 @@ class FromSource:
 
 
 def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
-    """The build of the packages in `root`, and the modules that there are two of. `switch` is TORMAG_COMPILED."""
+    """Return which build of the packages in `root` may run, and the names of the modules that were compiled.
+
+    Interpreted where there is no record of a compilation, or one for another Python, where TORMAG_COMPILED (`switch`,
+    None where not set) is 0, and where a source was edited since. Reads all of the sources.
+    """
     try:
         record = json.loads((root / "firmware_protocol" / "core.json").read_bytes())
         sources: dict[str, int] = record["sources"]
@@ -79,8 +86,10 @@ def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
 
 
 def check_sum(path: Path) -> int:
-    """CRC-32 of a source, -1 where it cannot be read. Edits are to be seen; what stands attacks takes as long to load
-    as all else here, and every command waits for it."""
+    """Return the CRC-32 of a source file, -1 where it cannot be read.
+
+    It has to show edits, not attacks: a cryptographic hash would take as long to import as all else here.
+    """
     try:
         return zlib.crc32(path.read_bytes())
     except OSError:
@@ -89,7 +98,11 @@ def check_sum(path: Path) -> int:
 
 @cache
 def settle() -> Build:
-    """The build that this process runs; the first call makes it so, before anything of the core is imported."""
+    """Decide which build this process runs, and return it; call this before any module of the core is imported.
+
+    For an interpreted core of which compiled modules exist, puts a finder of their sources into `sys.meta_path`, and
+    warns with RuntimeWarning where a source was edited. Later calls return the first one's answer.
+    """
     build, modules = judged(_HERE.parent, os.environ.get(SWITCH))
     if not build.is_compiled and modules:
         sys.meta_path.insert(0, FromSource(modules))

@@ -8,6 +8,7 @@ CRC8_FINAL_XOR: Final = 0xFF
 
 
 def _crc8_table() -> bytes:
+    """Return the register after each of the 256 bytes, from a register of 0."""
     table = []
     for byte in range(256):
         register = byte
@@ -19,11 +20,11 @@ def _crc8_table() -> bytes:
 
 
 CRC8_TABLE: Final = _crc8_table()
-"The register after a byte, by the register before it XOR the byte."
+"The register after a byte, by the register before the byte XOR the byte."
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8/SAE-J1850 of `data`."""
+    """Return the CRC-8/SAE-J1850 of `data`."""
     register = CRC8_INITIAL
     for byte in data:
         register = CRC8_TABLE[register ^ byte]

@@ -1,7 +1,7 @@
 """Typed messages to payload bytes and back.
 
 `wire.py`, which is generated from tormag.dbc, has the arithmetic: rounding to the nearest step, range checks and the
-CRC-8 of the protected messages. This module is its face, and says in words what did not fit. It knows no transport:
+CRC-8 of the protected messages. This module calls it, and says in words what did not fit. It knows no transport:
 `framing` carries the payloads over a serial line, and on CAN they are the data bytes.
 """
 
@@ -64,8 +64,8 @@ class EncodeError(ValueError):
 class DecodeError(ValueError):
     """Bytes from the wire are not a message. The text names what was expected and what was received.
 
-    `name` is the message that it would have been, empty where none has this function; `check` what it did not pass, in
-    a word: "function", "length", "CRC-8" or "range".
+    `name` is the message of this function, empty where there is none. `check` is the check that the bytes did not pass:
+    "function", "length", "CRC-8" or "range".
     """
 
     def __init__(self, text: str = "", name: str = "", check: str = "") -> None:
@@ -81,19 +81,22 @@ FUNCTION: Final[dict[type[Message], int]] = {layout.message: layout.function for
 
 
 def can_identifier(function: int, node: int = 1) -> int:
-    """The 11-bit CAN identifier of a function (1..127) of a node (0..15). Raises EncodeError outside them."""
+    """Return the 11-bit CAN identifier of a function (1..127) of a node (0..15). Raises EncodeError for others."""
     if not (1 <= function <= 0x7F and 0 <= node <= 0xF):
         raise EncodeError(f"CAN function {function}, node {node}: allowed are functions 1 to 127, nodes 0 to 15")
     return function << 4 | node
 
 
 def period(message: type[Message], signal: str) -> float:
-    """What a wrapping signal is known modulo, in its unit (mm, s). Raises KeyError for a signal that does not wrap."""
+    """Return the period of a wrapping signal of a message, in the signal's unit (mm, s).
+
+    Raises KeyError for a signal that does not wrap.
+    """
     return {s.name: s.period for s in _BY_TYPE[message].signals if s.wraps}[signal]
 
 
 def encode(message: Message) -> bytes:
-    """The payload of a message; physical values go to the nearest step, wrapping signals modulo their period.
+    """Return the payload of a message; physical values go to the nearest step, wrapping signals modulo their period.
 
     Raises EncodeError for a value that is not finite, not in range or, where a whole number is due, not whole.
     """
@@ -107,7 +110,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(function: int, payload: bytes | bytearray) -> Message:
-    """The message in a payload.
+    """Return the message in the payload of a function.
 
     Raises DecodeError for an unknown function, a wrong length, a wrong CRC-8, an undefined enumeration value or flag,
     or a value outside its range; nothing else, whatever the bytes.
@@ -120,7 +123,7 @@ def decode(function: int, payload: bytes | bytearray) -> Message:
 
 
 def _misfit(message: Message) -> EncodeError:
-    """What keeps a message off the wire: its first value that does not fit."""
+    """Return the error of a message that does not fit the wire: it names the first value that does not fit."""
     layout = _BY_TYPE.get(type(message))
     if layout is None:
         return EncodeError(f"{message!r} is not a message of this protocol")
@@ -135,6 +138,7 @@ def _misfit(message: Message) -> EncodeError:
 
 
 def _fits(signal: Signal, value: Any) -> bool:
+    """Tell whether a signal can carry a value; never raises."""
     try:
         step = round(value / signal.scale) if signal.type is float else index(value)
     except (TypeError, ValueError, OverflowError):  # not a number, NaN, infinite
@@ -143,7 +147,7 @@ def _fits(signal: Signal, value: Any) -> bool:
 
 
 def _no_message(function: int, payload: bytes) -> DecodeError:
-    """Why bytes are no message: the function, then the length, the CRC-8, and the first step out of its range."""
+    """Return the error of bytes that are no message: for function, length, CRC-8 or the first step out of range."""
     layout = _BY_FUNCTION.get(function)
     if layout is None:
         return DecodeError(f"function {function}: known are {', '.join(map(str, _BY_FUNCTION))}", check="function")

@@ -1,6 +1,6 @@
-"""What tormag.dbc says, checked against the rules of this protocol's byte layout.
+"""The schema in tormag.dbc, checked against the rules of this protocol's byte layout.
 
-Only the generators read the DBC; everything that runs has `layouts.py`. Needs cantools.
+Only the generators read the DBC; everything that runs uses `layouts.py`. Needs cantools.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ STRUCT_CODES: Final = {8: "b", 16: "h", 32: "i"}
 
 
 class SchemaError(ValueError):
-    """The DBC says something that the byte layout of this protocol does not allow."""
+    """The DBC states something that the byte layout of this protocol does not allow. The text says what and where."""
 
 
 class SignalSource(NamedTuple):
@@ -37,12 +37,13 @@ class SignalSource(NamedTuple):
 
     @property
     def struct_code(self) -> str:
+        """The code of the signal's integer in the module `struct`."""
         code = STRUCT_CODES[self.length]
         return code if self.signed else code.upper()
 
     @property
     def python_type(self) -> str:
-        """A quantity is a float, a bare number an int, a value table its enumeration."""
+        """The type of the Python field: float for a quantity, int for a bare number, else the enumeration's name."""
         if self.type_name:
             return self.type_name
         return "float" if self.unit or self.scale != 1 else "int"
@@ -60,19 +61,22 @@ class MessageSource(NamedTuple):
 
     @property
     def function(self) -> int:
+        """The function code: the upper part of the CAN identifier."""
         return self.frame_id >> 4
 
     @property
     def receiver(self) -> str:
+        """The other side than the sender: Device or Host."""
         return "Device" if self.sender == "Host" else "Host"
 
     @property
     def protected(self) -> bool:
+        """Whether the last byte is a CRC-8."""
         return self.signals[-1].kind == "Checksum"
 
     @property
     def fields(self) -> tuple[SignalSource, ...]:
-        """The signals a user of the codec sees: all but the checksum."""
+        """The signals that are fields of the Python message: all but the checksum."""
         return self.signals[:-1] if self.protected else self.signals
 
 
@@ -83,7 +87,7 @@ class Schema(NamedTuple):
     messages: tuple[MessageSource, ...]
 
     def canonical_layout(self) -> str:
-        """The text whose SHA-256 is the schema hash: what decides the bytes and their meaning, and no comments."""
+        """Return the text whose SHA-256 is the schema hash: all that decides bytes and their meaning, no comments."""
         lines = [f"protocol {self.version}"]
         for message in self.messages:
             lines.append(f"message {message.name} {message.frame_id} {message.length} {message.sender}")
@@ -97,12 +101,15 @@ class Schema(NamedTuple):
         return "\n".join(lines) + "\n"
 
     def schema_hash(self) -> int:
-        """First four bytes, big-endian, of the SHA-256 of the canonical layout."""
+        """Return the first four bytes, big-endian, of the SHA-256 of the canonical layout."""
         return int.from_bytes(hashlib.sha256(self.canonical_layout().encode("ascii")).digest()[:4], "big")
 
 
 def read_schema(path: Path = DBC) -> Schema:
-    """The schema of a DBC file. Raises SchemaError for what byte-aligned little-endian fields cannot give."""
+    """Read the schema of a DBC file, its messages by rising identifier.
+
+    Raises SchemaError where it breaks a rule of the byte layout, and the errors of cantools for a file that is no DBC.
+    """
     database: Any = cantools.database.load_file(path, database_format="dbc", strict=True)
     kinds = database.dbc.attribute_definitions["Kind"].choices
     messages = tuple(_message(message, kinds) for message in sorted(database.messages, key=lambda m: int(m.frame_id)))
@@ -110,6 +117,10 @@ def read_schema(path: Path = DBC) -> Schema:
 
 
 def _message(message: Any, kinds: list[str]) -> MessageSource:
+    """Return a cantools message as a MessageSource; `kinds` are the names of the attribute Kind.
+
+    Raises SchemaError for another node's identifier, gaps or overlaps, over 8 bytes, and a checksum that is not last.
+    """
     signals = tuple(_signal(message.name, signal, kinds) for signal in sorted(message.signals, key=lambda s: s.start))
     if message.frame_id & 0xF != NODE or not 1 <= message.frame_id >> 4 <= 0x7F or message.is_extended_frame:
         raise SchemaError(f"{message.name}: {message.frame_id:#x} is not (function << 4) | {NODE} in 11 bits")
@@ -133,6 +144,10 @@ def _message(message: Any, kinds: list[str]) -> MessageSource:
 
 
 def _signal(message_name: str, signal: Any, kinds: list[str]) -> SignalSource:
+    """Return a cantools signal as a SignalSource; `kinds` are the names of the attribute Kind.
+
+    Raises SchemaError for storage, ranges, value tables or flags that the codec cannot check.
+    """
     where = f"{message_name}.{signal.name}"
     attributes = signal.dbc.attributes
     kind = kinds[attributes["Kind"].value] if "Kind" in attributes else "Number"

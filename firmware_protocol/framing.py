@@ -2,8 +2,8 @@
 
     COBS( function u8 | sequence u8 | payload 0..8 | CRC-16/GENIBUS u16, big-endian ) 0x00
 
-COBS takes the zeros out of the frame, so that a zero on the line is always the end of one: after any disturbance the
-receiver is back at the next zero. The sequence counts the frames of one direction modulo 256.
+COBS takes the zeros out of a frame, so that a zero on the line always ends a frame. After any disturbance the receiver
+finds the next frame behind the next zero. The sequence counts the frames of one direction modulo 256.
 """
 
 from binascii import crc_hqx
@@ -16,23 +16,23 @@ DELIMITER: Final = b"\x00"
 CRC_INITIAL: Final = 0xFFFF
 CRC_FINAL_XOR: Final = 0xFFFF
 CRC_RESIDUE: Final = 0x1D0F
-"""Register after data and their own CRC. Not 0, where a zero more or less at the end would not show."""
+"""Register after data and their own CRC. It is not 0: with 0, a zero more or less at the end would not show."""
 CRC_LENGTH: Final = 2
 HEADER_LENGTH: Final = 2
 MAX_PAYLOAD: Final = 8
 OVERTAKEN: Final = 16
-"A frame behind the newest by less than this was overtaken, or repeated, or its sender has started anew."
+"A frame whose sequence is behind the newest by less than this was overtaken or repeated, or its sender began anew."
 ALL_MISSING: Final = (1 << (OVERTAKEN - 1)) - 1
 MAX_ENCODED: Final = 1 + HEADER_LENGTH + MAX_PAYLOAD + CRC_LENGTH
 """Longest frame before its delimiter; under 254 bytes, COBS adds exactly one."""
 _BYTES: Final = [bytes((byte,)) for byte in range(256)]
 _DISTANCES: Final = _BYTES[1:-1]
-"""What stands before a run of so many bytes."""
+"""By the length of a run without zeros, the byte that COBS puts before the run."""
 
 
 @final
 class Frame(Value):
-    """One frame that arrived whole. Whether its payload is a message is for `codec.decode` to say."""
+    """One frame that arrived whole. Its payload need not be a message: `codec.decode` checks that."""
 
     def __init__(self, function: int, sequence: int, payload: bytes) -> None:
         self.function: Final = function
@@ -42,7 +42,7 @@ class Frame(Value):
 
 @final
 class FramingStatistics(Value):
-    """What a FrameDecoder has seen since it was made. It counts on; a copy does not."""
+    """Counters of a FrameDecoder since it was made. The decoder's own object goes on counting; a copy does not."""
 
     __match_args__ = ("bytes", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 
@@ -61,21 +61,23 @@ class FramingStatistics(Value):
         self.corrupt = corrupt
         """Stretches between two delimiters that were not a frame."""
         self.lost = lost
-        """Frames missing from the sequence, those among them that arrived corrupt included; not those that were only
-        overtaken."""
+        """Frames missing from the sequence, also those that arrived corrupt; not those that were only overtaken."""
         self.repeated = repeated
         """Frames with the sequence number of the frame before."""
         self.resynchronisations = resynchronisations
         """Times a frame was found again after something corrupt."""
         self.unsent = 0
-        """Sent frames that the port did not take at once; whoever writes to it counts them."""
+        """Sent frames that the port did not take at once; the writer to the port counts them."""
         self.refused: dict[str, str] = {}
-        """By what it was, "frame" or a message, why the newest one of it was refused."""
+        """Why the newest refused one was refused, by "frame" or the name of a message."""
 
 
 @final
 class Succession:
-    """How many are missing from a sequence modulo 256. One that comes late was overtaken, and is missing no more."""
+    """A count of the numbers that are missing from a sequence modulo 256.
+
+    A number that comes late, by less than OVERTAKEN, was overtaken and is not missing any more.
+    """
 
     __match_args__: ClassVar = ("_missing", "newest")
     __slots__ = __match_args__
@@ -85,7 +87,11 @@ class Succession:
         self._missing = 0  # of the OVERTAKEN before the newest, a bit each, the nearest lowest
 
     def lost(self, number: int) -> int:
-        """By how many more are missing with this number: -1 for one that was counted before, 0 for one that came."""
+        """Take the next number that came; return the change in how many are missing.
+
+        That is 0 for the next number, the first and a repetition, -1 for one that was counted as missing, and else how
+        many were skipped.
+        """
         ahead = (number - self.newest) % 256
         if ahead == 1:  # as nearly always
             self.newest = number
@@ -109,7 +115,10 @@ class Succession:
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """`data` (under 254 bytes) without zeros: each zero, and one before the start, becomes the distance to the next."""
+    """Return `data` (under 254 bytes) without zeros, one byte longer.
+
+    Each zero, and one put before the start, becomes the distance to the next zero or the end.
+    """
     encoded = b""
     for run in data.split(DELIMITER):
         encoded += _DISTANCES[len(run)] + run
@@ -117,7 +126,10 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(data: bytes) -> bytes | None:
-    """Inverse of `cobs_encode` for `data` without zeros; None if the distances do not end where the data does."""
+    """Return the bytes that `cobs_encode` made `data` from; None if its distances do not end where it does.
+
+    `data` must hold no zeros.
+    """
     length = len(data)
     if length == 0:
         return b""
@@ -131,7 +143,10 @@ def cobs_decode(data: bytes) -> bytes | None:
 
 
 def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
-    """One frame with its delimiter. Raises EncodeError over 8 bytes of payload or for a number outside 0..255."""
+    """Return one frame with its delimiter.
+
+    Raises EncodeError for a payload over 8 bytes, and for a function or sequence outside 0..255.
+    """
     if not (0 <= function <= 0xFF and 0 <= sequence <= 0xFF and len(payload) <= MAX_PAYLOAD):
         raise EncodeError(
             f"frame of function {function}, sequence {sequence}, {len(payload)} bytes: "
@@ -144,10 +159,11 @@ def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
 
 @final
 class FrameDecoder:
-    """Takes a byte stream in pieces of any size and gives the frames in it.
+    """Decoder of a byte stream, in pieces of any size, into frames.
 
     Between calls it holds at most one frame's worth of bytes. A frame that repeats the one before it byte for byte is
-    counted and not returned; one that repeats only the sequence number comes from a sender that started anew, and is.
+    counted and not returned. A frame that repeats only the sequence number comes from a sender that began anew; it is
+    counted and returned.
     """
 
     __match_args__: ClassVar = ("_last", "_pending", "_succession", "_synchronised", "statistics")
@@ -161,7 +177,7 @@ class FrameDecoder:
         self._synchronised = True
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that `data` completes, in order. Never raises on content."""
+        """Return the frames that `data` completes, in order. Never raises, whatever the bytes."""
         self.statistics.bytes += len(data)
         stretches = data.split(DELIMITER)
         rest = stretches.pop()
@@ -180,6 +196,7 @@ class FrameDecoder:
         return frames
 
     def _accept(self, encoded: bytes) -> Frame | None:
+        """Count the bytes between two delimiters, and return their frame; None for a corrupt or repeated one."""
         statistics = self.statistics
         frame = _parse(encoded)
         if frame is None:
@@ -202,6 +219,7 @@ class FrameDecoder:
 
 
 def _why_refused(encoded: bytes) -> str:
+    """Return which check the bytes of a corrupt frame did not pass, in a word or two."""
     if len(encoded) > MAX_ENCODED:
         return f"over {MAX_ENCODED} bytes"
     body = cobs_decode(encoded)
@@ -211,6 +229,7 @@ def _why_refused(encoded: bytes) -> str:
 
 
 def _parse(encoded: bytes) -> Frame | None:
+    """Return the frame in the bytes between two delimiters; None where they are too long, too short or damaged."""
     if len(encoded) > MAX_ENCODED:
         return None
     body = cobs_decode(encoded)

@@ -20,7 +20,7 @@ TABLE_END: Final = "<!-- generated from tormag.dbc: end -->"
 
 
 def markdown_tables(schema: Schema) -> str:
-    """The message tables of the README, between and including their markers."""
+    """Return the message tables of the README in Markdown, with the markers around them."""
     lines = [TABLE_BEGIN, f"Protocol version {schema.version}, schema hash `{schema.schema_hash():08X}`.", ""]
     for message in schema.messages:
         lines += [
@@ -38,6 +38,7 @@ def markdown_tables(schema: Schema) -> str:
 
 
 def _markdown_row(signal: SignalSource) -> str:
+    """Return a signal's row: its bytes, name, wire type, values and meaning."""
     first, last = signal.start // 8, (signal.start + signal.length) // 8 - 1
     place = f"{first}" if first == last else f"{first}-{last}"
     wire_type = f"{'i' if signal.signed else 'u'}{signal.length}"
@@ -53,7 +54,11 @@ def _markdown_row(signal: SignalSource) -> str:
 
 
 def generated_files(room: Path) -> dict[Path, str]:
-    """The generated files of a room and the text each should have. Raises SchemaError if the README has no markers."""
+    """Return the text that each generated file of a folder should have, by its path; writes nothing.
+
+    `room` holds tormag.dbc and README.md. Raises SchemaError for a DBC that breaks a rule of the byte layout, and
+    where the README has no markers.
+    """
     schema = read_schema(room / DBC.name)
     readme = (room / "README.md").read_text(encoding="utf-8")
     before, begin, rest = readme.partition(TABLE_BEGIN)
@@ -67,7 +72,10 @@ def generated_files(room: Path) -> dict[Path, str]:
 
 
 def main(arguments: list[str] | None = None, room: Path = DBC.parent) -> int:
-    """Write the generated files of a room, or with `--check` compare them. Returns the exit code."""
+    """Write the generated files of a folder that are out of date, or with `--check` print how they differ.
+
+    Returns the exit code: 1 where `--check` found a difference, else 0.
+    """
     parser = argparse.ArgumentParser(prog="python -m firmware_protocol.generate", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is out of date")
     check: bool = parser.parse_args(arguments).check

@@ -1,8 +1,7 @@
 """Golden vectors: bytes that every implementation of the wire must produce, read and refuse.
 
-Nothing here comes from this room's codec or framing: payloads are packed by cantools, the CRCs are computed bit by
-bit, frames are stuffed by the `cobs` package, and what a receiver must make of a damaged stream is written down by
-hand.
+Nothing here uses this package's codec or framing. Payloads are packed by cantools, the CRCs are computed bit by bit,
+and frames are stuffed by the `cobs` package. What a receiver must make of a damaged stream is written down by hand.
 """
 
 import json
@@ -23,7 +22,7 @@ Json = dict[str, Any]
 
 
 def bitwise_crc8(data: bytes) -> int:
-    """CRC-8/SAE-J1850 straight from its definition."""
+    """Return the CRC-8/SAE-J1850 of `data`, straight from its definition."""
     register = 0xFF
     for byte in data:
         register ^= byte
@@ -33,7 +32,7 @@ def bitwise_crc8(data: bytes) -> int:
 
 
 def bitwise_crc16(data: bytes) -> int:
-    """CRC-16/GENIBUS straight from its definition."""
+    """Return the CRC-16/GENIBUS of `data`, straight from its definition."""
     register = 0xFFFF
     for byte in data:
         register ^= byte << 8
@@ -43,7 +42,7 @@ def bitwise_crc16(data: bytes) -> int:
 
 
 def vector_files(schema: Schema, dbc: Path) -> dict[str, str]:
-    """The vector files, by name, for the messages of a schema read from `dbc`."""
+    """Return the text of the vector files, by their names, for the messages of a schema that was read from `dbc`."""
     database = cantools.database.load_file(dbc, database_format="dbc", strict=True)
     valid = [vector for message in schema.messages for vector in _valid_payloads(message, database)]
     head = {"protocol_version": schema.version, "schema_hash": f"{schema.schema_hash():08X}"}
@@ -53,7 +52,7 @@ def vector_files(schema: Schema, dbc: Path) -> dict[str, str]:
 
 
 def _text(document: Json) -> str:
-    """JSON with one vector a line, so that a change of one shows as one."""
+    """Return a document as JSON with one vector a line, so that a changed vector is one changed line."""
     blocks = []
     for key, value in document.items():
         lines = ",\n".join(f"    {json.dumps(entry)}" for entry in value) if isinstance(value, list) else None
@@ -62,6 +61,7 @@ def _text(document: Json) -> str:
 
 
 def _valid_payloads(message: MessageSource, database: Any) -> Iterator[Json]:
+    """Yield payloads of a message: all signals at their least, all at their greatest, and RANDOM_VECTORS random."""
     generator = random.Random(f"{RANDOM_SEED} {message.name}")
     fields = message.fields
     cases = [tuple(signal.steps[0] for signal in fields), tuple(signal.steps[1] for signal in fields)]
@@ -83,7 +83,7 @@ def _valid_payloads(message: MessageSource, database: Any) -> Iterator[Json]:
 
 
 def _packed(message: MessageSource, steps: dict[str, int], database: Any) -> bytes:
-    """The payload of raw steps; a step outside its signal's range is packed too, if its bits hold it."""
+    """Return the payload of raw steps, with its CRC-8; a step out of range is packed too, if its bits hold it."""
     checksum = {message.signals[-1].name: 0} if message.protected else {}
     target = database.get_message_by_name(message.name)
     payload = bytes(target.encode(steps | checksum, scaling=False, strict=False))
@@ -93,7 +93,11 @@ def _packed(message: MessageSource, steps: dict[str, int], database: Any) -> byt
 
 
 def _invalid_payloads(schema: Schema, valid: list[Json]) -> Iterator[Json]:
-    """Payloads to refuse: wrong lengths, bits flipped under a CRC-8, steps out of range under a right one."""
+    """Yield payloads to refuse, with the reason.
+
+    Unknown functions, wrong lengths, bits flipped under a CRC-8, messages taken for another, and steps out of range
+    under a right CRC-8.
+    """
 
     def refused(function: int, payload: bytes, reason: str) -> Json:
         return {"function": function, "payload": payload.hex(), "reason": reason}
@@ -130,6 +134,7 @@ def _invalid_payloads(schema: Schema, valid: list[Json]) -> Iterator[Json]:
 
 
 def _checked(function: int, sequence: int, payload: bytes) -> bytes:
+    """Return a frame's bytes with their CRC-16, before COBS."""
     body = bytes((function, sequence)) + payload
     return body + bitwise_crc16(body).to_bytes(2, "big")
 
@@ -139,6 +144,7 @@ def _ended(checked: bytes) -> bytes:
 
 
 def _stuffed(function: int, sequence: int, payload: bytes) -> bytes:
+    """Return a whole frame with its delimiter."""
     return _ended(_checked(function, sequence, payload))
 
 
@@ -155,7 +161,7 @@ def _valid_frames(messages: list[Json]) -> list[Json]:
 
 
 def _streams() -> Iterator[Json]:
-    """Byte streams with the frames and the counts that a receiver must take from them."""
+    """Yield byte streams, each with the frames and counters that a receiver must take from it."""
     payload = bytes.fromhex("0011002233440055")
     a, b, c, d = (_stuffed(3, sequence, payload) for sequence in (254, 255, 0, 1))
     flipped = b[:4] + bytes((b[4] ^ 0x10,)) + b[5:]

@@ -1,7 +1,7 @@
-"""The Python modules that tormag.dbc gives: enumerations, messages with their layouts, and the bytes of each message.
+"""The Python modules that are generated from tormag.dbc: enumerations, messages with their layouts, and their bytes.
 
-`wire.py` says for each message what `codec.py` would have to look up: encoding or decoding one is a dozen operations on
-numbers, which a compiler makes native. The enumerations stand apart, because they are not compiled.
+`wire.py` writes out for each message what `codec.py` would have to look up. Encoding or decoding a message is then a
+dozen operations on numbers, which a compiler makes native. The enumerations stand apart: they are not compiled.
 """
 
 import textwrap
@@ -28,7 +28,7 @@ _WHOLE: Final = 2.0**51
 
 
 def python_files(schema: Schema) -> dict[str, str]:
-    """The text of each module by its file's name, as `ruff format` would leave it."""
+    """Return the text of each generated module by its file's name, as `ruff format` would leave it."""
     return {
         "enumerations.py": _enumerations_module(schema),
         "layouts.py": _layouts_module(schema),
@@ -41,6 +41,7 @@ def _enumerations(schema: Schema) -> dict[str, SignalSource]:
 
 
 def _import(module: str, names: list[str]) -> str:
+    """Return an import from a module of this package, broken where it is too long for a line."""
     line = f"from firmware_protocol.{module} import {', '.join(names)}\n"
     if len(line) <= LINE_WIDTH + 1:
         return line
@@ -74,6 +75,7 @@ def _docstring(text: str) -> str:
 
 
 def _layouts_module(schema: Schema) -> str:
+    """Return layouts.py: version and hash, the classes of the messages, and LAYOUTS."""
     head = (
         '"""Messages and byte layouts. Generated from tormag.dbc; to change it, see `generate.py`."""\n\n'
         "from typing import Final, final\n\n"
@@ -90,6 +92,7 @@ def _layouts_module(schema: Schema) -> str:
 
 
 def _message(message: MessageSource) -> str:
+    """Return the class of a message, with its signals' comments."""
     fields = []
     for signal in message.fields:
         fields += [f"        # {line}\n" for line in textwrap.wrap(signal.comment, TEXT_WIDTH - 4)]
@@ -103,7 +106,10 @@ def _message(message: MessageSource) -> str:
 
 
 def _call(before: str, arguments: list[str], after: str = "") -> str:
-    """`before(arguments)after` in a block, without its first indentation, broken where it is too long for a line."""
+    """Return `before(arguments)after`, broken where it is too long for a line of a block.
+
+    The first line comes without the block's indentation.
+    """
     whole = f"{before}({', '.join(arguments)}){after}"
     if len(whole) <= LINE_WIDTH - 4:
         return whole
@@ -114,6 +120,7 @@ def _call(before: str, arguments: list[str], after: str = "") -> str:
 
 
 def _layout(message: MessageSource) -> str:
+    """Return the `Layout` of a message, an entry of LAYOUTS."""
     signals = [
         f'Signal("{s.name}", {s.python_type}, {_number(s.scale)}, {_number(s.minimum)}, {_number(s.maximum)}'
         f"{', wraps=True' if s.kind == 'Wrapping' else ''}),"
@@ -135,6 +142,7 @@ def _number(value: float) -> str:
 
 
 def _wire_module(schema: Schema) -> str:
+    """Return wire.py: functions that pack and unpack each message, and their dispatch by type and by function."""
     enumerations = _enumerations(schema)
     flags = [name for name, signal in enumerations.items() if signal.kind == "Flags"]
     members = "".join(
@@ -164,12 +172,12 @@ def _wire_module(schema: Schema) -> str:
 
 
 def _constant(name: str) -> str:
-    """DriveMode to DRIVE_MODE."""
+    """Return a class's name as a constant's: DRIVE_MODE for DriveMode."""
     return "".join(f"_{letter}" if letter.isupper() and place else letter for place, letter in enumerate(name)).upper()
 
 
 def _codes(message: MessageSource) -> str:
-    """`struct` codes of what is packed: wrapped steps go without their sign, and the CRC-8 comes after."""
+    """Return the `struct` codes of a message's fields; a wrapping one without its sign, the CRC-8 left out."""
     return "".join(s.struct_code.upper() if s.kind == "Wrapping" else s.struct_code for s in message.fields)
 
 
@@ -178,6 +186,7 @@ def _mask(value: int) -> str:
 
 
 def _is_wide(signal: SignalSource) -> bool:
+    """Tell whether a signal is a whole number of over 8 bits."""
     return signal.python_type != "float" and signal.length > 8
 
 
@@ -187,12 +196,14 @@ def _storage(signal: SignalSource) -> tuple[int, int]:
 
 
 def _crc(message: MessageSource, data: str) -> list[str]:
+    """Return the lines that compute the CRC-8 register over the function and the bytes `data` of a payload."""
     start = CRC8_TABLE[CRC8_INITIAL ^ message.function]
     lines = [f"crc = CRC8_TABLE[{_mask(start)} ^ {data}[0]]  # the register after the function, and the first byte"]
     return lines + [f"crc = CRC8_TABLE[crc ^ {data}[{place}]]" for place in range(1, message.length - 1)]
 
 
 def _pack(message: MessageSource) -> str:
+    """Return the function that packs a message, None where a value is out of range."""
     lines, steps = [], []
     for s in message.fields:
         name, (lowest, highest) = s.name, s.steps
@@ -228,6 +239,7 @@ def _pack(message: MessageSource) -> str:
 
 
 def _unpack(message: MessageSource) -> str:
+    """Return the function that unpacks a message, None for a wrong length, CRC-8 or value."""
     lines = [f"if len(data) != {message.length}:", "    return None"]
     if message.protected:
         last = message.length - 1
@@ -258,6 +270,7 @@ def _unpack(message: MessageSource) -> str:
 
 
 def _dispatch(schema: Schema) -> str:
+    """Return `pack` and `unpack`, which choose the function of the message."""
     packs = "".join(
         f"    if isinstance(message, {m.name}):\n        return pack_{m.name.lower()}(message)\n"
         for m in schema.messages

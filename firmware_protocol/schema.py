@@ -1,4 +1,4 @@
-"""The form in which `layouts.py` states what tormag.dbc says."""
+"""The types in which `layouts.py` states the schema of tormag.dbc."""
 
 from typing import Any, NamedTuple
 
@@ -7,8 +7,8 @@ class Signal(NamedTuple):
     """One field of a payload: physical value = step * scale, with `step` the integer on the wire.
 
     `minimum` and `maximum` are physical and inclusive. A signal that `wraps` is a counter of steps modulo its span:
-    every finite value has a step, and what is read back is known only modulo `period`.
-    `type` is what the Python field holds: float, int, or an enumeration.
+    every finite value has a step, and a value that was read is known only modulo `period`.
+    `type` is the type of the Python field: float, int, or an enumeration.
     """
 
     name: str
@@ -30,7 +30,7 @@ class Signal(NamedTuple):
 
     @property
     def period(self) -> float:
-        """What a wrapping signal is known modulo, in its unit."""
+        """The period of a wrapping signal, in its unit."""
         return (self.highest - self.lowest + 1) * self.scale
 
 

@@ -1,9 +1,9 @@
-"""What the values of the core have in common: they compare by their fields, show them, and are copied with changes.
+"""Immutable records, the values of the core: they compare by their fields, show them, and are copied with changes.
 
-A value is a final class with a plain `__init__`, whose attributes are `Final`. Compiled, making one and reading it are
-a few machine instructions, and no assignment gets past it; interpreted, it is faster than a named tuple. The fields are
-named once, by `__init__`, which assigns them in the order of its parameters. A value that holds more than it is made of
-names its fields itself, in `__match_args__`.
+A value is a final class with a plain `__init__`, whose attributes are `Final`. Compiled, making and reading one take a
+few machine instructions, and assignments are refused; interpreted, it is faster than a named tuple. The fields are
+named once, by `__init__`, which assigns them in the order of its parameters. A value with attributes beside its
+parameters names its fields itself, in `__match_args__`.
 """
 
 from typing import Any, ClassVar, Self
@@ -15,7 +15,7 @@ class Value:
     __match_args__: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
-        """Reads the names of the fields: a compiled class says its attributes, any other its parameters."""
+        """Set `__match_args__`, unless the class has it: a compiled class's attributes, or `__init__`'s parameters."""
         code = getattr(cls.__init__, "__code__", None)
         names = code.co_varnames[1 : code.co_argcount] if code else getattr(cls, "__mypyc_attrs__", ())
         if "__match_args__" not in vars(cls):
@@ -37,8 +37,10 @@ class Value:
         return type(self), tuple([getattr(self, name) for name in self.__match_args__])
 
     def replaced(self, **changes: Any) -> Self:
-        """A copy with these fields changed. Where every tick needs one, the constructor is written out: it is checked
-        by name and type, and faster."""
+        """Return a copy with the given fields changed. Raises TypeError for a name that is no field.
+
+        Code that runs every tick calls the constructor instead: it is faster, and checked by name and type.
+        """
         fields: dict[str, Any] = {name: getattr(self, name) for name in self.__match_args__}
         fields.update(changes)
         return type(self)(**fields)

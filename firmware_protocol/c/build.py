@@ -1,7 +1,7 @@
 """Build the C sources on this machine, for the simulated device and for tests.
 
-`python -m firmware_protocol.c.build` builds the shared library, if that has not been done yet, and prints where it is.
-It goes to the user's cache, under a name that follows from the sources, the compiler and its flags.
+`python -m firmware_protocol.c.build` builds the shared library, if that has not been done yet, and prints its path. The
+library is kept in the user's cache, under a name that follows from the sources, the compiler and its flags.
 """
 
 import ctypes
@@ -29,7 +29,7 @@ class BuildError(RuntimeError):
 
 
 class Target(Enum):
-    """What can be built: its host sources and its compiler flags."""
+    """A program or library to build: its sources beside the firmware's, and its compiler flags."""
 
     LIBRARY = ("bridge",), ("-O2", "-fPIC", "-shared")
     SANITIZED_EXCHANGE = (
@@ -45,7 +45,7 @@ class Target(Enum):
 
 
 def compiler() -> str:
-    """Path of the C compiler: `CC` from the environment, else `cc`. Raises BuildError without one."""
+    """Return the path of the C compiler: `CC` from the environment, else `cc`. Raises BuildError without one."""
     wanted = os.environ.get("CC", "cc")
     found = shutil.which(wanted)
     if found is None:
@@ -54,7 +54,10 @@ def compiler() -> str:
 
 
 def build(target: Target) -> Path:
-    """The file built for a target, from the cache where it is up to date. Raises BuildError."""
+    """Build a target, unless the cache has it from the present sources, and return the path of its file.
+
+    Raises BuildError where there is no compiler, where it fails or takes too long, and where the cache is not writable.
+    """
     command = [compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
     path = _cache_folder() / f"{target.name.lower()}-{_fingerprint(command)}"
     if path.exists():
@@ -73,7 +76,7 @@ def build(target: Target) -> Path:
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """The shared library, built if need be. Raises BuildError."""
+    """Load the shared library, built first where need be; later calls return the same. Raises BuildError."""
     path = build(Target.LIBRARY)
     try:
         return ctypes.CDLL(str(path))
@@ -86,6 +89,7 @@ def _cache_folder() -> Path:
 
 
 def _fingerprint(command: list[str]) -> str:
+    """Return 16 hexadecimal digits that change with the compiler's command and with any C source or header."""
     digest = hashlib.sha256("\0".join(command).encode())
     for path in sorted([*ROOM.glob("*.[ch]"), *ROOM.glob("host/*.[ch]")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -93,6 +97,7 @@ def _fingerprint(command: list[str]) -> str:
 
 
 def _compile(command: list[str]) -> None:
+    """Run the compiler. Raises BuildError with what it says where it fails, and after TIME_LIMIT_S."""
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False)
     except subprocess.TimeoutExpired as error:
@@ -102,7 +107,7 @@ def _compile(command: list[str]) -> None:
 
 
 def main() -> int:
-    """Build the library and print its path; the exit code is 1 where that is not possible."""
+    """Build the library and print its path. Returns the exit code, 1 where it cannot be built."""
     try:
         print(build(Target.LIBRARY))
     except BuildError as error:
