@@ -25,7 +25,11 @@ the motors' supply switch in reach, take hands and patient's side off the brake,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """0 where all checks passed, 1 where one did not, 2 where it could not be begun."""
+    """Examine the device on a line, once the user has agreed that its motors move, and print the results.
+
+    Returns the exit code: 0 where all checks passed, 1 where one did not, 2 where nothing could be sent. `--list` only
+    prints the checks. Raises SystemExit for wrong arguments.
+    """
     command = parser()
     options = command.parse_args(arguments)
     if options.list:
@@ -52,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def report(results: Sequence[Result]) -> dict[str, Any]:
-    """What `--json` prints."""
+    """Return the results as the JSON document that `--json` prints."""
     return {
         "checks": [
             {
@@ -69,7 +73,7 @@ def report(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def told(result: Result) -> str:
-    """One check for a person: a line where it passed; where not, what to look at."""
+    """Return a result for a person: one line where the check passed, else what was sent, seen and expected."""
     one = result.check
     if result.passed:
         return f"ok    {one.name}: {result.seen}"
@@ -80,7 +84,10 @@ def told(result: Result) -> str:
 
 
 def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
-    """Raises ValueError for a check that there is not."""
+    """Perform the chosen checks, print each result, and return all; none where they were ended or the line is gone.
+
+    SIGINT and SIGTERM end the checks and then open the gap. Raises ValueError for an unknown name in `--only`.
+    """
     checks = _chosen(checks_on(line), options.only)
     out = sys.stderr if options.json else sys.stdout
     host = Host(line)
@@ -93,7 +100,7 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
     with contextlib.ExitStack() as kept:
         for number in (signal.SIGINT, signal.SIGTERM):
             kept.callback(signal.signal, number, signal.getsignal(number))
-        # a request to end ends the check, not the promise to leave the gap open
+        # a request to end ends the checks, not the promise to leave the gap open
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             try:
@@ -115,12 +122,13 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
 
 
 def _say(text: str, out: TextIO) -> None:
-    """A reader that has gone is no reason to leave the device as it is."""
+    """Print a line. A reader that has gone is ignored: the device must not stay as it is because of that."""
     with contextlib.suppress(OSError):
         print(text, file=out, flush=True)
 
 
 def _name(host: Host) -> str:
+    """Return the device's serial number and firmware in words; "nobody" before an Identity."""
     heard = host.newest.get(Identity)
     if heard is None or not isinstance(heard.message, Identity):
         return "nobody"
@@ -129,7 +137,10 @@ def _name(host: Host) -> str:
 
 
 def _chosen(checks: Sequence[Check], only: Sequence[str]) -> Sequence[Check]:
-    """Those asked for, and always the one that leaves the device open."""
+    """Return the checks that `only` names, all where it is empty, and always the one that leaves the gap open.
+
+    Raises ValueError for a name that is no check.
+    """
     names = {one.name for one in checks}
     if unknown := [name for name in only if name not in names]:
         raise ValueError(f"--only {unknown[0]}: checks on this line are {', '.join(sorted(names))}")
@@ -137,6 +148,7 @@ def _chosen(checks: Sequence[Check], only: Sequence[str]) -> Sequence[Check]:
 
 
 def _is_agreed(line: str) -> bool:
+    """Print the warning and tell whether the user types yes; False without a terminal to ask on."""
     print(WARNING.format(line=line), file=sys.stderr, flush=True)
     if not sys.stdin.isatty():
         return False
@@ -145,7 +157,7 @@ def _is_agreed(line: str) -> bool:
 
 
 def parser() -> argparse.ArgumentParser:
-    """What the kit understands; the reference of commands is made from it, too."""
+    """Return the kit's argument parser; docs/reference/commands.md is written from it, too."""
     made = argparse.ArgumentParser(
         prog="python -m firmware_protocol.conformance",
         description="Plays the host against a device and says what of firmware_protocol/README.md it does not keep. "

@@ -1,4 +1,4 @@
-"""A check: what is sent, what the page expects then, and where it stands there; and the running of them all."""
+"""A check, which says what is sent and what the protocol page expects; and the running of checks in a row."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple
@@ -6,26 +6,26 @@ from typing import Final, NamedTuple
 from firmware_protocol.conformance.host import STALLED_S, Host, Unmet
 
 ATTEMPTS: Final = 3
-"A check that failed while this process was late is tried so often."
+"A check that fails while this process is late is tried this often."
 Perform = Callable[[Host], str]
 
 
 class Check(NamedTuple):
-    """`perform` returns what was seen, or raises Unmet with it."""
+    """One rule of the page as a test. `perform` returns what was seen, or raises Unmet with what was seen."""
 
     name: str
     page: str
-    "Heading of firmware_protocol/README.md, and the number of the rule below it."
+    "Heading in firmware_protocol/README.md, and the number of the rule below it."
     sent: str
     expected: str
     perform: Perform
     moves: bool
     is_gate: bool
-    "Where it fails, nothing is moved any more."
+    "If this check fails, checks that move the device are not tried any more."
 
 
 class Result(NamedTuple):
-    """What came of a check."""
+    """The result of one check: whether it passed, and what was seen."""
 
     check: Check
     passed: bool
@@ -35,12 +35,15 @@ class Result(NamedTuple):
 def check(
     page: str, sent: str, expected: str, *, moves: bool = False, is_gate: bool = False
 ) -> Callable[[Perform], Check]:
-    """Makes a check of a function, by its name."""
+    """Return a decorator that makes a Check of a function, with the function's name."""
     return lambda perform: Check(perform.__name__, page, sent, expected, perform, moves, is_gate)
 
 
 def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = lambda result: None) -> Sequence[Result]:
-    """Performs checks one after the other. Raises OSError when the line is gone."""
+    """Perform checks one after the other, hand each result to `tell`, and return all results.
+
+    After a gate has failed, checks that move the device fail untried. Raises OSError when the line is gone.
+    """
     results: list[Result] = []
     closed_by = ""
     for one in checks:
@@ -56,6 +59,7 @@ def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = la
 
 
 def _performed(host: Host, one: Check) -> Result:
+    """Perform one check; repeat a failure, ATTEMPTS times in all, while this process was late during it."""
     for attempt in range(1, ATTEMPTS + 1):
         host.begin()
         try:

@@ -1,6 +1,6 @@
-"""Frames that are damaged, cut off, too long, or not for this device: not obeyed, not answered, and soon forgotten.
+"""Checks that frames which are damaged, cut off, too long or for another device are neither obeyed nor answered.
 
-What is damaged is a Drive OFF or a Clear, so that a device that obeys does no harm by it.
+The damaged message is a Drive OFF or a Clear, so that a device that obeys it does no harm.
 """
 
 import struct
@@ -16,7 +16,7 @@ SILENT = "no State, drive_counter unchanged; the good Drive after it is answered
 
 
 def _raw_drive(duty_steps: int, mode: int, counter: int) -> bytes:
-    """A Drive that an encoder would refuse, with the right CRC-8."""
+    """Return the payload of a Drive that the codec would refuse, with the right CRC-8."""
     body = struct.pack("<hhBB", duty_steps, 0, mode, counter)
     return body + bytes((crc8(bytes((DRIVE,)) + body),))
 
@@ -26,7 +26,10 @@ def _drive(counter: int) -> bytes:
 
 
 def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
-    """Each of `put` sends a bad Drive with that counter."""
+    """Send bad Drives, each by a function of `put` that takes the counter, and a good Drive after each.
+
+    Raises Unmet where a bad Drive is answered or shows in Status, and where the good Drive after it is not answered.
+    """
     tried = 0
     for send in put:
         host.pass_time(3 * PERIOD_S, Beat.OFF)
@@ -52,7 +55,7 @@ def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
 
 @check("Carriers", "a Drive with a wrong CRC-8 in a whole frame", SILENT)
 def drive_crc_8(host: Host) -> str:
-    """One bit of the CRC, one of a duty."""
+    """Check that a Drive with a wrong bit, in the CRC-8 or in a duty, is ignored."""
     return _ignores(
         host,
         [
@@ -64,7 +67,7 @@ def drive_crc_8(host: Host) -> str:
 
 @check("Who says what when, 2", "a Drive with a duty of 1.0001 or -3.2768, its CRC-8 right", SILENT)
 def drive_range(host: Host) -> str:
-    """A value out of range is no value."""
+    """Check that a Drive with a duty out of range is ignored."""
     return _ignores(
         host,
         [
@@ -76,7 +79,7 @@ def drive_range(host: Host) -> str:
 
 @check("Who says what when, 2", "a Drive of mode 2 or 255, its CRC-8 right", SILENT)
 def drive_mode(host: Host) -> str:
-    """A mode that there is not."""
+    """Check that a Drive with an undefined mode is ignored."""
     return _ignores(
         host,
         [
@@ -88,7 +91,7 @@ def drive_mode(host: Host) -> str:
 
 @check("Carriers", "a Drive of 6 and of 8 bytes, and of none", SILENT)
 def drive_length(host: Host) -> str:
-    """A whole frame is not yet a message."""
+    """Check that a Drive of a wrong length is ignored, though its frame is whole."""
     return _ignores(
         host,
         [
@@ -101,7 +104,7 @@ def drive_length(host: Host) -> str:
 
 @check("Carriers", "functions 10 and 127, and a device's own State and Identity", SILENT)
 def other_functions(host: Host) -> str:
-    """What is not a host's message is nobody's."""
+    """Check that messages of unknown functions and a device's own are ignored."""
 
     def send(function: int) -> Callable[[int], None]:
         return lambda counter: host.line.send(function, _drive(counter) + b"\x00")
@@ -111,10 +114,10 @@ def other_functions(host: Host) -> str:
 
 @check("Carriers", "a Clear of 2 bytes and of none, a Hello of 5 and of 7", "not acknowledged, not answered")
 def command_length(host: Host) -> str:
-    """Commands carry no CRC-8: their length is what is left to check."""
+    """Check that commands of a wrong length are ignored: without a CRC-8, the length is all there is to check."""
     host.idle()
     nonce = host.new_nonce()
-    hello = encode(Hello(0, 0, nonce))  # of no schema: a device that takes it latches, and no more
+    hello = encode(Hello(0, 0, nonce))  # of no schema: a device that takes it does no more than latch
     host.forget()
     for function, payload in (
         (FUNCTION[Clear], bytes((nonce, nonce))),
@@ -142,6 +145,8 @@ SENT: Final = {
 
 
 def _of_carrier(name: str) -> Check:
+    """Return the check that a Drive with one kind of damage of the carrier is ignored; `name` is a key of SENT."""
+
     def perform(host: Host) -> str:
         def send(at: int) -> Callable[[int], None]:
             return lambda counter: host.line.send_damaged(host.line.damages(DRIVE, _drive(counter))[name][at])
@@ -160,4 +165,4 @@ CHECKS: Final = (
     command_length,
 )
 ON_A_CARRIER: Final = tuple(_of_carrier(name) for name in SENT)
-"""Which of these a line has, its `damages` say."""
+"""The checks of damages by the carrier. A line has those that its `damages` names."""

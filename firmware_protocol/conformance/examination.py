@@ -1,4 +1,4 @@
-"""All checks in their order: first what moves nothing."""
+"""All checks in their order: first those that move nothing."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from firmware_protocol.conformance.line import Line
 
 
 def checks_on(line: Line) -> Sequence[Check]:
-    """Those that can be made on this line."""
+    """Return the checks that can be made on a line: all, but for damages that its carrier cannot do."""
     damages = line.damages(FUNCTION[Drive], b"")
     return [one for one in CHECKS if one not in damage.ON_A_CARRIER or one.name in damages]
 
@@ -24,4 +24,4 @@ CHECKS = (
     *silence.CHECKS,
     *overall.CHECKS,
 )
-"""Of every line."""
+"""The checks of every line."""

@@ -1,4 +1,4 @@
-"""Home: what it does, where the zero is, and from which State on."""
+"""Checks of Home: what it does, where the zero is, and from which State on."""
 
 from typing import Final
 
@@ -23,13 +23,13 @@ from firmware_protocol.conformance.host import (
 PAGE: Final = "Homing"
 TAKES: Final = "What each mode takes"
 ZERO_MM = 1.0
-"""A carriage rests behind its switch, where it was braked from a creep."""
+"""A carriage rests this near its zero: behind its switch, where it was braked from a creep."""
 JUMP_MM = 0.2
-"""It is braked when HOMED shows: a State that is further from the next ones was of the old origin."""
+"""Carriages are braked when HOMED shows: a State further than this from later ones is of the old origin."""
 
 
 def _homings(host: Host) -> list[Homing]:
-    """Those of before, or one from here on: the first after a boot says the most."""
+    """Return the homings so far; without any, home a device without a zero. The first after a boot shows the most."""
     if not host.homings:
         host.without_zero()
         host.home()
@@ -44,7 +44,7 @@ def _homings(host: Host) -> list[Homing]:
     is_gate=True,
 )
 def home_homes(host: Host) -> str:
-    """The device finds its open end by itself."""
+    """Check that the device finds its open end by itself."""
     homing = _homings(host)[0]
     modes = " ".join(mode.name for mode in homing.modes)
     status = homing.status
@@ -56,7 +56,7 @@ def home_homes(host: Host) -> str:
 
 @check(PAGE, "Home, Drive OFF every 1 ms", f"both positions within {ZERO_MM:g} mm of 0 afterwards", moves=True)
 def home_zeroes(host: Host) -> str:
-    """The origin is the open switch, found at a creep."""
+    """Check that positions are near 0 after each homing: the origin is the open switch, found at a creep."""
     seen = ""
     for homing in _homings(host):
         state = homing.last
@@ -73,7 +73,7 @@ def home_zeroes(host: Host) -> str:
     moves=True,
 )
 def homed_is_in_new_origin(host: Host) -> str:
-    """The host takes the device for homed from that State on."""
+    """Check that the first State after HOMED has the new origin: from it on the host takes the device for homed."""
     seen = ""
     for homing in _homings(host):
         first, last = homing.first, homing.last
@@ -87,7 +87,7 @@ def homed_is_in_new_origin(host: Host) -> str:
 
 @check("Who says what when, 5", "Home, and when it is done the same Home again", "not done again", moves=True)
 def repeated_command(host: Host) -> str:
-    """A device acts on a nonce once."""
+    """Check that the device acts on a nonce once: a repeated Home is not done again."""
     host.homed()
     host.obeyed(Home)
     nonce = host.status.command_nonce
@@ -107,7 +107,7 @@ def repeated_command(host: Host) -> str:
     moves=True,
 )
 def retract_when_idle(host: Host) -> str:
-    """Retract is taken in every mode but LATCHED."""
+    """Check that an idle device takes a Retract."""
     host.homed()
     was_acknowledged = host.command(Retract)
     host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
@@ -122,7 +122,7 @@ def retract_when_idle(host: Host) -> str:
     moves=True,
 )
 def homing_takes_only_retract(host: Host) -> str:
-    """A homing is ended by a Retract, and by nothing else that a host says."""
+    """Check that of all commands only a Retract ends a homing."""
     host.homed()
     host.obeyed(Home)
     for kind in (Clear, Home):

@@ -1,7 +1,7 @@
-"""The host of one device: it keeps the rhythm, remembers what was said, and brings the device to where a check begins.
+"""The host of one device: it keeps the rhythm, records messages, and brings the device to where a check begins.
 
-A device that does not follow ends the check that wanted it to (`Unmet`). Duties are small, and nothing goes further in
-than INSIDE_MM.
+A device that does not follow ends the check with `Unmet`. Duties are small, and no carriage goes further in than
+INSIDE_MM.
 """
 
 import math
@@ -41,7 +41,7 @@ ANSWER_S: Final = 0.02
 "Within this time an answer that is sent at once has arrived, on any carrier that the position loop bears."
 STATUS_S: Final = 0.02
 SEEN_S: Final = 0.065
-"Three Status: what has happened by now shows in one of them, even where one was lost."
+"Three Status come in this time: the present state shows in one of them, even where one is lost."
 ACKNOWLEDGED_S: Final = 0.5
 OPENED_S: Final = 10.0
 HOMED_S: Final = 12.0
@@ -57,30 +57,30 @@ MOVED_S: Final = 3.0
 OPEN: Final = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
 NO_FAULT: Final = DeviceFault(0)
 STALLED_S: Final = 0.005
-"This process was this late: what the device did then may have been our doing."
+"Lateness of this process from which on it, and not the device, may be to blame for a failed check."
 
 M = TypeVar("M", bound=Message)
 Command = type[Retract] | type[Clear] | type[Home]
 
 
 class Unmet(Exception):  # noqa: N818  (what a device leaves unmet; nothing has gone wrong here)
-    """The device does not do what the page says; the text is what was seen."""
+    """The device does not do what the protocol page says. The text is what was seen."""
 
 
 def told(was_acknowledged: bool) -> str:
-    """How a command went, in words."""
+    """Return whether a command was acknowledged, in words."""
     return "acknowledged" if was_acknowledged else "not acknowledged"
 
 
 def unless(is_wrong: object, seen: str) -> str:
-    """What was seen. Raises Unmet with it where that is wrong."""
+    """Return `seen`; raise Unmet with it if `is_wrong` is true or not empty."""
     if is_wrong:
         raise Unmet(seen)
     return seen
 
 
 class Beat(Enum):
-    """What is sent every millisecond."""
+    """The Drive that is sent every millisecond, or none."""
 
     NOTHING = auto()
     OFF = auto()
@@ -88,7 +88,7 @@ class Beat(Enum):
 
 
 class Heard(NamedTuple):
-    """A message of the device, and when it was here."""
+    """A message of the device, and the time at which it came, s."""
 
     time_s: float
     message: Message
@@ -100,42 +100,46 @@ class Homing(NamedTuple):
     was_acknowledged: bool
     seconds: float
     status: Status
-    """The last one."""
+    """The last Status."""
     modes: tuple[DeviceMode, ...]
-    """As Status showed them, each once in a row."""
+    """The modes in the order in which Status showed them, repetitions left out."""
     first: State | None
-    """The first State after the first Status with HOMED."""
+    """The first State after the first Status with HOMED; None where none came."""
     last: State | None
-    """One a little later, when all has come to rest."""
+    """The last State, when the carriages are at rest; None where none came."""
 
 
 class Silence(NamedTuple):
     """What a device in RUN did when no Drive came any more."""
 
     statuses: tuple[tuple[float, Status], ...]
-    """With the time since the last Drive."""
+    """Each Status, with the time since the last Drive, s."""
     seconds: float
-    """Until the drives were off."""
+    """The time from the last Drive until the drives were off, or until the host waited no longer."""
     status: Status
-    """The last one."""
+    """The last Status."""
 
 
 class Host:
-    """One conversation. `heard` is what came since `forget`; `newest` the last message of each kind."""
+    """One conversation with a device.
+
+    `heard` are the messages since `forget`, `newest` is the last message of each type. All methods that wait or send
+    raise OSError when the line is gone.
+    """
 
     def __init__(self, line: Line) -> None:
         self.line = line
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
         self.refused: dict[str, int] = {}
-        """What came in whole frames and was no message of a device, and how often."""
+        """Whole frames that held no message of a device: what was wrong with them, and how often."""
         self.resets = 0
-        """Times a nonce of 0 came after another one."""
+        """How often a Status with nonce 0 followed one with another nonce."""
         self.contradictions: dict[str, int] = {}
-        """What Status said of itself that cannot be, and how often."""
+        """Contradictions within a Status, and how often each came."""
         self.homings: list[Homing] = []
         self.stalled_s = 0.0
-        """How late this process was at worst since `begin`."""
+        """The greatest lateness of this process since `begin`."""
         self.drive_s = line.now_s()
         """When the last good Drive was sent."""
         self.counter = 0
@@ -150,11 +154,11 @@ class Host:
     # -- what is sent ------------------------------------------------------------------------------------------------
 
     def send(self, message: Message) -> None:
-        """One message, whole."""
+        """Send one message in a whole frame."""
         self.line.send(FUNCTION[type(message)], encode(message))
 
     def drive(self, mode: DriveMode, left: float = 0.0, right: float = 0.0) -> None:
-        """The next Drive."""
+        """Send the next Drive, its counter one higher."""
         self.counter = (self.counter + 1) % 256
         self.drive_s = self.now_s
         self.send(Drive(left, right, mode, self.counter))
@@ -166,19 +170,19 @@ class Host:
         nonce: int = HELLO_NONCE,
         beat: Beat = Beat.NOTHING,
     ) -> None:
-        """One Hello, and the time for its answer."""
+        """Send one Hello, and wait for the time of its answer with `beat` going on."""
         self.send(Hello(schema_hash, version, nonce))
         self.pass_time(ANSWER_S, beat)
 
     def new_nonce(self) -> int:
-        """One that the device has not accepted."""
+        """Return a nonce that the device has not accepted last: 1 to 254, counting on."""
         self._nonce = self._nonce % MOST_NONCE + 1
         if self._nonce == self._shown_nonce():
             self._nonce = self._nonce % MOST_NONCE + 1
         return self._nonce
 
     def command(self, kind: Command, beat: Beat = Beat.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
-        """Sends a command until it is acknowledged; whether it was."""
+        """Send a command again and again until a Status acknowledges it; return whether one did within `limit_s`."""
         nonce = self.new_nonce()
         start_s = due_s = self._next_s
         while self.status.command_nonce != nonce:
@@ -191,33 +195,36 @@ class Host:
         return True
 
     def obeyed(self, kind: Command, beat: Beat = Beat.OFF) -> None:
-        """The same of one that has to be. Raises Unmet."""
+        """Send a command as `command` does. Raises Unmet where it is not acknowledged."""
         if not self.command(kind, beat):
             raise Unmet(f"{kind.__name__} not acknowledged: {shown(self.status)}")
 
     def is_refused(self, kind: Command, beat: Beat = Beat.OFF) -> bool:
-        """Whether a command is not acknowledged."""
+        """Send a command for SEEN_S; return whether it is not acknowledged."""
         return not self.command(kind, beat, SEEN_S)
 
     def refuses(self, kind: Command, mode: DeviceMode, beat: Beat = Beat.OFF, *, homed: bool | None = None) -> str:
-        """A command that must not be acknowledged, and leaves the device as it is; as `shows`."""
+        """Send a command that the device must refuse, and return what the next Status shows, as `shows`.
+
+        Raises Unmet where the command is acknowledged, or the device is not in `mode` and, unless None, `homed` so.
+        """
         is_refused = self.is_refused(kind, beat)
         besides = f"{kind.__name__} {told(not is_refused)}"
         return self.shows(mode, beat, homed=homed, besides=besides, wrong=not is_refused)
 
     def beat(self, beat: Beat, left: float = 0.0, right: float = 0.0) -> None:
-        """One millisecond: a Drive, where one is wanted, and whatever comes."""
+        """Send a Drive, unless `beat` is NOTHING, and listen for a millisecond."""
         if beat is not Beat.NOTHING:
             self.drive(DriveMode.RUN if beat is Beat.RUN else DriveMode.OFF, left, right)
         self._listen()
 
     def pass_time(self, seconds: float, beat: Beat = Beat.NOTHING) -> None:
-        """That many milliseconds of it."""
+        """Repeat `beat` every millisecond for a time."""
         for _ in range(round(seconds / PERIOD_S)):
             self.beat(beat)
 
     def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = Beat.OFF) -> bool:
-        """Goes on until then, or for so long; whether it was reached."""
+        """Repeat `beat` every millisecond until `reached()` or for `limit_s`; return whether it was reached."""
         end_s = self._next_s + limit_s
         while not reached():
             if self._next_s >= end_s:
@@ -228,21 +235,21 @@ class Host:
     # -- what came ---------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """A check begins: nothing was heard, and this process was not late."""
+        """Begin a check: forget the messages heard and the lateness, and restart the rhythm from now."""
         self.forget()
         self.stalled_s = 0.0
         self._next_s = self.now_s
 
     def forget(self) -> None:
-        """Forgets what was heard; what is newest is kept."""
+        """Forget the messages heard; `newest` is kept."""
         self.heard.clear()
 
     def all_of(self, kind: type[M]) -> list[tuple[float, M]]:
-        """Those since `forget`, with their times."""
+        """Return the messages of a type since `forget`, with their times."""
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
 
     def last(self, kind: type[M]) -> M:
-        """The newest message of a kind. Raises Unmet where there was none."""
+        """Return the newest message of a type. Raises Unmet where none ever came."""
         message = self.newest[kind].message if kind in self.newest else None
         if not isinstance(message, kind):
             raise Unmet(f"no {kind.__name__} ever came")
@@ -250,13 +257,13 @@ class Host:
 
     @property
     def status(self) -> Status:
-        """The newest Status; one is waited for where there was none."""
+        """The newest Status; waits for the first one. Raises Unmet where none comes."""
         if Status not in self.newest:
             self.until(lambda: Status in self.newest, 10 * STATUS_S, Beat.NOTHING)
         return self.last(Status)
 
     def next_status(self, beat: Beat) -> Status:
-        """One that comes from now on, and shows what has happened by now. Raises Unmet where none comes."""
+        """Wait for a Status that comes from now on, and return it. Raises Unmet where none comes."""
         before = self.newest.get(Status)
         if not self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat):
             raise Unmet(f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
@@ -273,10 +280,10 @@ class Host:
         besides: str = "",
         wrong: object = False,
     ) -> str:
-        """What the next Status shows, behind what was seen `besides`.
+        """Return what the next Status shows, in words, behind what was seen `besides`.
 
-        Raises Unmet with it unless that is this mode and what else is given (`fault`: among others; NO_FAULT: none at
-        all), and where something else was `wrong`.
+        Raises Unmet with these words unless the Status shows `mode` and all that is not None; `fault` may be one of
+        several, NO_FAULT is none at all. Raises it also where `wrong` is true: something else went wrong before.
         """
         status = self.next_status(beat)
         is_right = (
@@ -288,10 +295,11 @@ class Host:
         return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
 
     def _shown_nonce(self) -> int:
-        """Of the newest Status; 0 before there was one."""
+        """Return the nonce in the newest Status; 0 before the first."""
         return self.last(Status).command_nonce if Status in self.newest else 0
 
     def _listen(self) -> None:
+        """Take what comes in the next millisecond, and note how late this process is."""
         self._next_s += PERIOD_S
         for arrival in self.line.receive(self._next_s):
             try:
@@ -304,7 +312,7 @@ class Host:
             else:
                 self._refuse(f"{type(message).__name__}: a host's message")
         late_s = self.now_s - self._next_s
-        if late_s > PERIOD_S:  # no burst makes up for what was missed
+        if late_s > PERIOD_S:  # missed beats are not made up for by a burst
             self.stalled_s = max(self.stalled_s, late_s)
             self._next_s += late_s
 
@@ -312,6 +320,7 @@ class Host:
         self.refused[what] = self.refused.get(what, 0) + 1
 
     def _take(self, heard: Heard) -> None:
+        """Keep a message, and count the resets and contradictions that a Status shows."""
         message = heard.message
         if isinstance(message, Status):
             self.resets += self._shown_nonce() != 0 and message.command_nonce == 0
@@ -323,7 +332,7 @@ class Host:
     # -- where a check begins ----------------------------------------------------------------------------------------
 
     def idle(self) -> None:
-        """IDLE, without a fault, met. Raises Unmet."""
+        """Bring the device to IDLE without a fault, by a Hello, Drive OFF and, in LATCHED, a Clear. Raises Unmet."""
         self.hello()
         self.pass_time(SEEN_S, Beat.OFF)
         resting = (DeviceMode.IDLE, DeviceMode.LATCHED)
@@ -336,12 +345,15 @@ class Host:
             raise Unmet(f"not IDLE without a fault after Hello, Drive OFF and Clear: {shown(status)}")
 
     def without_zero(self) -> None:
-        """IDLE and not homed, if a mismatch takes the zero away as it should; nothing moves. Raises Unmet."""
+        """Take the device's zero away by a mismatched Hello, and bring it to IDLE; nothing moves. Raises Unmet.
+
+        A device that breaks this rule is still homed.
+        """
         self.hello(SCHEMA_HASH ^ 1)
         self.idle()
 
     def homed(self) -> None:
-        """IDLE and homed, at the open end. Raises Unmet."""
+        """Bring the device to IDLE, homed, at both open switches. Raises Unmet."""
         self.idle()
         if not is_homed(self.status):
             self.home()
@@ -351,7 +363,10 @@ class Host:
             raise Unmet(f"Retract does not open: {shown(self.status)}")
 
     def home(self, beat: Beat = Beat.OFF) -> Homing:
-        """One homing of an idle device, whatever comes of it."""
+        """Home an idle device; return how it went, well or not, and add this to `homings`.
+
+        Raises Unmet only where no Status ever came.
+        """
         start_s = self._next_s
         first_heard = len(self.heard)
         was_acknowledged = self.command(Home, beat)
@@ -369,7 +384,7 @@ class Host:
         return homing
 
     def running(self, inside_mm: float = 0.0) -> None:
-        """RUN with a duty of 0, the carriages that far from their open switches. Raises Unmet."""
+        """Bring the device to RUN, duties 0, the carriages `inside_mm` from their open switches. Raises Unmet."""
         self.homed()
         self.pass_time(2 * PERIOD_S, Beat.OFF)
         if not self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, Beat.RUN):
@@ -378,6 +393,7 @@ class Host:
             self._go_in(inside_mm)
 
     def _go_in(self, inside_mm: float) -> None:
+        """Drive both carriages in RUN to `inside_mm` from their open switches. Raises Unmet after MOVED_S."""
         end_s = self._next_s + MOVED_S
         while True:
             state = self.last(State)
@@ -394,9 +410,10 @@ class Host:
         self.pass_time(SEEN_S, Beat.RUN)
 
     def fall_silent(self, meanwhile: Callable[[], None] | None = None) -> Silence:
-        """In RUN, no Drive any more, until the drives are off; `meanwhile` is sent every millisecond.
+        """Send no Drive any more in RUN, until the drives are off, and return what the device did.
 
-        The last Drive goes out so that a Status is due 57 ms after it, when the device has to have noticed.
+        `meanwhile` is called every millisecond, to send other things. The last Drive goes out so that a Status is due
+        57 ms after it, when the device has to have noticed the silence.
         """
         self.next_status(Beat.RUN)
         self.pass_time(3 * PERIOD_S, Beat.RUN)
@@ -409,7 +426,7 @@ class Host:
             if self._next_s > silent_s + SEEN_S + 2 * STATUS_S and self._is_resting():
                 break
             if self._next_s > silent_s + 0.5 and self.status.mode is DeviceMode.RUN:
-                break  # it will not notice any more
+                break  # the device will not notice any more
         seconds = self._next_s - silent_s
         statuses = tuple(
             (one.time_s - silent_s, one.message) for one in self.heard[first_heard:] if isinstance(one.message, Status)
@@ -417,7 +434,7 @@ class Host:
         return Silence(statuses, seconds, self.status)
 
     def latched(self) -> None:
-        """LATCHED, by silence in RUN. Raises Unmet."""
+        """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN; at once where it is. Raises Unmet."""
         status = self.next_status(Beat.NOTHING)
         if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults:
             self.running(INSIDE_MM)
@@ -426,7 +443,10 @@ class Host:
                 raise Unmet(f"silence in RUN does not lead to LATCHED: {shown(self.status)}")
 
     def leave_open(self) -> str:
-        """Opens the gap, whatever the device was doing; what hinders it, in words, empty where it is open."""
+        """Open the gap, whatever the device was doing; return what hinders it, in words, or "" for an open gap.
+
+        Raises Unmet where Status stops coming.
+        """
         self.hello()
         for _ in range(2):
             if Status not in self.newest and not self.until(lambda: Status in self.newest, 0.2):
@@ -446,29 +466,29 @@ class Host:
 
 
 def is_homed(status: Status) -> bool:
-    """Whether the zero is valid."""
+    """Tell whether a Status says HOMED."""
     return Switches.HOMED in status.switches
 
 
 def is_open(status: Status) -> bool:
-    """Whether both carriages are at their open switches."""
+    """Tell whether both carriages are at their open switches."""
     return OPEN in status.switches
 
 
 def shown(status: Status) -> str:
-    """A Status in a few words."""
+    """Return a Status in a few words."""
     faults = "|".join(fault.name or "" for fault in DeviceFault if fault in status.faults) or "no fault"
     switches = "|".join(switch.name or "" for switch in Switches if switch in status.switches) or "no switch"
     return f"{status.mode.name}, {faults}, {switches}, nonce {status.command_nonce}"
 
 
 def positions(state: State) -> str:
-    """Where the carriages are, in a few words."""
+    """Return where the carriages are, in a few words."""
     return f"left {state.left_position_mm:+.2f} mm, right {state.right_position_mm:+.2f} mm"
 
 
 def contradictions(status: Status) -> list[str]:
-    """What cannot be true of one Status at once."""
+    """Return what in one Status cannot be true together, in words; empty where nothing is wrong."""
     found = [
         f"{side}_OPEN with {side}_CLOSED"
         for side in ("LEFT", "RIGHT")
@@ -484,5 +504,5 @@ def contradictions(status: Status) -> list[str]:
 
 
 def usual(values: list[float]) -> float:
-    """The median; NaN of nothing."""
+    """Return the median of some values; NaN of none."""
     return sorted(values)[len(values) // 2] if values else math.nan

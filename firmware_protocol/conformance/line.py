@@ -1,4 +1,4 @@
-"""What carries messages between this host and a device, with its clock; and what can be damaged on it."""
+"""Lines: they carry frames between the kit and a device, have a clock, and can send damaged frames."""
 
 from collections.abc import Mapping
 from typing import Final, NamedTuple, Protocol, TypeAlias
@@ -8,11 +8,11 @@ from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, cobs
 
 NODES: Final = 16
 NOISE: Final = bytes((0x55, 0xAA, 0xFF, 0x01, 0x7E, 0x80, 0x0D, 0x0A, 0x11, 0x13)) * 3
-"Neither a frame nor without the bytes that terminals take for more than bytes."
+"No frame; among its bytes are those that a terminal acts on, XON and XOFF, CR and LF."
 
 
 class Arrival(NamedTuple):
-    """The payload of one whole frame, and when it was here."""
+    """The payload of one whole frame, its function, and the time at which it came, s."""
 
     time_s: float
     function: int
@@ -23,38 +23,38 @@ class BytePort(Protocol):
     """A serial port and a clock, real or virtual."""
 
     def now_s(self) -> float:
-        """The time, from any start; it never falls."""
+        """Return the time, from any start; it never falls."""
 
     def write(self, data: bytes) -> None:
-        """Sends bytes. Raises OSError when the port is gone."""
+        """Send bytes. Raises OSError when the port is gone."""
 
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Waits until then; what came, with its times. Raises OSError when the port is gone."""
+        """Wait until `until_s`; return what came, with its times. Raises OSError when the port is gone."""
 
     def close(self) -> None:
-        """Gives the port back."""
+        """Close the port."""
 
 
 class FramePort(Protocol):
-    """A CAN bus and a clock, real or virtual. Classical frames with 11-bit identifiers."""
+    """A CAN bus and a clock, real or virtual. Frames are classical, with 11-bit identifiers."""
 
     def now_s(self) -> float:
-        """The time, from any start; it never falls."""
+        """Return the time, from any start; it never falls."""
 
     def write(self, identifier: int, data: bytes) -> None:
-        """Sends a frame. Raises OSError when the bus is gone."""
+        """Send a frame. Raises OSError when the bus is gone."""
 
     def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
-        """Waits until then; times, identifiers and data of what came. Raises OSError when the bus is gone."""
+        """Wait until `until_s`; return the time, identifier and data of each frame. Raises OSError for a lost bus."""
 
     def close(self) -> None:
-        """Gives the bus back."""
+        """Close the bus."""
 
 
 class SerialLine:
     """One conversation with one device, in frames of COBS and CRC-16 on a serial port.
 
-    Whatever uses the port raises OSError when it is gone.
+    Every method that uses the port raises OSError when it is gone.
     """
 
     def __init__(self, port: BytePort) -> None:
@@ -65,17 +65,18 @@ class SerialLine:
         port.write(DELIMITER)  # ends whatever was there before
 
     def now_s(self) -> float:
-        """The port's clock."""
+        """Return the time of the port's clock."""
         return self._port.now_s()
 
     def send(self, function: int, payload: bytes) -> None:
-        """One frame, with the next sequence number."""
+        """Send one frame, with the next sequence number."""
         self._port.write(self._frame(function, payload))
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """What this carrier can do to a frame, by name, as what `send_damaged` takes, each to be ignored.
+        """Return damaged forms of a frame, by the kind of damage, for `send_damaged`; a device has to ignore each.
 
-        Each ends with a delimiter, so that the frame after it is whole."""
+        Every form ends with a delimiter, so that the frame after it is whole. Takes one sequence number.
+        """
         frame = self._frame(function, payload)
         body = frame[:-1]
         middle = len(body) // 2
@@ -93,11 +94,11 @@ class SerialLine:
         }
 
     def send_damaged(self, unit: bytes) -> None:
-        """Bytes as they are."""
+        """Send bytes as they are."""
         self._port.write(unit)
 
     def receive(self, until_s: float) -> list[Arrival]:
-        """The whole frames."""
+        """Wait until `until_s`, and return the whole frames that came."""
         arrivals = [
             Arrival(time_s, frame.function, frame.payload)
             for time_s, data in self._port.read(until_s)
@@ -109,62 +110,72 @@ class SerialLine:
         return arrivals
 
     def close(self) -> None:
-        """Gives the port back."""
+        """Close the port."""
         self._port.close()
 
     def _frame(self, function: int, payload: bytes) -> bytes:
+        """Return a whole frame, and count the sequence on."""
         frame = encode_frame(function, self._sequence, payload)
         self._sequence = (self._sequence + 1) % 256
         return frame
 
     @property
     def frame_errors(self) -> dict[str, int]:
-        """From the first whole frame on, if one ever came: before it the line was not ours."""
+        """What was wrong with the device's frames, and how often; empty where nothing was.
+
+        Counted from the first whole frame on: before it, the line carried something else.
+        """
         statistics = self._decoder.statistics
         now = statistics.corrupt, statistics.lost, statistics.repeated
         corrupt, lost, repeated = (count - before for count, before in zip(now, self._before or (1, 0, 0), strict=True))
         errors = {
             f"not a frame ({statistics.refused.get('frame', '')})": corrupt,
-            "missing from the sequence": lost - corrupt,  # one that came damaged is missing, and is one error
+            "missing from the sequence": lost - corrupt,  # a damaged frame is missing too, and is one error
             "sequence number repeated": repeated,
         }
         return {what: count for what, count in errors.items() if count > 0}
 
 
 class CanLine:
-    """The same conversation, its payloads the data of CAN frames of one node."""
+    """One conversation with one device, a node on a CAN bus: payloads are the data of CAN frames.
+
+    Every method that uses the bus raises OSError when it is gone.
+    """
 
     def __init__(self, port: FramePort, node: int) -> None:
-        """Raises EncodeError for a node outside 0..15."""
+        """Begin a conversation with `node`. Raises EncodeError for a node outside 0..15."""
         can_identifier(1, node)
         self._port, self._node = port, node
         self._others: set[int] = set()
 
     @property
     def frame_errors(self) -> dict[str, int]:
-        """None: the controllers check frames, and what they discard is not seen."""
+        """Always empty: the CAN controllers check frames, and what they discard is not seen."""
         return {}
 
     def now_s(self) -> float:
-        """The bus's clock."""
+        """Return the time of the bus's clock."""
         return self._port.now_s()
 
     def send(self, function: int, payload: bytes) -> None:
-        """One frame to our node."""
+        """Send one frame to the node."""
         self._port.write(can_identifier(function, self._node), payload)
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """A whole frame to a node that nobody has spoken for: a Drive to another brake would be obeyed there."""
+        """Return whole frames to other nodes, for `send_damaged`; the device has to ignore them.
+
+        Only to nodes that no frame has come from: a Drive to another brake would be obeyed there. Empty without such.
+        """
         free = [node for node in range(NODES) if node != self._node and node not in self._others]
         frames = tuple(can_identifier(function, node).to_bytes(2, "big") + payload for node in free[:2])
         return {"other_node": frames} if frames else {}
 
     def send_damaged(self, unit: bytes) -> None:
-        """Two bytes of identifier, then the data."""
+        """Send a frame that is given as two bytes of identifier and its data."""
         self._port.write(int.from_bytes(unit[:2], "big"), unit[2:])
 
     def receive(self, until_s: float) -> list[Arrival]:
-        """The frames of our node."""
+        """Wait until `until_s`, and return the frames of the node; note which other nodes are on the bus."""
         arrivals = []
         for time_s, identifier, data in self._port.read(until_s):
             if identifier & 0xF == self._node:
@@ -174,7 +185,7 @@ class CanLine:
         return arrivals
 
     def close(self) -> None:
-        """Gives the bus back."""
+        """Close the bus."""
         self._port.close()
 
 

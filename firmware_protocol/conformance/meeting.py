@@ -1,4 +1,4 @@
-"""Hello and Identity, schema and version, and what a mismatch leads to. Nothing moves."""
+"""Checks of Hello and Identity, schema and version, and of what a mismatch leads to. Nothing moves."""
 
 from typing import Final
 
@@ -13,7 +13,7 @@ HELLOS = 3
 
 @check(PAGE, f"{HELLOS} Hellos", "one Identity each, at once", is_gate=True)
 def identity_answers_hello(host: Host) -> str:
-    """Who is there, and does it answer always."""
+    """Check that the device answers each Hello with one Identity."""
     for _ in range(HELLOS):
         host.hello()
     count = len(host.all_of(Identity))
@@ -28,7 +28,7 @@ def identity_answers_hello(host: Host) -> str:
     is_gate=True,
 )
 def schema_hash(host: Host) -> str:
-    """Both were built from the same tormag.dbc."""
+    """Check that firmware and kit were built from the same tormag.dbc; tells apart a reversed byte order."""
     host.hello()
     theirs = host.last(Identity).schema_hash
     seen = f"schema {theirs:08X}, bytes {theirs.to_bytes(4, 'little').hex(' ')}"
@@ -40,7 +40,7 @@ def schema_hash(host: Host) -> str:
 
 @check("Who says what when, 5", "Hello with nonce 255, 77, 77, 255", "the next Status shows each")
 def hello_nonce(host: Host) -> str:
-    """A Hello's nonce counts as accepted."""
+    """Check that the nonce of a Hello counts as accepted: the next Status shows it."""
     seen = []
     for nonce in (255, 77, 77, 255):
         host.hello(nonce=nonce)
@@ -51,6 +51,7 @@ def hello_nonce(host: Host) -> str:
 
 
 def _mismatch(host: Host, schema: int, version: int) -> str:
+    """Send an idle device a Hello of this schema and version. Raises Unmet unless it answers once and latches."""
     host.idle()
     host.forget()
     host.hello(schema, version)
@@ -66,19 +67,19 @@ def _mismatch(host: Host, schema: int, version: int) -> str:
 
 @check(PAGE, "Hello with another schema hash", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
 def schema_mismatch(host: Host) -> str:
-    """A device does not run for a host of another schema."""
+    """Check that a device latches for a host of another schema."""
     return _mismatch(host, SCHEMA_HASH ^ 1, PROTOCOL_VERSION)
 
 
 @check(PAGE, "Hello with another protocol version", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
 def version_mismatch(host: Host) -> str:
-    """Nor for one of another version."""
+    """Check that a device latches for a host of another protocol version."""
     return _mismatch(host, SCHEMA_HASH, (PROTOCOL_VERSION + 1) % 256)
 
 
 @check(CLEARING, "Hello with another schema hash, then Clear", "Clear not acknowledged, still LATCHED")
 def mismatch_holds(host: Host) -> str:
-    """The cause is not gone."""
+    """Check that Clear does not take away a mismatch while its cause is there."""
     schema_mismatch.perform(host)
     host.refuses(Clear, DeviceMode.LATCHED)
     return host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH)
@@ -90,7 +91,7 @@ def mismatch_holds(host: Host) -> str:
     "Clear acknowledged; IDLE, no fault, not HOMED",
 )
 def clear_clears(host: Host) -> str:
-    """Clear takes away a fault whose cause is gone, and brings back no zero."""
+    """Check that Clear takes away a fault whose cause is gone, and brings back no zero."""
     schema_mismatch.perform(host)
     host.hello()
     host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH, besides="after the right Hello, before Clear")
@@ -100,7 +101,7 @@ def clear_clears(host: Host) -> str:
 
 @check("Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
 def run_needs_homing(host: Host) -> str:
-    """Without a zero nothing runs."""
+    """Check that a device without a zero does not run."""
     host.without_zero()
     if is_homed(host.status):
         raise Unmet(f"HOMED even after a mismatch and a Clear: {shown(host.status)}")

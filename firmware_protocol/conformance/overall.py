@@ -1,4 +1,4 @@
-"""What can only be said at the end: of all that came, and of how the device is left."""
+"""Checks at the end: of all messages that came, and of how the device is left."""
 
 from typing import Final
 
@@ -10,26 +10,29 @@ ALL = "everything, from the start on"
 
 @check("Messages", ALL, "only messages that pass: length, CRC-8, ranges; those of a device")
 def own_messages(host: Host) -> str:
-    """No message of the device was refused."""
+    """Check that no message of the device was refused."""
     return unless(host.refused, listed(host.refused) or "all passed")
 
 
 @check("Carriers", ALL, "whole frames, their sequence one more each time (on CAN the controllers see to it)")
 def own_frames(host: Host) -> str:
-    """COBS, CRC-16 and sequence of the device's frames."""
+    """Check COBS, CRC-16 and sequence of the device's frames."""
     errors = host.line.frame_errors
     return unless(errors, listed(errors) or "all whole")
 
 
 @check("Who says what when, 5", ALL, "no reset: the nonce in Status never falls back to 0")
 def no_reset(host: Host) -> str:
-    """Nothing that a host says resets a device."""
+    """Check that nothing that the host sent has reset the device."""
     return unless(host.resets, f"the nonce fell back to 0 {host.resets} times")
 
 
 @check("Modes", ALL, "Status does not contradict itself")
 def status_consistent(host: Host) -> str:
-    """No switch at both ends, no LATCHED without a fault or with a zero, no fault in IDLE or RUN."""
+    """Check that no Status contradicts itself.
+
+    No carriage is at both ends, LATCHED is never without a fault or with a zero, IDLE and RUN are never with a fault.
+    """
     return unless(host.contradictions, listed(host.contradictions) or f"at last {shown(host.status)}")
 
 
@@ -39,14 +42,14 @@ def status_consistent(host: Host) -> str:
     "both open switches, drives off",
 )
 def left_open(host: Host) -> str:
-    """However it went, the device is left in its safe state."""
+    """Open the gap, and check that it is open: however it went, the device is left in its safe state."""
     if hindrance := host.leave_open():
         raise Unmet(f"THE GAP MAY BE SHUT: {hindrance}")
     return shown(host.status)
 
 
 def listed(counts: dict[str, int]) -> str:
-    """Things and how often, in words."""
+    """Return things and how often each came, in words."""
     return ", ".join(f"{what}, {count} times" for what, count in counts.items())
 
 

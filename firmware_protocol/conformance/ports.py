@@ -18,7 +18,7 @@ from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 
 READ_BYTES: Final = 4096
 PATIENCE_S: Final = 1.0
-"A port that takes nothing for so long is gone."
+"A port that takes nothing for this time is gone."
 
 
 @final
@@ -26,7 +26,7 @@ class SerialPort:
     """An open, exclusively held serial port: a `BytePort`."""
 
     def __init__(self, path: str, baud: int) -> None:
-        """Raises OSError."""
+        """Open the port at `path`, with its latency timer at 1 ms where it has one. Raises OSError."""
         try:
             self._port = serial.Serial(path, baud, timeout=0, write_timeout=PATIENCE_S, exclusive=True)
             self._port.reset_input_buffer()
@@ -37,15 +37,15 @@ class SerialPort:
             self._port.set_low_latency_mode(True)
 
     def now_s(self) -> float:
-        """The monotonic clock."""
+        """Return the time of the monotonic clock."""
         return time.monotonic()
 
     def write(self, data: bytes) -> None:
-        """Raises OSError."""
+        """Send bytes. Raises OSError when the port is gone, or takes nothing for PATIENCE_S."""
         self._port.write(data)
 
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Raises OSError."""
+        """Wait until `until_s`; return what came, with its times. Raises OSError when the device was unplugged."""
         came: list[tuple[float, bytes]] = []
         while (left_s := until_s - time.monotonic()) > 0.0 or not came:
             if select.select([self._port.fileno()], [], [], max(left_s, 0.0))[0]:
@@ -58,7 +58,7 @@ class SerialPort:
         return came
 
     def close(self) -> None:
-        """Gives the port back, and does not wait for what was not sent."""
+        """Close the port without waiting for unsent bytes. Errors of a port that is gone are ignored."""
         with contextlib.suppress(OSError, termios.error):  # it may be gone
             self._port.reset_output_buffer()
             self._port.close()
@@ -66,10 +66,10 @@ class SerialPort:
 
 @final
 class CanPort:
-    """An open bus: a `FramePort`."""
+    """An open CAN bus: a `FramePort`."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
-        """Raises OSError."""
+        """Open a bus by python-can; `baud` is of an adapter's serial port. Raises OSError."""
         settings: dict[str, Any] = {}
         if interface == "slcan":  # by default it sleeps for 2 s when it opens
             settings = {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0}
@@ -84,18 +84,18 @@ class CanPort:
             raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
 
     def now_s(self) -> float:
-        """The monotonic clock."""
+        """Return the time of the monotonic clock."""
         return time.monotonic()
 
     def write(self, identifier: int, data: bytes) -> None:
-        """Raises OSError."""
+        """Send a frame. Raises OSError when the bus is gone, or takes nothing for PATIENCE_S."""
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=PATIENCE_S)
         except can.CanError as error:
             raise OSError(str(error)) from error
 
     def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
-        """Raises OSError."""
+        """Wait until `until_s`; return the time, identifier and data of each frame. Raises OSError for a lost bus."""
         came: list[tuple[float, int, bytes]] = []
         while True:
             left_s = until_s - time.monotonic()
@@ -107,16 +107,20 @@ class CanPort:
                 return came
 
     def close(self) -> None:
-        """Gives the bus back."""
+        """Close the bus. Errors of a bus that is gone are ignored."""
         with contextlib.suppress(can.CanError, OSError):  # it may be gone
             self._bus.shutdown()
 
     def _received(self) -> can.Message | None:
+        """Return a classical data frame with an 11-bit identifier; None for any other, and where none is there.
+
+        Raises OSError when the bus is gone.
+        """
         try:
             frame = self._bus.recv(0)
         except (can.CanError, OSError) as error:
             if isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError):
-                self._bus.flush()  # it would keep a line that is no text for ever
+                self._bus.flush()  # python-can would keep a line that is no text for ever
                 return None
             raise OSError(str(error)) from error
         except (ValueError, IndexError):  # how slcan says that a line of the adapter's is damaged
@@ -127,7 +131,10 @@ class CanPort:
 
 
 def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:
-    """A serial line by its path, a bus as INTERFACE:CHANNEL. Raises OSError saying why not."""
+    """Open a line: a serial port by its path, a CAN bus as INTERFACE:CHANNEL. Raises OSError saying why not.
+
+    Also EncodeError for a node outside 0..15.
+    """
     interface, colon, channel = name.partition(":")
     if colon and interface in BACKENDS:
         return CanLine(CanPort(interface, channel, bitrate, baud), node)

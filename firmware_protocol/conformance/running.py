@@ -1,4 +1,4 @@
-"""RUN: how it is entered, what the duties do, what ends it and what does not. Duties are small, ways are short."""
+"""Checks of RUN: how it is entered, what the duties do, what ends it. Duties are small, ways are short."""
 
 from typing import Final
 
@@ -37,13 +37,13 @@ MOVED_MM: Final = 0.3
 AT_STOP_DUTY: Final = 0.3
 AT_STOP_MM: Final = 0.1
 AT_STOP_A: Final = 0.3
-"""A motor that pushes into the stop draws several times this at that duty."""
+"""A motor that pushes into the stop at AT_STOP_DUTY draws several times this."""
 BEGUN_MM: Final = 0.1
 BEGUN_S: Final = 0.2
 OPEN_S: Final = 0.8
-"""From INSIDE_MM in a carriage has begun to open after the first, and is open after the second."""
+"""A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."""
 GIVEN_UP_S: Final = 7.0
-"""By then a device that cannot open has said so, from anywhere."""
+"""A device that cannot open, from anywhere, has said so after this time."""
 IN_TIME: Final = (
     f"RETRACTING, both out by {BEGUN_MM:g} mm in {BEGUN_S:g} s; in {OPEN_S:g} s IDLE, open, HOMED, no fault"
 )
@@ -52,7 +52,7 @@ RUNNING: Final = f"in RUN, {INSIDE_MM:g} mm in, "
 
 @check(PAGE, "homed, Drive OFF, then Drive RUN with a duty of 0", "RUN", moves=True)
 def run_is_entered(host: Host) -> str:
-    """Homed, met, no fault: a Drive that asks for it is enough."""
+    """Check that a Drive RUN is enough to enter RUN for a device that is homed, without a fault, after a Hello."""
     host.running()
     return shown(host.status)
 
@@ -65,7 +65,7 @@ def run_is_entered(host: Host) -> str:
     is_gate=True,
 )
 def left_duty(host: Host) -> str:
-    """Side and sign: with either wrong, every safe state closes the gap."""
+    """Check side and sign of the left duty: with either wrong, every safe state closes the gap."""
     return _duty_moves(host, is_left=True)
 
 
@@ -77,11 +77,12 @@ def left_duty(host: Host) -> str:
     is_gate=True,
 )
 def right_duty(host: Host) -> str:
-    """The other side."""
+    """Check side and sign of the right duty."""
     return _duty_moves(host, is_left=False)
 
 
 def _duty_moves(host: Host, *, is_left: bool) -> str:
+    """Lower one duty slowly. Raises Unmet unless its carriage goes in by MOVED_MM while the other one stays."""
     host.running()
     start = host.last(State)
     for step in range(round(MOST_DUTY / RAMP_PER_S / PERIOD_S)):
@@ -104,7 +105,7 @@ def _duty_moves(host: Host, *, is_left: bool) -> str:
     moves=True,
 )
 def open_switch_stops(host: Host) -> str:
-    """A carriage at its open switch is not driven out into the stop."""
+    """Check that a carriage at its open switch is not driven out into the stop."""
     host.running()
     if not is_open(host.status):
         raise Unmet(f"not at the open switches: {shown(host.status)}")
@@ -124,7 +125,7 @@ def open_switch_stops(host: Host) -> str:
 
 
 def _moved_mm(host: Host, start: State) -> tuple[float, float]:
-    """How far left and right are from where they were."""
+    """Return how far the left and the right carriage are from their positions in `start`, mm; positive is out."""
     state = host.last(State)
     return state.left_position_mm - start.left_position_mm, state.right_position_mm - start.right_position_mm
 
@@ -136,7 +137,7 @@ def _moved_mm(host: Host, start: State) -> tuple[float, float]:
     moves=True,
 )
 def off_opens(host: Host) -> str:
-    """Parting: the gap opens, and nothing is latched."""
+    """Check that Drive OFF ends RUN: the gap opens, and nothing is latched."""
     host.running(INSIDE_MM)
     return _opens(host, Beat.OFF)
 
@@ -148,13 +149,14 @@ def off_opens(host: Host) -> str:
     moves=True,
 )
 def retract_opens(host: Host) -> str:
-    """A Retract is stronger than a Drive."""
+    """Check that a Retract opens the gap though Drive RUN goes on."""
     host.running(INSIDE_MM)
     host.obeyed(Retract, Beat.RUN)
     return _opens(host, Beat.RUN)
 
 
 def _opens(host: Host, beat: Beat) -> str:
+    """Watch the gap open, with `beat` going on. Raises Unmet where it does not begin, is late, or ends wrong."""
     start = host.last(State)
     host.shows(DeviceMode.RETRACTING, beat, besides=f"from {positions(start)}")
     seen = f"from {positions(start)} to "
@@ -175,7 +177,7 @@ def _is_over(host: Host) -> bool:
 
 
 def _given_up(host: Host, beat: Beat) -> str:
-    """What a device says that does not open in time: it has to."""
+    """Return what a device that does not open in time says of it, within GIVEN_UP_S; it has to say RETRACT_FAILED."""
     said = host.until(lambda: _is_over(host) or DeviceFault.RETRACT_FAILED in host.status.faults, GIVEN_UP_S, beat)
     return f"then {shown(host.status)}" if said else f"and says nothing of it in {GIVEN_UP_S:g} s"
 
@@ -187,7 +189,7 @@ def _given_up(host: Host, beat: Beat) -> str:
     moves=True,
 )
 def let_go_after_retract(host: Host) -> str:
-    """Who was put off RUN has to let go once before it gets there again."""
+    """Check that RUN, ended by a Retract, comes back only after a Drive OFF."""
     host.running()
     host.obeyed(Retract, Beat.RUN)
     host.until(lambda: host.status.mode is not DeviceMode.RETRACTING, OPENED_S, Beat.RUN)
@@ -195,7 +197,10 @@ def let_go_after_retract(host: Host) -> str:
 
 
 def has_to_let_go(host: Host) -> str:
-    """From IDLE, Drive RUN going on. Raises Unmet where RUN comes before a Drive OFF, or not after it."""
+    """Send Drive RUN to an idle device, one Drive OFF, then Drive RUN again.
+
+    Raises Unmet where RUN comes before the Drive OFF, or not after it.
+    """
     host.pass_time(SEEN_S, Beat.RUN)
     host.shows(DeviceMode.IDLE, Beat.RUN, besides="before a Drive OFF")
     host.beat(Beat.OFF)
@@ -205,21 +210,21 @@ def has_to_let_go(host: Host) -> str:
 
 @check("What each mode takes", "Home in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
 def home_refused_in_run(host: Host) -> str:
-    """A homing would take the brake out of the host's hands."""
+    """Check that Home is refused in RUN: a homing would take the brake out of the host's hands."""
     host.running()
     return host.refuses(Home, DeviceMode.RUN, Beat.RUN, homed=True)
 
 
 @check("What each mode takes", "Clear in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
 def clear_refused_in_run(host: Host) -> str:
-    """Clear is for drives that are off."""
+    """Check that Clear is refused in RUN: it is for drives that are off."""
     host.running()
     return host.refuses(Clear, DeviceMode.RUN, Beat.RUN, homed=True)
 
 
 @check("Who says what when, 1", "the right Hello in RUN", "Identity; stays RUN and HOMED", moves=True)
 def hello_in_run(host: Host) -> str:
-    """The host says it every second, to hear of a device that was reset."""
+    """Check that a right Hello is answered in RUN and changes nothing; the host sends one every second."""
     host.running()
     host.forget()
     for nonce in (host.status.command_nonce, 77):
@@ -236,7 +241,7 @@ def hello_in_run(host: Host) -> str:
     moves=True,
 )
 def mismatch_in_run(host: Host) -> str:
-    """Another host has come, that does not know what it says."""
+    """Check that a Hello of another schema in RUN opens the gap: a host has come that does not know the protocol."""
     host.running(INSIDE_MM)
     host.hello(SCHEMA_HASH ^ 1, beat=Beat.RUN)
     if (status := host.next_status(Beat.RUN)).mode is DeviceMode.RUN:
@@ -252,7 +257,7 @@ def mismatch_in_run(host: Host) -> str:
     moves=True,
 )
 def retracting_takes_only_retract(host: Host) -> str:
-    """What opens is not turned round."""
+    """Check that a device that opens refuses Home and takes Retract."""
     host.running(INSIDE_MM)
     host.shows(DeviceMode.RETRACTING, besides="after Drive OFF")
     is_refused = host.is_refused(Home)

@@ -1,4 +1,4 @@
-"""The host falls silent in RUN: when that is noticed, what the device does, and what it takes until it runs again."""
+"""Checks of silence in RUN: when the device notices, what it does then, and what it takes until it runs again."""
 
 from typing import Final
 
@@ -38,16 +38,16 @@ from firmware_protocol.conformance.running import has_to_let_go
 PAGE: Final = "Who says what when, 6"
 LATCHES: Final = "What each mode takes"
 SHORT_S: Final = 0.044
-"""With a period of the host's and a device's tick it is under 50 ms."""
+"""A silence that, with a period of the host and a tick of the device, is under 50 ms."""
 NOTICED_S: Final = 0.054
-"""50 ms, a tick of the device, and what a Status takes to get here."""
+"""50 ms, a tick of the device, and the time that a Status is on its way."""
 SILENT: Final = f"in RUN, {INSIDE_MM:g} mm in, no Drive any more"
 LATCHED: Final = "LATCHED by silence, "
 
 
 @check(PAGE, f"in RUN, {SHORT_S * 1e3:g} ms without a Drive, three times", "stays RUN, no fault", moves=True)
 def short_silence_is_borne(host: Host) -> str:
-    """50 ms are the host's to use."""
+    """Check that silences of SHORT_S change nothing: up to 50 ms are allowed."""
     host.running()
     seen = ""
     for _ in range(3):
@@ -58,7 +58,7 @@ def short_silence_is_borne(host: Host) -> str:
 
 
 def _judged(silence: Silence) -> str:
-    """Raises Unmet where the device was too early or too late."""
+    """Return what the first Status after NOTICED_S shows. Raises Unmet unless it shows COMMAND_TIMEOUT and no RUN."""
     late = [(at_s, status) for at_s, status in silence.statuses if at_s > NOTICED_S]
     if not late:
         raise Unmet("no Status after the last Drive")
@@ -74,14 +74,14 @@ def _judged(silence: Silence) -> str:
     moves=True,
 )
 def silence_is_noticed(host: Host) -> str:
-    """50 ms on the device's clock, and a tick."""
+    """Check that the device notices silence after 50 ms on its clock, and a tick."""
     host.running(INSIDE_MM)
     return _judged(host.fall_silent())
 
 
 @check(PAGE, SILENT, "both carriages go to their open switches, then the drives are off", moves=True)
 def silence_opens(host: Host) -> str:
-    """Opening is the safe way: friction holds, and the magnets pull shut."""
+    """Check that the device opens the gap on silence, then switches the drives off."""
     host.running(INSIDE_MM)
     before = positions(host.last(State))
     silence = host.fall_silent()
@@ -97,7 +97,7 @@ def silence_opens(host: Host) -> str:
     moves=True,
 )
 def only_good_drives_extend(host: Host) -> str:
-    """Nothing but a good Drive extends the 50 ms."""
+    """Check that only a good Drive extends the 50 ms: not a repeated or damaged one, a Clear or a Hello."""
     host.running()
     bad_counter = 0
 
@@ -118,7 +118,7 @@ def only_good_drives_extend(host: Host) -> str:
 
 @check(PAGE, f"{LATCHED}Drive OFF every 1 ms for 0.3 s", "stays LATCHED with COMMAND_TIMEOUT, not HOMED", moves=True)
 def silence_latches(host: Host) -> str:
-    """A fault stays until it is cleared, and takes the zero away."""
+    """Check that the fault of silence stays until it is cleared, and takes the zero away."""
     host.running(INSIDE_MM)
     host.fall_silent()
     host.pass_time(0.3, Beat.OFF)
@@ -127,7 +127,7 @@ def silence_latches(host: Host) -> str:
 
 @check(LATCHES, f"{LATCHED}Drive RUN with a duty of 0", "stays LATCHED; each Drive is answered", moves=True)
 def latched_refuses_run(host: Host) -> str:
-    """Measuring goes on, running does not."""
+    """Check that a latched device does not run, and answers each Drive all the same."""
     host.latched()
     host.forget()
     host.pass_time(SEEN_S, Beat.RUN)
@@ -137,21 +137,21 @@ def latched_refuses_run(host: Host) -> str:
 
 @check(LATCHES, f"{LATCHED}Home", "not acknowledged, stays LATCHED", moves=True)
 def latched_refuses_home(host: Host) -> str:
-    """First the fault is cleared."""
+    """Check that a latched device refuses Home: the fault is cleared first."""
     host.latched()
     return host.refuses(Home, DeviceMode.LATCHED)
 
 
 @check(LATCHES, f"{LATCHED}Retract", "not acknowledged, stays LATCHED", moves=True)
 def latched_refuses_retract(host: Host) -> str:
-    """It has opened already, or cannot."""
+    """Check that a latched device refuses Retract: it has opened already, or cannot."""
     host.latched()
     return host.refuses(Retract, DeviceMode.LATCHED)
 
 
 @check(LATCHES, f"{LATCHED}Clear, then Drive RUN", "acknowledged, no fault, not HOMED; stays IDLE", moves=True)
 def cleared_is_not_homed(host: Host) -> str:
-    """After a fault the zero is found anew."""
+    """Check that a Clear brings back no zero: after a fault the device has to home again."""
     host.latched()
     host.obeyed(Clear)
     host.pass_time(SEEN_S, Beat.RUN)
@@ -165,7 +165,7 @@ def cleared_is_not_homed(host: Host) -> str:
     moves=True,
 )
 def let_go_after_fault(host: Host) -> str:
-    """A host that knows of no fault does not run on through it."""
+    """Check that RUN comes back after a fault only by a Drive OFF, for a host that did not see the fault."""
     host.running(INSIDE_MM)
     host.fall_silent()
     host.obeyed(Clear, Beat.RUN)

@@ -1,4 +1,4 @@
-"""State, Sense and Status: how often, in which order, how soon, by which clock. Nothing moves."""
+"""Checks of State, Sense and Status: how often, in which order, how soon, by which clock. Nothing moves."""
 
 from itertools import pairwise
 from typing import Final
@@ -22,30 +22,31 @@ LISTENED_S = 1.0
 CLOCKED_S = 3.0
 PAIRS = 200
 WINDOW = 300
-"""States in which the clocks are compared once; the median of all counts, because a step of either is no rate."""
+"""States of one comparison of the clocks; the median of all comparisons counts, because a step is no rate."""
 ENDS = 50
-"""States at either end of a window; the promptest of them counts."""
+"""States at either end of a window; the least delayed of them counts."""
 MOST_LOST = 0.01
 STATUS_TOLERANCE = 0.03
 MOST_DRIFT = 0.01
 MOST_ANSWER_S = 5e-3
-"""What the daemon calls LINK_DEGRADED."""
+"""Above this the daemon reports LINK_DEGRADED."""
 TIME_SPAN_S = period(State, "device_time_s")
 
 
 @check(STATUS, f"nothing for {LISTENED_S:g} s", "50 Status a second, 3 % more or less, on the device's own clock")
 def status_without_host(host: Host) -> str:
-    """Status needs nobody."""
+    """Check that Status comes at its rate without a host."""
     return _status_rate(host, Beat.NOTHING)
 
 
 @check(STATUS, f"Drive OFF every 1 ms for {LISTENED_S:g} s", "50 Status a second, 3 % more or less")
 def status_with_host(host: Host) -> str:
-    """Nor do Drives hinder it."""
+    """Check that Status comes at its rate while Drives come."""
     return _status_rate(host, Beat.OFF)
 
 
 def _status_rate(host: Host, beat: Beat) -> str:
+    """Listen for LISTENED_S. Raises Unmet for a wrong rate of Status, or a gap of over two and a half periods."""
     start_s = host.now_s
     host.pass_time(LISTENED_S, beat)
     times = [time_s for time_s, _ in host.all_of(Status)]
@@ -54,23 +55,24 @@ def _status_rate(host: Host, beat: Beat) -> str:
     period_s = (times[-1] - times[0]) / (len(times) - 1)
     widest_s = max(after - before for before, after in pairwise([start_s, *times, host.now_s]))
     seen = f"one every {period_s * 1e3:.1f} ms, {widest_s * 1e3:.0f} ms apart at most"
-    # a lost one, or a late one of ours, makes one gap of two; a sender that lags makes more
+    # a lost Status, or a late turn of this process, makes one gap of two; a sender that lags makes more
     return unless(abs(period_s / STATUS_S - 1.0) > STATUS_TOLERANCE or widest_s > 2.5 * STATUS_S, seen)
 
 
 @check(ANSWERS, f"{LISTENED_S * 1e3:.0f} Drive OFF, one every 1 ms", "a State for each, 99 % at least")
 def state_answers_drive(host: Host) -> str:
-    """Positions at the rate of the control loop."""
+    """Check that each Drive is answered by a State: the control loop needs positions at its own rate."""
     return _answered(host, State)
 
 
 @check(ANSWERS, f"{LISTENED_S * 1e3:.0f} Drive OFF, one every 1 ms", "a Sense for each, 99 % at least")
 def sense_answers_drive(host: Host) -> str:
-    """And force, handle and currents."""
+    """Check that each Drive is answered by a Sense: force, handle and currents."""
     return _answered(host, Sense)
 
 
 def _answered(host: Host, kind: type[State] | type[Sense]) -> str:
+    """Send Drive OFF for LISTENED_S. Raises Unmet unless as many answers of a type come, to within MOST_LOST."""
     host.pass_time(LISTENED_S, Beat.OFF)
     host.pass_time(ANSWER_S)
     sent, came = round(LISTENED_S / PERIOD_S), len(host.all_of(kind))
@@ -83,7 +85,7 @@ def _answered(host: Host, kind: type[State] | type[Sense]) -> str:
 
 @check(ANSWERS, f"{PAIRS} Drive OFF, each after the answer to the one before", "State, then Sense")
 def state_before_sense(host: Host) -> str:
-    """The control loop waits for positions."""
+    """Check that State comes before Sense: the control loop waits for positions."""
     wrong: list[str] = []
     for _ in range(PAIRS):
         host.forget()
@@ -98,7 +100,7 @@ def state_before_sense(host: Host) -> str:
 
 @check(ANSWERS, "no Drive for 0.2 s", "no State and no Sense")
 def no_answer_without_drive(host: Host) -> str:
-    """They answer, they do not stream."""
+    """Check that State and Sense come only as answers to a Drive."""
     host.pass_time(ANSWER_S)
     host.forget()
     host.pass_time(0.2)
@@ -109,7 +111,7 @@ def no_answer_without_drive(host: Host) -> str:
 
 @check(ANSWERS, "Drive OFF every 1 ms", f"State within {MOST_ANSWER_S * 1e3:g} ms as a rule, at once on the device")
 def answer_time(host: Host) -> str:
-    """Sent at once: what the position loop bears, with the adapter's delay in it."""
+    """Check that State comes as soon as the position loop needs it, the adapter's delay included."""
     delays_s = []
     for _ in range(200):
         host.beat(Beat.OFF)
@@ -125,7 +127,7 @@ def answer_time(host: Host) -> str:
 
 @check("State", "Drive OFF every 1 ms for 0.6 s", "State's counter is one more each time, modulo 256")
 def state_counter(host: Host) -> str:
-    """By it the host knows a State for news, and counts those that were lost."""
+    """Check that State's counter rises by one: by it the host counts lost States, and knows repeated ones."""
     host.pass_time(0.6, Beat.OFF)
     counters = [state.counter for _, state in host.all_of(State)]
     if len(counters) < 2:
@@ -142,7 +144,7 @@ def state_counter(host: Host) -> str:
     "device_time_s runs by 1 s in a second, 1 % more or less",
 )
 def device_clock(host: Host) -> str:
-    """Steps of 10 us, and true ones: speeds come from them."""
+    """Check that the device's clock runs true: speeds are computed from it."""
     host.pass_time(CLOCKED_S, Beat.OFF)
     states = host.all_of(State)
     device_s, clocks = 0.0, []
@@ -162,7 +164,7 @@ def device_clock(host: Host) -> str:
 
 @check(STATUS, "Drive OFF, its counter going up, then none", "Status shows the counter of the last Drive")
 def drive_counter_shown(host: Host) -> str:
-    """So the host sees what arrived."""
+    """Check that Status shows the counter of the last Drive: by it the host sees what arrived."""
     seen = ""
     for _ in range(3):
         host.pass_time(7 * PERIOD_S, Beat.OFF)
@@ -174,7 +176,7 @@ def drive_counter_shown(host: Host) -> str:
 
 @check(DRIVE, "a Drive OFF, then five more with the same counter", "one State")
 def repeated_drive(host: Host) -> str:
-    """A repetition is not accepted, so it is not answered."""
+    """Check that a repeated Drive is not answered: it is not accepted."""
     host.pass_time(2 * PERIOD_S, Beat.OFF)
     host.pass_time(ANSWER_S)
     host.forget()
@@ -190,7 +192,7 @@ def repeated_drive(host: Host) -> str:
 
 @check("Status", "Drive OFF", "a supply of 9 to 15 V, an element of -20 to 60 degC, no SUPPLY or TEMPERATURE")
 def status_plausible(host: Host) -> str:
-    """A wrong unit or a wire that is off shows here."""
+    """Check that supply and temperature are plausible: a wrong unit or a loose wire shows here."""
     status = host.next_status(Beat.OFF)
     seen = f"{status.supply_V:.1f} V, {status.temperature_C:.0f} degC, {shown(status)}"
     causes = [fault.name for fault in status.faults if fault.name in ("SUPPLY", "TEMPERATURE")]
@@ -199,7 +201,7 @@ def status_plausible(host: Host) -> str:
 
 @check("Sense", "Drive OFF, nothing moving", "currents under 0.2 A, a force under 5 N")
 def sense_plausible(host: Host) -> str:
-    """At rest there is next to nothing to measure."""
+    """Check that currents and force are near 0 at rest."""
     host.idle()
     host.pass_time(0.1, Beat.OFF)
     sense = host.last(Sense)
