@@ -149,6 +149,7 @@ def _stuffed(function: int, sequence: int, payload: bytes) -> bytes:
 
 
 def _valid_frames(messages: list[Json]) -> list[Json]:
+    """Return the valid messages in frames, their sequence counting from 0."""
     return [
         {
             "function": vector["function"],

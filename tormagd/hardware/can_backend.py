@@ -1,7 +1,7 @@
 """The CAN backend: python-can opens the bus, and each `receive` drains it.
 
-A python-can interface will do if its bus has a file descriptor: `socketcan` in the field, `slcan` and `udp_multicast`
-on the bench, `tormagsim` for the simulated device.
+Any python-can interface will do whose bus has a file descriptor. Known are `socketcan` in the field, `slcan` and
+`udp_multicast` on the bench, and `tormagsim` for the simulated device.
 """
 
 import contextlib
@@ -79,8 +79,8 @@ class CanBackend:
     def receive(self) -> list[Message]:
         """Return the node's messages among the frames that have arrived, from FRAMES_AT_ONCE frames at most.
 
-        Frames that cannot be read are counted as corrupt. Raises BackendError when the bus is off or gone, or when
-        another host drives the node.
+        Frames that cannot be read are counted as corrupt. `stream.received` is begun anew and holds the node's frames.
+        Raises BackendError when the bus is off or gone, or when another host drives the node.
         """
         self.stream.received = []
         messages: list[Message] = []
@@ -147,9 +147,9 @@ class CanBackend:
         return f"check the device's supply, wiring, termination and bit rate ({self._options.bitrate})"
 
     def _unpack(self, frame: can.Message) -> Message | None:
-        """Return the message in a frame; None for an error frame, a foreign one, and one that does not decode.
+        """Return the message in a frame; None for one that is foreign, damaged or not from the device.
 
-        Raises BackendError on bus-off, and when another host drives the node.
+        An error frame is counted as corrupt. Raises BackendError on bus-off, and when another host drives the node.
         """
         if frame.is_error_frame:
             if frame.arbitration_id & BUS_OFF or self._bus.state is can.BusState.ERROR:

@@ -76,8 +76,8 @@ class CanStream:
     def unpack(self, identifier: int, data: bytes) -> Message | None:
         """Return the message in a frame; None for a frame of another node, of a host, or one that does not decode.
 
-        A frame that does not decode is counted as corrupt. Raises SecondHostError for a Drive to this node that is not
-        the echo of one of the last ECHOES sent.
+        Frames of this node are added to `received` and counted, one that does not decode as corrupt. Raises
+        SecondHostError for a Drive to this node that is not the echo of one of the last ECHOES sent.
         """
         if identifier & 0xF != self.node:
             return None

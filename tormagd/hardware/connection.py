@@ -123,9 +123,9 @@ class Connection:
         self._open(now_s)
 
     def receive(self, now_s: float) -> None:
-        """Read all that has come from the device and hand it to the conversation; nothing while the port is closed.
+        """Read what has come from the device, and hand it to `traffic` and the conversation.
 
-        A port that fails is closed, to be opened again by a later `exchange`.
+        Nothing happens while the port is closed. A port that fails is closed; a later `exchange` opens it again.
         """
         backend, link = self._backend, self._link
         if backend is None or link is None:
@@ -145,11 +145,11 @@ class Connection:
     def exchange(
         self, now_s: float, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
     ) -> None:
-        """Send this period's Drive to a running device, then the Hello or command that is due.
+        """Send this period's Drive to a running device, then the Hello or command that is due; tell `traffic`.
 
-        Opens the port first when it is time to, and closes one that fails or whose device is lost. A `request` counts
-        once for each `number`; unless it is RETRACT, it is dropped where the device does not run. Duties are -1..1.
-        Call it after `receive`, so that what has come by then does not count as silence.
+        Opens the port first when it is time to, and closes a port that fails or whose device is lost. A `request` is
+        taken once, when `number` changes; unless it is RETRACT, it is dropped where the device does not run. Duties are
+        -1..1. Call it after `receive`, so that what has come by then does not count as silence.
         """
         if self._link is None and self._is_wanted and now_s >= self._reopen_s:
             self._open(now_s)

@@ -165,7 +165,10 @@ class DeviceLink:
         return self.state is _RUNNING and now_s - self._heard_s > SILENT_S
 
     def receive(self, now_s: float, message: Message) -> None:
-        """Take one message that came from the device at `now_s`. After UNANSWERED, ask at once who it is."""
+        """Take one message that came from the device at `now_s`: State, Sense, Status or Identity; others are ignored.
+
+        Any message ends silence, and UNANSWERED, so that the next `due` has a Hello.
+        """
         self._heard_s = now_s
         if self.state is _UNANSWERED:
             self.state = _IDENTIFYING
@@ -180,9 +183,12 @@ class DeviceLink:
             self._take_identity(message)
 
     def due(self, now_s: float) -> list[Message]:
-        """Return the Hello and the command to send at `now_s`, after the period's Drive; often none.
+        """Return the Hello or the command to send at `now_s`, after the period's Drive; often none.
 
-        First changes `state` on silence, a reset or a replacement, and gives up a Home or Clear after GIVE_UP_S.
+        A command is repeated every REPEAT_S until it is acknowledged. A Hello is repeated as often until the device is
+        known, then every HELLO_S, but not beside a command. Before that, `state` changes on silence, a reset, a
+        replacement or a missing Identity, and a Home or Clear is given up after GIVE_UP_S. The newest Drive is noted as
+        sent at `now_s`.
         """
         self.round_trip.drive(self._counter, now_s)
         self._change_state(now_s)
@@ -233,7 +239,7 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Renew `quality` from the backend's counters; call it when `is_judging`.
+        """Renew `quality`, which the next measurement carries, from the backend's counters; call it when `is_judging`.
 
         The counters, of frames received and damaged and of messages not taken at once, only grow.
         """
@@ -279,9 +285,9 @@ class DeviceLink:
             )
 
     def _take_status(self, now_s: float, status: Status) -> None:
-        """Keep a Status: it ends an acknowledged request, shows a reset, and dates the Drive that the device obeys.
+        """Keep a Status: end an acknowledged request, note a reset, and date the Drive that the device obeys.
 
-        It also ends a RETRACT that a latched device will not take.
+        The first one says from where nonces count on. A RETRACT also ends when the device has latched.
         """
         if self._status is None:
             # an earlier host has counted this far; its last number again would be taken for a repetition
@@ -321,9 +327,10 @@ class DeviceLink:
         self._sense = sense
 
     def _take_state(self, now_s: float, state: State) -> None:
-        """Keep a State, unwrap its positions and time, and feed the clock; one that is no news is counted and dropped.
+        """Take a State into the measurement, its positions and time unwrapped, and feed round trips and clock.
 
-        The first after a Status and a Sense begins the measurements.
+        A State that repeats an earlier one or was overtaken is only counted. The first State after a Status and a Sense
+        begins the measurements; States before that one give no positions.
         """
         previous = self._state
         if previous is not None and (previous.counter - state.counter) % 256 < OVERTAKEN:

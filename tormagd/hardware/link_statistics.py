@@ -86,7 +86,11 @@ class RoundTrip:
         self._before_hello = None
 
     def state(self, counter: int, now_s: float) -> None:
-        """Note that the State with this counter came at `now_s`; its round trip waits for a Status to confirm it."""
+        """Note that the State with this counter came at `now_s`; its round trip counts once a Status confirms it.
+
+        A State that would answer a Drive which is not sent yet shows that the counters do not match: then no round trip
+        is taken until a Status or an Identity matches them again.
+        """
         self._state, self._newest_s = counter, now_s
         lead = self._lead
         if lead is None:

@@ -23,8 +23,8 @@ class RisingSearch:
 
     A rising force has one root at most. A step to or past an end of the range evaluates the force at that end, once.
     Any other step out of the bracket is replaced by a bisection, and so is one of over half the step before. The answer
-    is the root to `ACCURACY_MT`, or the nearer end for a force out of reach. Raises `DomainError` unless the range is
-    finite and rises.
+    is the root to `ACCURACY_MT`, or the nearer end for a force out of reach; after `MOST_EVALUATIONS` it is where the
+    search stands. Raises `DomainError` unless the range is finite and rises.
     """
 
     def __init__(self, field_range_mT: tuple[float, float]) -> None:

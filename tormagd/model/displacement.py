@@ -22,9 +22,10 @@ class Turn(Value):
         self.furthest_mm: Final = furthest_mm
 
     def moved_to(self, position_mm: float) -> "Turn":
-        """Return the turn after the handle moved to `position_mm`: this one, unless the handle turned back.
+        """Return the state after the handle moved to `position_mm`.
 
-        It has turned when it went back by more than TURN_MM. The place of the new turn is the furthest it had been.
+        Going on, the handle has a new furthest place. Back by more than TURN_MM, it has turned where it had been
+        furthest, and goes the other way. Otherwise nothing changes, and this very state is returned.
         """
         beyond_mm = position_mm - self.furthest_mm
         if beyond_mm * self.direction >= 0.0:

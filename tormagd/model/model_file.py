@@ -327,6 +327,7 @@ def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _tensors(model: ForceModel) -> dict[str, Array]:
+    """Return the weights of a model as its file's tensors, by their names."""
     return {
         "hidden_weight": model.hidden_weight,
         "hidden_bias": model.hidden_bias,

@@ -31,9 +31,9 @@ def require_that(condition: bool, variable: str, value: object, allowed: str) ->
 
 
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:
-    """Raise `DomainError` unless `value`, or every element of it, is in [low, high]; NaN never is.
+    """Raise `DomainError`, naming `variable`, unless `value` or every element of it is in [low, high]; NaN never is.
 
-    Also for an array that is not of float32 or float64.
+    Also for a value that is no float, int or array of float32 or float64.
     """
     if isinstance(value, float | int):
         if low <= value <= high:

@@ -9,8 +9,9 @@ curve under it, and why it is written so, is in `tormagd.physics.brake_curve`:
 The radial moment a (`radial_moment_Tm`) is that of `tormagd.physics.field`, without mu_r / 4. F rises strictly with a,
 so the inverse is unique; `tormagd.lab.design.force_law` has it. The model is used for a stretch lambda1 >= 0.05 only.
 
-Every function takes a float and returns one, about ten times faster, or takes an array of float32 or float64 whose
-shape and type the result keeps. All raise `DomainError` for NaN and for values outside the stated domain.
+Every function takes a float and returns one, about ten times faster than for an array. Or it takes an array of float32
+or float64, whose shape and type the result keeps. All raise `DomainError` for NaN and for values outside the stated
+domain.
 """
 
 import math

@@ -403,7 +403,8 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
     """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED.
 
-    The daemon takes them once the causes of the latched faults have gone.
+    `home` is among them where the device is not `is_homed`, or a latched fault took the positions away. The daemon
+    takes them once the causes of the faults have gone.
     """
     if state.operating_state is ENABLED:
         return ()
