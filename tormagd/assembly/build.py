@@ -125,7 +125,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
-    """Return the scene's element as the model describes it, and the search for its field.
+    """Return the scene's element as the model describes it, and the choice of the search for its field.
 
     Raises DomainError where the model does not fit the scene's insert and gaps, or the search does not fit the model.
     """
@@ -224,7 +224,7 @@ def _known_fields_mT(
 
 
 def _refuse_unstable(config: Config) -> Margins:
-    """Return the position loop's stability margins. Raises ConfigError where one of them is too small."""
+    """Return the position loop's stability margins. Raises ConfigError where the phase or gain margin is too small."""
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
     if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
         raise ConfigError(
@@ -267,7 +267,7 @@ def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
 def at_rates_of(scene: Scene, config: Config) -> Config:
     """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`.
 
-    Raises ConfigError for rates that a configuration may not have.
+    The control rate is LEAST_CONTROL_HZ at least. Raises ConfigError for rates that a configuration may not have.
     """
     if not config.rates.of_scene:
         return config
@@ -318,7 +318,7 @@ def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
 
 
 def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
-    """Raise ConfigError where the hand's rate, or a finger's depth and rate, are not what the model was trained on."""
+    """Raise ConfigError where the model was not trained on the handle's rates, or on the depth and rate of a finger."""
     depths_mm, rates_mm_s, *_ = model.feature_ranges
     handle, finger = scene.handle, scene.finger
     stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
@@ -333,9 +333,10 @@ def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
 
 
 def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
-    """Return what the gap's speed leaves of the scene's signal; None where the scene states no signal.
+    """Return what ideal carriages at the gap's speed miss of the scene's signal; None where it states no signal.
 
-    The signal's file is read from the folder `beside`. Raises ConfigError where the scene tolerates less.
+    The signal's file is read from the folder `beside`. Raises ConfigError where the RMS error is over the scene's
+    `tolerance_rms_N`.
     """
     if scene.signal is None:
         return None
@@ -359,7 +360,11 @@ def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path
 
 
 def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
-    """Raise ConfigError where an opening gap would release the force faster than the scene allows."""
+    """Raise ConfigError where an opening gap could release the force faster than the scene allows.
+
+    Taken is the weakest believable device, the greatest force that the ceiling lets it make, and the faster of the
+    device's own opening and the gap's speed.
+    """
     # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
     # ceiling lets no gap make more than CEILING times the scene's greatest
     opening_mm_s, key = max(

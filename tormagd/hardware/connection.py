@@ -81,7 +81,10 @@ class Connection:
 
     @property
     def cause(self) -> str:
-        """Why the device does not run, or what a measurement still lacks; empty when it runs and is measured."""
+        """Why the device does not run, or what a measurement still lacks; empty when it runs and is measured.
+
+        For a device that sends no Identity, also whether it is silent or sends something else.
+        """
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return self._cause

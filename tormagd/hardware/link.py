@@ -269,7 +269,10 @@ class DeviceLink:
             self.cause = f"the device has not said who it is for {UNANSWERED_S:g} s"
 
     def _take_identity(self, identity: Identity) -> None:
-        """Enter RUNNING, or REFUSED for another protocol schema; a changed serial number is noted as a replacement."""
+        """Keep an Identity: enter RUNNING, or REFUSED for another protocol schema, and match the round trips' counters.
+
+        Another serial number than before is noted as a replacement of the device.
+        """
         self.round_trip.identity()
         known, self.identity = self.identity, identity
         if known is not None and known.serial_number != identity.serial_number:
@@ -317,7 +320,7 @@ class DeviceLink:
             self._measurement = None
 
     def _take_sense(self, now_s: float, sense: Sense) -> None:
-        """Keep a Sense, and add its handle's travel once there are measurements."""
+        """Keep a Sense and the time at which it came; once there are measurements, add the handle's travel to them."""
         # Sense follows the State of the same instant; the measurement takes the newest of both
         self._sensed_s = now_s
         previous = self._sense

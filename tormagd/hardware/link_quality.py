@@ -89,7 +89,10 @@ class LinkWatch:
         return now_s >= self._due_s
 
     def look(self, now_s: float, counts: Counts, round_trip_s: float, clock_drift: float) -> LinkQuality:
-        """Return the quality since the look LOOKS before this one, and put the next look off by LOOKED_S."""
+        """Return the quality over the last LOOKS looks, from the counters now; the next look is due after LOOKED_S.
+
+        `round_trip_s` is the usual one now; the quality has the lesser of this and the last look's, 0 at the first.
+        """
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)
         before = self._counts[0]

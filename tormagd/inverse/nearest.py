@@ -59,7 +59,11 @@ class NearestFieldSearch:
         self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`, as `FieldSolver.solve` does. Raises `DomainError` for numbers not finite."""
+        """Return the field for `force_N`; of several the one nearest `last_field_mT`, or the least where that is None.
+
+        A force out of reach gets the field that comes nearest; `reach` says so. Raises `DomainError` for numbers that
+        are not finite.
+        """
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
         forces_N = curve.forces_N(self._fields_mT) if self._batch is None else self._batch(curve)
         candidates, reach = self._candidates(forces_N - force_N, near, tie_N(curve))

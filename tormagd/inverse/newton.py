@@ -37,7 +37,11 @@ class RisingSearch:
         self._high_mT = high_mT
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`, as `FieldSolver.solve` does. Raises `DomainError` for numbers not finite."""
+        """Return the field for `force_N`. The search begins at `last_field_mT`, or at the least field where it is None.
+
+        A force out of reach gets the nearer end of the range; `reach` says so. Raises `DomainError` for numbers that
+        are not finite.
+        """
         low, high = self._low_mT, self._high_mT
         span = high - low
         field = checked_near_mT(force_N, last_field_mT, low)

@@ -65,9 +65,10 @@ class RowByRow:
         self._epsilon_N, self._predict_N = epsilon_N, predict_N
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`, as `FieldSolver.solve` does, but not nearest to the last field.
+        """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest.
 
-        A force within epsilon of some field's counts as in reach. Raises `DomainError` for numbers not finite.
+        `reach` is INSIDE where a row is within epsilon, or rows lie on both sides. `last_field_mT` may be None; it is
+        checked and not used. Raises `DomainError` for numbers that are not finite.
         """
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0

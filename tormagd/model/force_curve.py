@@ -155,11 +155,11 @@ class NetworkCurve:
 
     @property
     def magnitude_N(self) -> float:
-        """See `ForceCurve.magnitude_N`."""
+        """The sum of the magnitudes of a force's terms: its rounding error is a share of this."""
         return self._network.magnitude_N
 
     def force_N(self, field_mT: float) -> float:
-        """See `ForceCurve.force_N`."""
+        """Return the force at one field."""
         network, total_N = self._network, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -168,7 +168,7 @@ class NetworkCurve:
         return total_N + network.constant_N
 
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """See `ForceCurve.force_and_slope`."""
+        """Return the force, N, and its slope dF/dB, N/mT, at one field."""
         network, total_N, slope = self._network, 0.0, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -181,7 +181,7 @@ class NetworkCurve:
         return total_N + network.constant_N, slope
 
     def forces_N(self, fields_mT: Floats) -> Floats:
-        """See `ForceCurve.forces_N`."""
+        """Return the force at each field (n), in the precision of the fields."""
         network, kind = self._network, fields_mT.dtype
         hidden = np.multiply.outer(fields_mT, network.field_half.astype(kind, copy=False))
         hidden -= np.array(self._shift, dtype=kind) / 2

@@ -9,10 +9,10 @@ from tormagd.model.model_file import ForceModel
 def falling_at(
     model: ForceModel, fields_mT: tuple[float, float], displacement_mm: float, points: int = 33
 ) -> float | None:
-    """Return a rate of the handle, mm/s, at which the model's force does not rise with the field everywhere.
+    """Return the least rate of the handle, mm/s, at which the model's force somewhere does not rise with the field.
 
-    Looked at are `points` rates over those seen in training, the least first, and as many fields between the two
-    `fields_mT`, at one displacement and the least share of iron. None where the force rises at all of them.
+    Looked at are `points` rates over those seen in training, and as many fields between the two `fields_mT`, at one
+    displacement and the least share of iron. None where the force rises at all of them.
     """
     _, (slowest, fastest), _, (cip_percent, _) = model.feature_ranges
     fields = np.linspace(*fields_mT, points)

@@ -39,9 +39,10 @@ class PronyStep(Value):
         self.gains: Final = gains
 
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
-        """Return the force, N, and the state at the end of a step; `driving_N` is the driving force there.
+        """Return the force, N, and the state at the end of a step, from the state at its beginning.
 
-        Raises `DomainError` if `driving_N` is not finite or beyond MAX_FORCE_N, or the state has another length.
+        `driving_N` is the driving force at the end. Raises `DomainError` if it is not finite or beyond MAX_FORCE_N, or
+        if the state is not of as many branches as the series.
         """
         if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
             require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)

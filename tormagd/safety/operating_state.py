@@ -343,9 +343,10 @@ _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
 
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
-    """Return `state` with `faults` latched and the device asked to open; `state` itself where none of them is new.
+    """Return `state` in FAULT with `faults` latched and the device asked to open; `state` itself where none is new.
 
-    Faults that show together are latched in the order of `Fault`: causes before their consequences.
+    Faults that show together are latched in the order of `Fault`: causes before their consequences. Faults of
+    LOST_POSITION set `needs_homing`.
     """
     if not faults:  # as nearly always, a thousand times a second
         return state
@@ -373,8 +374,9 @@ def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
     """Return the state after an operator's command, with a request to the device where the table has one.
 
-    Raises RefusedError for an unknown command, for one that the table refuses in this state, and for the first of its
-    guards that does not hold. `stop` latches the fault STOPPED.
+    `stop` latches the fault STOPPED. `clear-fault` drops all faults, and asks the device for CLEAR only if it has
+    latched one; the device may still report that fault for CLEARING_S. Raises RefusedError for an unknown command, for
+    a device that is not connected, for a command that the table refuses, and for the first guard that does not hold.
     """
     if name not in COMMANDS:
         raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
