@@ -37,7 +37,10 @@ FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the device until SIGTERM or SIGINT; the first line on stdout says where. Usage errors exit with 2."""
+    """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come.
+
+    Exits with 2 for usage or parts that cannot be used; returns 1 where stdout cannot be written.
+    """
     command = parser()
     options = command.parse_args(arguments)
     ask_for_slices()  # a real device has a processor of its own
@@ -63,7 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
-    """The device and the door asked for. Raises what the parts of the device raise, and OSError."""
+    """Return the device and the door that the options ask for, to be closed by `resources`.
+
+    Raises PlantError, HandError, FaultError, DomainError, BuildError or OSError.
+    """
     boot = FIRMWARES[options.firmware]
     plant = load_plant(options.plant)
     hand = parse_hand(options.hand or ("steady" if plant.pad is None else "pressing"))
@@ -88,7 +94,7 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
 
 
 def parser() -> argparse.ArgumentParser:
-    """What the simulated device understands; the reference of commands is made from it, too."""
+    """Return the argument parser of `python -m tormagd.simulation`; the reference of commands is made from it, too."""
     made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
     doors = made.add_mutually_exclusive_group(required=True)
     doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal, its path printed first")
@@ -135,6 +141,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _rate(least: int, most: int, text: str) -> int:
+    """Return `text` as a whole number. Raises ArgumentTypeError outside `least`..`most`, ValueError for no number."""
     rate = int(text)
     if not least <= rate <= most:
         raise argparse.ArgumentTypeError(f"{rate}: allowed are {least} to {most}")

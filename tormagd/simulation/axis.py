@@ -21,11 +21,11 @@ MAX_STEP_SHARE: Final = 0.25
 
 @final
 class Axis:
-    """State and laws of one carriage.
+    """State and laws of one carriage with its drive.
 
-    `position_m` is the carriage's distance from the centre plane, `angle_rad` the screw's angle from power-on,
-    `contact_N` the force with which the nut pushes the carriage outward.
-    Raises PlantError for a plant that is too stiff or too light for the substep.
+    `position_m` is the carriage's distance from the centre plane, `angle_rad` the screw's angle since power-on.
+    `contact_N` is the force with which the nut pushes the carriage outward. Raises PlantError for a plant whose motion
+    is too fast for steps of `dt_s`.
     """
 
     def __init__(
@@ -70,11 +70,15 @@ class Axis:
 
     @property
     def back_emf_V(self) -> float:
-        """What the turning motor shows at its terminals without a current."""
+        """Voltage of the turning motor at its terminals without a current."""
         return self._coupling_Nm_A * self.speed_rad_s
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
-        """One time step with that voltage at the motor, or None for an open bridge, and that pull of the magnets."""
+        """Advance by one time step, `dt_s`, with the mean voltage `voltage_V` at the motor and the magnets' pull
+        `attraction_N`.
+
+        None for the voltage is an open bridge: no current flows.
+        """
         # four times a simulated millisecond: hence local names, and `_lead_of` written out in the second half
         coupling_Nm_A = self._coupling_Nm_A
         before_rad_s, contact_N = self.speed_rad_s, self.contact_N
@@ -152,7 +156,11 @@ class Axis:
             self.contact_N = 0.0
 
     def shaft_after(self, age_s: float, voltage_V: float | None) -> tuple[float, float]:
-        """(angle_rad, current_A) that long after the last step and within the next, with that mean voltage since."""
+        """Return the screw's (angle_rad, current_A) at `age_s` after the last step, without changing the state.
+
+        `age_s` is under one step. `voltage_V` is the mean voltage since that step, None for an open bridge. The speed
+        counts as constant.
+        """
         speed_rad_s = self.speed_rad_s
         angle_rad = self.angle_rad + age_s * speed_rad_s
         if voltage_V is None:
@@ -163,6 +171,6 @@ class Axis:
         return angle_rad, -limit_A if current_A < -limit_A else limit_A if current_A > limit_A else current_A
 
     def _lead_of(self, contact_N: float) -> float:
-        """How far the nut is outward of the carriage, m, when it pushes with that force."""
+        """Return how far the nut is outward of the carriage, m, while it pushes outward with `contact_N`."""
         flank_m = self.backlash_m if contact_N > 0.0 else -self.backlash_m
         return flank_m + contact_N / self._stiffness_N_m

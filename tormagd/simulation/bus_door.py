@@ -11,16 +11,16 @@ from tormagd.simulation.can_frame import MAX_DATA, CanFrame
 
 FRAMES_AT_ONCE = 64
 OPTIONS: dict[str, dict[str, Any]] = {"udp_multicast": {"hop_limit": 0, "fd": False}}
-"""A simulated device stays on this machine."""
+"""Keeps a simulated device on this machine."""
 OWN_FUNCTIONS = {FUNCTION[message] for message in (State, Sense, Status, Identity)}
-"""UDP multicast hands a sender its own frames."""
+"""Functions that only a device sends: UDP multicast hands a sender its own frames."""
 
 
 class BusDoor:
-    """One device as a node of somebody else's bus. The bus must have a descriptor to wait for."""
+    """The device as a node of a CAN bus that others run. The bus must have a descriptor to wait for."""
 
     def __init__(self, device: CanDevice, spec: str) -> None:
-        """`spec` is INTERFACE:CHANNEL. Raises OSError saying why it cannot be opened."""
+        """Open the bus of `spec`, INTERFACE:CHANNEL. Raises OSError saying why it cannot be opened."""
         interface, _, channel = spec.partition(":")
         try:
             self._bus = can.Bus(interface=interface, channel=channel, ignore_config=True, **OPTIONS.get(interface, {}))
@@ -31,11 +31,15 @@ class BusDoor:
         self.address = channel
 
     def descriptors(self) -> Sequence[int]:
-        """The bus's."""
+        """Return the bus's descriptor."""
         return (self._fd,)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Frames in, frames out. Raises can.CanError when the bus goes away."""
+        """Take at most FRAMES_AT_ONCE frames from the bus if it is readable, and send what the device has sent by
+        `now_s`.
+
+        Frames that are no classical data frames are ignored. Raises can.CanError when the bus goes away.
+        """
         if readable:
             for _ in range(FRAMES_AT_ONCE):
                 frame = self._bus.recv(0)
@@ -50,9 +54,10 @@ class BusDoor:
                 )
 
     def close(self) -> None:
-        """Leaves the bus."""
+        """Leave the bus."""
         self._bus.shutdown()
 
     def _take(self, now_s: float, frame: CanFrame) -> None:
+        """Give the device a frame; its own messages, as UDP multicast returns them, and too long ones are dropped."""
         if frame.identifier >> 4 not in OWN_FUNCTIONS and len(frame.data) <= MAX_DATA:
             self._device.receive(now_s, frame)

@@ -27,17 +27,20 @@ from tormagd.simulation.can_frame import (
 )
 
 SEND_BUFFER_BYTES = 4_608
-"""The kernel's least, a handful of frames: a host has to notice soon that nobody takes them."""
+"""The kernel's least, a handful of frames: a host has to notice soon that nobody takes its frames."""
 
 
 class SimulatorBus(can.BusABC):
-    """A host's controller on the simulated bus. Classical frames with 11-bit identifiers only."""
+    """A host's CAN controller on the simulated bus. Classical frames with 11-bit identifiers only."""
 
     def __init__(self, channel: str, can_filters: Any = None, **settings: object) -> None:
-        """Raises can.CanInitializationError if no simulator serves `channel`. The bit rate is the simulator's."""
+        """Connect to the simulator that serves `channel`. Raises can.CanInitializationError if none does.
+
+        The bit rate is the simulator's; `settings` go to python-can.
+        """
         self.channel_info = f"tormagsim {channel}"
         self._name = "".join(Path(channel).name.split())
-        """In the frames. A log's fields are separated by spaces, so a name has none."""
+        """Channel in received frames. A log's fields are separated by spaces, so the name has none."""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -50,17 +53,20 @@ class SimulatorBus(can.BusABC):
 
     @staticmethod
     def _detect_available_configs() -> list[AutoDetectedConfig]:
-        """The channels of simulated devices that were given no path of their own; python-can asks for them."""
+        """Return the channels of running simulators that were given no path of their own; python-can asks for them."""
         listening = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace").split()
         found = sorted(str(path) for path in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/can"))
         return [{"interface": "tormagsim", "channel": path} for path in found if path in listening]
 
     def fileno(self) -> int:
-        """The socket's descriptor, -1 once it is shut down."""
+        """Return the socket's descriptor, -1 once the bus is shut down."""
         return self._socket.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Raises can.CanOperationError: not a classical data frame of 11 bits, no room, or the simulator has gone."""
+        """Send a frame, waiting up to `timeout` seconds for room (None: for ever).
+
+        Raises can.CanOperationError: no classical data frame of 11 bits, no room, or the simulator has gone.
+        """
         if msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd or len(msg.data) > MAX_DATA:
             raise can.CanOperationError(f"{msg}: allowed are classical data frames of 11-bit identifiers")
         packet = to_socket(CanFrame(msg.arbitration_id & MAX_IDENTIFIER, bytes(msg.data)))
@@ -74,6 +80,10 @@ class SimulatorBus(can.BusABC):
             raise can.CanOperationError("the simulator has gone", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        """Return the next frame, or None after `timeout` seconds, and that it is not filtered yet.
+
+        An error frame is one with ERROR_FLAG. Raises can.CanOperationError: the simulator has gone, or sent no frame.
+        """
         try:
             if timeout != 0:
                 select.select([self._socket], [], [], timeout)
@@ -97,6 +107,6 @@ class SimulatorBus(can.BusABC):
         return message, False
 
     def shutdown(self) -> None:
-        """Leaves the bus."""
+        """Leave the bus."""
         super().shutdown()
         self._socket.close()

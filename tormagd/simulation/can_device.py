@@ -19,7 +19,7 @@ DEVICE = 0
 
 
 class Delivery(NamedTuple):
-    """A frame that all but its sender have just received."""
+    """A frame that all nodes but its sender have just received."""
 
     sender: int
     frame: CanFrame
@@ -39,23 +39,23 @@ class CanLine(Protocol):
 
     @property
     def truth(self) -> Truth:
-        """What really is, at the time of the last call."""
+        """The plant's true state at the time of the last call."""
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
-        """The host hands a frame to its controller now."""
+        """Take the frame that the host hands to its controller at `now_s`."""
 
     def transmit(self, now_s: float) -> list[Delivery]:
-        """The frames that have gone by since the last call."""
+        """Let time pass until `now_s` and return the frames that have gone by since the last call."""
 
 
 class CanDevice:
     """One device and the bus it is on.
 
-    receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
-    transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
-    advance(now_s)                only lets time pass
+        receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
+        transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
+        advance(now_s)                only lets time pass
 
-    Times are seconds from power-on and must not fall over all three (ValueError).
+    Times are seconds from power-on. A time before the last, over all three, raises ValueError.
     """
 
     def __init__(self, messages: MessageDevice, bitrate: int = DEFAULT_BITRATE, node: int = DEFAULT_NODE) -> None:
@@ -76,39 +76,41 @@ class CanDevice:
 
     @property
     def truth(self) -> Truth:
-        """What really is, at the time of the last call."""
+        """The plant's true state at the time of the last call."""
         return self.messages.truth
 
     @property
     def next_event_s(self) -> float:
-        """When there is next something to do: a frame that ends or may start, or an event inside the device."""
+        """When something happens next: a frame ends or may start, or an event inside the device."""
         event_s = self.messages.next_event_s
         if self._flight is not None:
             return min(event_s, self._flight.end_s)
         return min(event_s, max(self._free_s, self._now_s)) if self._waiting else event_s
 
     def receive(self, now_s: float, frame: CanFrame, host: int = 1) -> None:
-        """A host sends `frame` now."""
+        """Queue the frame that `host` (from 1) sends at `now_s`; in a full queue the frame is lost and counted."""
         self.advance(now_s)
         self._queue(Delivery(host, frame))
 
     def transmit(self, now_s: float) -> list[Delivery]:
-        """The frames that have gone by since the last call, the hosts' own among them."""
+        """Let time pass until `now_s` and return the frames that have gone by since the last call, the hosts' own among
+        them."""
         self.advance(now_s)
         delivered, self._delivered = self._delivered, []
         return delivered
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`."""
+        """Let time pass until `now_s`: frames end and start on the bus."""
         while (event_s := self.next_event_s) <= now_s:
             self._pass_time(event_s)
             if self._flight is not None and self._flight.end_s <= event_s:
-                self._land(self._flight)
+                self._end_frame(self._flight)
             if self._flight is None and self._waiting and self._free_s <= event_s:
-                self._take_off(event_s)
+                self._start_frame(event_s)
         self._pass_time(now_s)
 
     def _pass_time(self, time_s: float) -> None:
+        """Advance the device to `time_s`, and queue what it sends."""
         self.messages.advance(time_s)
         self._now_s = time_s
         outbox = self.messages.outbox
@@ -117,19 +119,22 @@ class CanDevice:
             self._queue(Delivery(DEVICE, CanFrame(packet.function << 4 | self._node, packet.payload)))
 
     def _queue(self, delivery: Delivery) -> None:
+        """Queue a frame by its identifier, or count it as lost where MAX_WAITING are waiting."""
         if len(self._waiting) >= MAX_WAITING:
             self.lost += 1
             return
         self._order += 1
         heappush(self._waiting, (delivery.frame.identifier, self._order, delivery))
 
-    def _take_off(self, time_s: float) -> None:
+    def _start_frame(self, time_s: float) -> None:
+        """Put the waiting frame of the lowest identifier on the bus."""
         _, _, delivery = heappop(self._waiting)
         duration_s = frame_bits(delivery.frame) * self._bit_s
         self.busy_s += duration_s
         self._flight = _Flight(time_s + duration_s, delivery)
 
-    def _land(self, flight: _Flight) -> None:
+    def _end_frame(self, flight: _Flight) -> None:
+        """Free the bus and deliver its frame, to the device too where a host addresses its node."""
         self._flight = None
         self._free_s = flight.end_s
         sender, frame = flight.delivery

@@ -11,14 +11,14 @@ from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, from_socket, 
 MAX_HOSTS = 8
 FRAMES_AT_ONCE = 16
 FOLDER_PREFIX = "tormagsim-"
-"Of the folder in which a simulated device makes its channel, where it is given no path."
+"Begins the name of the folder for a channel that was given no path."
 
 
 class CanDoor:
-    """One bus with a device and up to MAX_HOSTS hosts, that come and go as they like."""
+    """Simulated CAN bus with a device and up to MAX_HOSTS hosts, which come and go as they like."""
 
     def __init__(self, device: CanDevice, path: Path) -> None:
-        """Serves at `path`; what a killed simulator left there is replaced. Raises OSError."""
+        """Serve at `path`, replacing what a killed simulator left there. Raises OSError."""
         self._device = device
         self._path = path
         self._hosts: dict[int, socket.socket] = {}
@@ -34,11 +34,11 @@ class CanDoor:
         self.address = str(path)
 
     def descriptors(self) -> Sequence[int]:
-        """The listening socket and every host's."""
+        """Return the descriptors of the listening socket and of every host."""
         return (self._listener.fileno(), *self._hosts)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Frames in, frames out to all but their sender."""
+        """Admit hosts and take their frames; hand every frame that has gone by to all hosts but its sender."""
         for descriptor in readable:
             if descriptor in self._hosts:
                 self._take(now_s, descriptor)
@@ -50,13 +50,14 @@ class CanDoor:
                 self._hand(descriptor, packet)
 
     def close(self) -> None:
-        """Takes the bus away."""
+        """Disconnect all hosts and remove the socket."""
         for descriptor in list(self._hosts):
             self._dismiss(descriptor)
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
     def _welcome(self) -> None:
+        """Admit the host that connects; one above MAX_HOSTS is disconnected."""
         with contextlib.suppress(BlockingIOError):  # a host that came has gone again
             host, _ = self._listener.accept()
             if len(self._hosts) >= MAX_HOSTS:
@@ -69,6 +70,8 @@ class CanDoor:
         self._hosts.pop(descriptor).close()
 
     def _take(self, now_s: float, descriptor: int) -> None:
+        """Hand the device at most FRAMES_AT_ONCE of a host's frames; a host that left or sends no frame is
+        disconnected."""
         for _ in range(FRAMES_AT_ONCE):
             try:
                 packet = self._hosts[descriptor].recv(SOCKET_FRAME.size + 1)
@@ -83,6 +86,7 @@ class CanDoor:
             self._device.receive(now_s, frame, descriptor)
 
     def _hand(self, descriptor: int, packet: bytes) -> None:
+        """Send a packet to a host. One that does not read loses the packet; one that has gone is disconnected."""
         try:
             self._hosts[descriptor].send(packet)
         except BlockingIOError:
@@ -92,7 +96,7 @@ class CanDoor:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Removes a socket that nobody listens at."""
+    """Remove the socket at `path` if nobody listens there. Raises OSError where it cannot."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
         try:
             probe.connect(str(path))

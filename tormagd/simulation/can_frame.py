@@ -6,7 +6,7 @@ from typing import NamedTuple
 MAX_IDENTIFIER = 0x7FF
 MAX_DATA = 8
 ERROR_FLAG = 0x2000_0000
-"""In the identifier of an error frame, which is no frame but a report of the controller's: linux/can.h."""
+"""In the identifier of an error frame, which is a report of the controller (linux/can.h)."""
 SOCKET_FRAME = struct.Struct("=IB3x8s")
 """Linux's `struct can_frame`."""
 
@@ -20,14 +20,14 @@ UNSTUFFED_BITS = 13
 
 
 class CanFrame(NamedTuple):
-    """Identifier and 0 to 8 bytes of data. With ERROR_FLAG in the identifier, a controller's report."""
+    """Identifier and 0 to 8 bytes of data. With ERROR_FLAG in the identifier: a controller's report of an error."""
 
     identifier: int
     data: bytes
 
 
 def frame_bits(frame: CanFrame) -> int:
-    """How many bit times the frame takes, with its stuff bits and the pause behind it."""
+    """Return how many bit times the frame takes, with its stuff bits and the pause behind it (ISO 11898-1)."""
     # start of frame, identifier, then RTR, IDE and r0, which are 0 in a classical data frame, and the length
     head = (frame.identifier << 7 | len(frame.data)).to_bytes(3, "big")
     crc = 0
@@ -44,12 +44,12 @@ def frame_bits(frame: CanFrame) -> int:
 
 
 def to_socket(frame: CanFrame) -> bytes:
-    """The frame as one packet of the simulator's socket."""
+    """Return the frame as one packet of the simulator's socket."""
     return SOCKET_FRAME.pack(frame.identifier, len(frame.data), frame.data)
 
 
 def from_socket(packet: bytes) -> CanFrame | None:
-    """The frame in a packet of the simulator's socket; None if there is none in it."""
+    """Return the frame in a packet of the simulator's socket, None where the packet holds no valid one."""
     if len(packet) != SOCKET_FRAME.size:
         return None
     identifier, length, data = SOCKET_FRAME.unpack(packet)
@@ -69,8 +69,8 @@ _CRC_TABLE = [_crc_of(byte) for byte in range(256)]
 
 
 def _after(run: int, byte: int) -> tuple[int, int]:
-    """How many bits are stuffed into a byte after a run of so many zeros, or ones where it is negative; and the run
-    that it leaves."""
+    """Return the stuff bits in a byte that follows a run of `run` zeros (ones where negative), and the run it
+    leaves."""
     stuffed = 0
     for place in range(7, -1, -1):
         one = -1 if byte >> place & 1 else 1
@@ -81,4 +81,4 @@ def _after(run: int, byte: int) -> tuple[int, int]:
 
 
 _RUNS = [[_after(run, byte) for byte in range(256)] for run in (0, 1, 2, 3, 4, -4, -3, -2, -1)]
-"""By the run before, from whose end a negative one counts, and the byte."""
+"""`_after` by run and byte; a negative run counts from the list's end."""

@@ -1,7 +1,7 @@
 """The firmware's C sources, compiled for this machine, behind the interface of the Python firmware.
 
-What a microcontroller would run is what runs here: every message goes in and comes out as payload bytes through the C
-codec, and the state is the C struct. The Python firmware is its twin; tests hold the two equal step by step.
+What a microcontroller would run runs here. Every message goes in and comes out as payload bytes through the C codec,
+and the state is the C struct. Tests hold this firmware and the Python one equal step by step.
 """
 
 import ctypes
@@ -78,7 +78,8 @@ class _View(ctypes.Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    """The library with its functions' types declared. Raises BuildError."""
+    """Load the library once and declare its functions' types. Raises BuildError: not built, or structures laid out
+    otherwise."""
     library = load_library()
     pointer, time_s, payload = ctypes.c_void_p, ctypes.c_double, ctypes.c_char_p
     library.tormag_device_init.argtypes = [pointer, pointer]
@@ -99,14 +100,15 @@ def _library() -> ctypes.CDLL:
 
 
 def _sizes(library: ctypes.CDLL) -> list[int]:
-    """Bytes of the device, and of the three structures above."""
+    """Return the bytes of the C device, and of the structures for parameters, sensors and view."""
     sizes = (ctypes.c_size_t * 4)()
     library.tormag_bridge_sizes(sizes)
     return list(sizes)
 
 
 class CompiledFirmware:
-    """One device's firmware from its boot on, as `Firmware`. Raises BuildError where the C sources cannot be built."""
+    """One device's firmware in C from its boot on, as `Firmware`. Raises BuildError where the C sources cannot be
+    built."""
 
     def __init__(self, plant: PlantParameters) -> None:
         parameters = _Parameters(
@@ -124,7 +126,10 @@ class CompiledFirmware:
         library.tormag_device_init(self._device, ctypes.byref(parameters))
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host; those of a device are ignored."""
+        """Act on one message of the host and return what to answer; messages of a device are ignored.
+
+        Raises EncodeError for a message that has no form on the wire, DecodeError for one that the C codec refuses.
+        """
         payload = encode(message)
         answer: int = _library().tormag_bridge_receive(
             self._device, time_s, FUNCTION[type(message)], payload, len(payload), _seen(sensors)
@@ -134,14 +139,15 @@ class CompiledFirmware:
         return ANSWERS[answer]
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """The 1 kHz tick: motions and watches; every twentieth gives a Status. Raises EncodeError as `status` does."""
+        """Run one 1 kHz tick, as `Firmware.tick`: a Status every twentieth time, None otherwise. Raises EncodeError as
+        `status`."""
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
         length: int = _library().tormag_bridge_tick(self._device, time_s, _seen(sensors), payload)
         _require_sent(length, sensors)
         return _decoded(Status, payload.raw) if length else None
 
     def status(self, sensors: Sensors) -> Status:
-        """Mode, switches, faults, and what was last accepted (0 before anything was).
+        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any).
 
         Raises EncodeError for a supply or temperature that has no step on the wire.
         """
@@ -150,14 +156,15 @@ class CompiledFirmware:
         return _decoded(Status, payload.raw)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """State and Sense of that moment. Raises EncodeError for a current or force that has no step on the wire."""
+        """Return State and Sense of that moment. Raises EncodeError for a current or force that has no step on the
+        wire."""
         payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
         result: int = _library().tormag_bridge_measurement(self._device, time_s, _seen(sensors), payloads)
         _require_sent(result, sensors)
         return _decoded(State, payloads.raw[:MAX_PAYLOAD]), _decoded(Sense, payloads.raw[MAX_PAYLOAD:])
 
     def identity(self) -> Identity:
-        """Who this device is."""
+        """Return the schema hash, firmware version and serial number."""
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
         _library().tormag_bridge_identity(self._device, payload)
         return _decoded(Identity, payload.raw)
@@ -179,7 +186,7 @@ class CompiledFirmware:
 
     @property
     def output(self) -> Output:
-        """What the bridges do."""
+        """State of both bridges now."""
         view = self._view()
         return Output(view.left_duty, view.right_duty, view.enabled)
 
@@ -190,7 +197,7 @@ class CompiledFirmware:
 
 
 def _seen(sensors: Sensors) -> Any:
-    """A reference to the sensors as the C sources see them."""
+    """Return a reference to `sensors` as a C structure."""
     return ctypes.byref(
         _Sensors(
             sensors.left_counts,
@@ -207,12 +214,13 @@ def _seen(sensors: Sensors) -> Any:
 
 
 def _require_sent(result: int, sensors: Sensors) -> None:
+    """Raise EncodeError if the C function's result is negative: a value has no step on the wire."""
     if result < 0:
         raise EncodeError(f"{sensors}: a value has no step on the wire")
 
 
 def _decoded(kind: type[M], payload: bytes) -> M:
-    """The message in a payload of the C codec; those of a device all have 8 bytes."""
+    """Return the message in a payload of the C codec; every message of a device has 8 bytes."""
     message = decode(FUNCTION[kind], payload)
     assert isinstance(message, kind), f"function {FUNCTION[kind]} decodes to {kind}"
     return message

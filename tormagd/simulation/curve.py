@@ -5,7 +5,8 @@ from typing import final
 
 @final
 class Curve:
-    """A function by its values on a uniform grid from `start` to `end`, linear between the points (two at least)."""
+    """A function as a table of its values, two at least, on a uniform grid from `start` to `end`; linear between the
+    points."""
 
     def __init__(self, values: list[float], start: float, end: float) -> None:
         self._start = start
@@ -14,7 +15,7 @@ class Curve:
         self._values = values
 
     def at(self, x: float) -> float:
-        """Value at x; the outermost pieces continue beyond the ends."""
+        """Return the value at `x`; the outermost pieces continue beyond both ends."""
         place = (x - self._start) * self._per_unit
         index = int(place)
         if index < 0:

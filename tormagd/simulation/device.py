@@ -37,10 +37,10 @@ from tormagd.simulation.plant import Plant, Truth
 BITS_PER_BYTE: Final = 10  # start, eight data bits, stop
 DEFAULT_BAUD: Final = 1_000_000
 FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware]
-"""What boots: `Firmware`, or the C sources of the same rules as `CompiledFirmware`."""
+"""Makes what boots: `Firmware`, or the C sources of the same rules, `CompiledFirmware`."""
 WEAR: Final = 4.0
 JUMP_MM: Final = 4.0
-"Of an encoder."
+"By how much an encoder leaps."
 WATCHDOG_S: Final = 0.1
 "A firmware that hangs is reset after this time."
 HOT_C: Final = 70.0
@@ -61,19 +61,19 @@ STANDING: Final = frozenset(
         "switch_dead_left",
     }
 )
-"""Faults that are there or not, and are asked for where they show."""
+"""Faults without a size or state of their own, asked for by name where they show."""
 OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed", "opening"})
 LEFT_OPEN: Final = 1
 RIGHT_OPEN: Final = 2
 LEFT_CLOSED: Final = 4
 RIGHT_CLOSED: Final = 8
 END_SWITCHES: Final = [Switches(bits) for bits in range(16)]
-"""By their bits, the four above: flags are made here, not in a tick."""
+"""By their bits, sums of the four above: flags are made here, not in a tick."""
 
 
 @final
 class Packet(Value):
-    """One message's payload and when it is handed to, or came from, the link."""
+    """One message's payload, and when the link delivers it or the device hands it to the link."""
 
     def __init__(self, time_s: float, function: int, payload: bytes) -> None:
         self.time_s: Final = time_s
@@ -83,9 +83,10 @@ class Packet(Value):
 
 @final
 class MessageDevice:
-    """The device at the level of messages: payloads in, payloads out, whatever carries them.
+    """The simulated device at the level of messages: payloads in, payloads out, whatever carries them.
 
-    `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`.
+    `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`. Times are the
+    host's, seconds from power-on. Faults strike at their times.
     """
 
     def __init__(
@@ -115,16 +116,16 @@ class MessageDevice:
         self._closed_m = parameters.assumed.closed_mm * 1e-3
         self._inbox: deque[Packet] = deque()
         self._answers: deque[tuple[float, Answer]] = deque()
-        """What received messages called for, and when it is given."""
+        """Answers that are due, with their times."""
         # when the first of each is due; infinite where there is none
         self._arrival_s = math.inf
         self._answer_s = math.inf
         self._struck: set[str] = set()
-        """The faults by name that are there now, of those that nothing else shows."""
+        """Names of the faults in STANDING that act now."""
         self._output: Output = OFF
         self._stuck_left: int | None = None
         self._silent = 0
-        """The functions that are not sent, a bit each."""
+        """Functions that a fault keeps from being sent, a bit each."""
         self._stuck_handle: int | None = None
         self._frozen_until_s = -math.inf
         self._answering_every = 1
@@ -145,11 +146,12 @@ class MessageDevice:
 
     @property
     def truth(self) -> Truth:
-        """What really is, at the time of the last `advance`."""
+        """The plant's true state at the time of the last `advance`."""
         return self.plant.truth
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
-        """Queue a payload that arrives at that time. Raises ValueError for one before those already queued."""
+        """Queue a payload that arrives at `time_s`. Raises ValueError for one before those already queued, or in the
+        past."""
         waiting = self._arrival_s < math.inf
         latest_s = self._inbox[-1].time_s if waiting else self._time_s
         if not latest_s <= time_s < math.inf:
@@ -159,7 +161,8 @@ class MessageDevice:
             self._arrival_s = time_s
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`. Raises ValueError for a time before the last one."""
+        """Let time pass until `now_s`: messages arrive, the firmware ticks and answers. Raises ValueError for a time in
+        the past."""
         if not self._time_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._time_s} on")
         while (event_s := self.next_event_s) <= now_s:
@@ -180,7 +183,7 @@ class MessageDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something will happen next, at the latest the next tick of the firmware."""
+        """When something happens next, at the latest the firmware's next tick."""
         event_s = self._tick_due_s
         if self._arrival_s < event_s:
             event_s = self._arrival_s
@@ -194,7 +197,7 @@ class MessageDevice:
             self._time_s = time_s
 
     def _switch(self) -> None:
-        """Let the bridges do what the firmware wants of them now."""
+        """Put the firmware's present output at the motors, as supply and faults let it."""
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
@@ -213,6 +216,8 @@ class MessageDevice:
         return (time_s - self._boot_s) * self._rate
 
     def _tick(self, time_s: float) -> None:
+        """Begin the faults that are due, then let the firmware tick; a frozen one is reset once its watchdog's time is
+        over."""
         self._ticks += 1
         while self._faults and self._faults[0].at_s <= time_s:
             self._strike(time_s, self._faults.popleft())
@@ -227,6 +232,8 @@ class MessageDevice:
             self._send(time_s, status)
 
     def _deliver(self, time_s: float, packet: Packet) -> None:
+        """Give the firmware a packet and queue its answer; faults may drop the packet, and one that is no message is
+        counted."""
         if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
         try:
@@ -249,6 +256,7 @@ class MessageDevice:
             self._answers.append((answer_s, answer))
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
+        """Send Identity, or State and Sense of this moment."""
         if answer is IDENTITY:
             known = self.firmware.identity()
             if "other_schema" in self._struck:
@@ -260,6 +268,7 @@ class MessageDevice:
         self._send(time_s, sense)
 
     def _send(self, time_s: float, message: Message) -> None:
+        """Put a message into `outbox`, unless a fault silences its kind; a fault may spoil the CRC of a State."""
         function, payload = FUNCTION[type(message)], encode(message)
         if self._silent and self._silent >> function & 1:
             return
@@ -268,6 +277,7 @@ class MessageDevice:
         self.outbox.append(Packet(time_s, function, payload))
 
     def _sensors(self) -> Sensors:
+        """Return what the electronics measure now, faults included."""
         plant, struck = self.plant, self._struck
         left_m, right_m = plant.left.position_m, plant.right.position_m
         switches = 0
@@ -297,6 +307,7 @@ class MessageDevice:
         return math.floor(self.plant.handle_mm * self._handle_counts_per_mm)
 
     def _reset(self, time_s: float) -> None:
+        """Boot the firmware again: mode, zero, clock and pending answers are lost, and encoders count from here."""
         self.firmware = self._boot(self.parameters)
         self._answers.clear()
         self._answer_s = math.inf
@@ -307,6 +318,7 @@ class MessageDevice:
         self._tick_due_s = time_s + TICK_S / self._rate
 
     def _encoders(self, left_rad: float, right_rad: float) -> tuple[int, int]:
+        """Return left and right counts since power-on at these screw angles, faults of the encoders included."""
         stuck = self._stuck_left
         left_counts = math.floor(left_rad * self._counts_per_rad) if stuck is None else stuck
         right_counts = math.floor(right_rad * self._counts_per_rad)
@@ -318,7 +330,8 @@ class MessageDevice:
         )
 
     def _count_on(self, stuck_left: int | None, left_count_sign: int) -> None:
-        """The left encoder counts another way from where it stands."""
+        """Let the left encoder go on from its present count: stuck at `stuck_left` unless None, else in the given
+        direction."""
         (left_rad, _), (right_rad, _) = self.plant.shafts
         left_counts, _ = self._encoders(left_rad, right_rad)
         self._has_bad_encoders = True
@@ -326,9 +339,10 @@ class MessageDevice:
         self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
 
     def mend(self) -> None:
-        """Ends, at the time of the last `advance`, whatever a fault does to the device.
+        """End all faults that act on the device now, at the time of the last `advance`.
 
-        What came of it stays: a firmware that was reset, counts that an encoder gained or missed, what was latched.
+        What came of them stays: a firmware that was reset, counts that an encoder gained or missed, what was latched. A
+        hanging firmware hangs until its reset, and faults that are not due yet still come.
         """
         plant, parameters, time_s = self.plant, self.parameters, self._time_s
         if "worn_gearbox" in self._struck:
@@ -348,6 +362,7 @@ class MessageDevice:
         self._switch()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
+        """Begin a fault. Raises ValueError for one whose effect is not defined here."""
         if fault.name in STANDING:
             self._struck.add(fault.name)
         match fault.name:
@@ -403,7 +418,7 @@ class MessageDevice:
             self._switch()
 
     def _run_clock_at(self, time_s: float, rate: float) -> None:
-        """The clock goes on from where it is."""
+        """Let the firmware's clock run at `rate` device seconds a second, from its present time on."""
         self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
         self._rate = rate
         self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
@@ -418,24 +433,24 @@ class SerialDevice(Protocol):
 
     @property
     def truth(self) -> Truth:
-        """What really is, at the time of the last call."""
+        """The plant's true state at the time of the last call."""
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """The host writes `data` now."""
+        """Take the bytes `data` that the host writes at `now_s`."""
 
     def transmit(self, now_s: float) -> bytes:
-        """The bytes that have come out of the line since the last call."""
+        """Let time pass until `now_s` and return the bytes that have left the line since the last call."""
 
 
 @final
 class VirtualDevice:
     """The device behind a serial line: bytes in, bytes out, both paced to the baud rate.
 
-    receive(now_s, data)   the host hands bytes to its port; they arrive one by one from then on
-    transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
-    advance(now_s)         only lets time pass
+        receive(now_s, data)   the host hands bytes to its port; they arrive one by one from then on
+        transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
+        advance(now_s)         only lets time pass
 
-    Times are the host's, seconds from power-on, and must not fall over all three (ValueError).
+    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError.
     """
 
     def __init__(
@@ -458,16 +473,16 @@ class VirtualDevice:
 
     @property
     def truth(self) -> Truth:
-        """What really is, at the time of the last call."""
+        """The plant's true state at the time of the last call."""
         return self.messages.truth
 
     @property
     def statistics(self) -> FramingStatistics:
-        """What the device's frame decoder has seen."""
+        """What the device's frame decoder has counted."""
         return self._decoder.statistics
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """The host writes `data` now; what exceeds the line's buffers is lost."""
+        """Take the bytes `data` that the host writes at `now_s`; what exceeds the line's buffers is lost."""
         self.messages.advance(now_s)
         start_s = max(now_s, self._receiver_free_s)
         room = MAX_BACKLOG_BYTES - math.ceil((start_s - now_s) / self._byte_s)
@@ -480,7 +495,7 @@ class VirtualDevice:
         self._receiver_free_s = start_s + taken * self._byte_s
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`."""
+        """Let time pass until `now_s`, and queue what the device sends on the line."""
         self.messages.advance(now_s)
         outbox = self.messages.outbox
         while outbox:
@@ -492,7 +507,7 @@ class VirtualDevice:
             self._line.append((start_s, frame))
 
     def transmit(self, now_s: float) -> bytes:
-        """The bytes that have come out of the line since the last call."""
+        """Let time pass until `now_s` and return the bytes that have left the line since the last call."""
         self.advance(now_s)
         out: list[bytes] = []
         line, byte_s = self._line, self._byte_s
@@ -511,7 +526,7 @@ class VirtualDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When there is next something to do: a frame that ends on the line, or an event inside the device."""
+        """When something happens next: a frame ends on the line, or an event inside the device."""
         event_s = self.messages.next_event_s
         if self._line:
             start_s, data = self._line[0]
@@ -520,7 +535,7 @@ class VirtualDevice:
 
 
 def _stretches(data: bytes) -> list[bytes]:
-    """`data` cut behind each delimiter, because a frame has arrived when its delimiter has."""
+    """Return `data` cut behind each delimiter: a frame has arrived when its delimiter has."""
     if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
         return [data]
     *ended, rest = data.split(DELIMITER)

@@ -16,12 +16,12 @@ from tormagd.simulation.warmth import Warmth
 
 @final
 class Element:
-    """State of the element: the field's branch, the elastomer's memory, the bristles, the temperature.
+    """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristle deflection, temperature.
 
-    Advances in equal steps of `dt_s`. `force_N` is the rendered force, the friction at the roller surface as a torque
-    sensor feels it: positive resists positive motion, negative resists negative motion, and just after a reversal the
-    bristles still point the old way. `kinetic_N`, never negative, is the level it slides at. Raises
-    tormagd.physics.errors.DomainError when the parameters leave the force law's domain somewhere in the stroke.
+    Advances in equal steps of `dt_s`. `force_N` is the friction at the roller surface, as a torque sensor feels it.
+    Positive resists positive motion. Just after a reversal the bristles still point the old way. `kinetic_N`, never
+    negative, is the kinetic friction now. Raises tormagd.physics.errors.DomainError when the parameters leave the force
+    law's domain somewhere in the stroke.
     """
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
@@ -49,16 +49,20 @@ class Element:
 
     @property
     def temperature_C(self) -> float:
-        """Of the elastomer."""
+        """Temperature of the elastomer."""
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
-        """One step that ends at that time, at that gap, with the handle at that mean speed."""
+        """Advance by one step that ends at `time_s` and at gap `gap_mm`, with the handle at the mean speed
+        `speed_mm_s`."""
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
-        """What of a step does not depend on the handle: field, memory, warmth, and the level it slides at."""
+        """Begin a step that ends at `time_s` and `gap_mm`: advance field, relaxation, temperature and `kinetic_N`.
+
+        None of these depends on the handle; `slide` ends the step.
+        """
         moment_Tm = self._field.advance(gap_mm)
         driving_N = self._force.at(moment_Tm) * self._warmth.advance(time_s)
         relaxed_N, self._memory = self._relax.advance(self._memory, driving_N)
@@ -66,11 +70,15 @@ class Element:
         self.kinetic_N = max(relaxed_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """The force at the end of the step that is prepared, were this the handle's mean speed; nothing changes."""
+        """Return the friction that the step begun by `prepare` would end with at the mean handle speed `speed_mm_s`.
+
+        The state stays.
+        """
         return self._friction.advance(self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
-        """The rest of the step that is prepared, with the handle at that mean speed."""
+        """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`: set `force_N` and the
+        bristles."""
         self.force_N, self._deflection_mm = self._friction.advance(
             self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s
         )

@@ -41,11 +41,11 @@ _FORM = re.compile(r"(?P<name>\w+)(?:=(?P<percent>[+-]?[\d.]+)%)?(?:@(?P<at_s>[\
 
 
 class FaultError(ValueError):
-    """A fault specification that names no known fault, or not in a known form."""
+    """Fault specification that is in no known form or names no known fault; the message says what is allowed."""
 
 
 class Fault(NamedTuple):
-    """One fault, when it begins (device power-on is 0) and, for those that have a size, its change in percent."""
+    """One fault, when it begins in seconds since power-on, and the change in percent for those that have a size."""
 
     name: str
     at_s: float = 0.0
@@ -53,7 +53,7 @@ class Fault(NamedTuple):
 
 
 def parse_fault(spec: str) -> Fault:
-    """Read `NAME[=PERCENT%][@SECONDS]`. Raises FaultError that lists what is known."""
+    """Read `NAME[=PERCENT%][@SECONDS]`. Raises FaultError that says what is allowed."""
     match = _FORM.fullmatch(spec)
     name = match["name"] if match else spec
     if match is None or name not in KNOWN:

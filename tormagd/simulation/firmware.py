@@ -3,8 +3,8 @@
     IDLE --Home--> HOMING --> IDLE, homed --Drive RUN--> RUN --Drive OFF, Retract, silence, fault--> RETRACTING
     RETRACTING --> IDLE at the open end, or LATCHED there when a fault is behind it; LATCHED --Clear--> IDLE
 
-The safe state is the open gap, reached at a bounded speed: friction holds the gap when the drives go off, and when it
-does not, the magnets pull it shut. So everything that ends a run opens first and switches off then.
+The safe state is the open gap, reached at a bounded speed. Friction holds the gap when the drives go off; where it does
+not, the magnets pull the gap shut. So everything that ends a run opens first and switches off then.
 """
 
 import math
@@ -63,7 +63,7 @@ DRIVES_OFF: Final = DriveMode.OFF
 
 @final
 class Sensors(Value):
-    """What the electronics measure; encoder counts since power-on, positive opening."""
+    """What the electronics measure at one time. Encoder counts are since boot, positive opening."""
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class Sensors(Value):
 
 @final
 class Output(Value):
-    """What the bridges do: duties in [-1, 1], or open."""
+    """State of both bridges: duties in -1..1, or open when not `enabled`."""
 
     def __init__(self, left_duty: float, right_duty: float, enabled: bool) -> None:
         self.left_duty: Final = left_duty
@@ -102,7 +102,7 @@ OFF: Final = Output(0.0, 0.0, enabled=False)
 
 
 class Answer(Enum):
-    """What a received message calls for."""
+    """What the firmware answers to a received message: nothing, its Identity, or State and Sense."""
 
     NONE = auto()
     IDENTITY = auto()
@@ -116,7 +116,7 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 
 @final
 class Firmware:
-    """One device's firmware from its boot on. All times are device time, in seconds since the boot, never falling."""
+    """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm
@@ -148,7 +148,11 @@ class Firmware:
     # -- messages ------------------------------------------------------------------------------------------------
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host; those of a device are ignored."""
+        """Act on one message of the host and return what to answer; messages of a device are ignored.
+
+        A Hello with another schema or protocol version latches SCHEMA_MISMATCH, which opens the gap. A command with the
+        nonce accepted last is ignored.
+        """
         if isinstance(message, Drive):
             return self._drive(time_s, message, sensors)
         if isinstance(message, Hello):
@@ -165,7 +169,11 @@ class Firmware:
         return NO_ANSWER
 
     def _drive(self, time_s: float, drive: Drive, sensors: Sensors) -> Answer:
-        """A Drive with a new counter is answered in every mode, so that a host can always measure."""
+        """Act on a Drive; one with a new counter is answered in every mode, so that a host can always measure.
+
+        RUN is entered only from IDLE: homed, of a matching schema, without a fault. Where anything but OFF ended the
+        last run, an OFF must come first.
+        """
         if drive.counter == self._drive_counter:
             return NO_ANSWER
         self._drive_counter = drive.counter
@@ -184,7 +192,11 @@ class Firmware:
         return MEASUREMENT
 
     def _obey(self, time_s: float, command: Retract | Home | Clear, sensors: Sensors) -> bool:
-        """Whether the command was accepted; only an accepted one is acknowledged in Status."""
+        """Carry out the command unless the mode forbids it, and return whether it was accepted.
+
+        Only an accepted command is acknowledged in Status. Retract is refused in LATCHED, Home outside IDLE. Clear is
+        refused while motors are on, a cause is still there or the schema does not match.
+        """
         if isinstance(command, Retract):
             if self.mode is LATCHED:
                 return False
@@ -216,7 +228,8 @@ class Firmware:
     # -- time ----------------------------------------------------------------------------------------------------
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """The 1 kHz tick: motions and watches; every twentieth gives a Status."""
+        """Run one 1 kHz tick, motions and watches, which may latch faults. Returns a Status every twentieth time, None
+        otherwise."""
         if self.mode is RUN:
             self._tick_run(time_s, sensors)
         elif self._motors_on:
@@ -227,6 +240,7 @@ class Firmware:
         return None if self._ticks % STATUS_TICKS else self.status(sensors)
 
     def _tick_run(self, time_s: float, sensors: Sensors) -> None:
+        """Watch a run: any fault ends it and opens the gap."""
         left_mm, right_mm = self._positions_mm(sensors)
         fault = self._causes(time_s, sensors)
         if time_s - self._drive_s > COMMAND_TIMEOUT_S:
@@ -241,6 +255,7 @@ class Firmware:
         self.output = self._bounded(self.output, sensors)
 
     def _tick_motion(self, time_s: float, sensors: Sensors) -> None:
+        """Advance homing or retraction by one tick; at its end take over the zeros, latch faults and rest."""
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
         homing = isinstance(motion, Homing)
@@ -274,6 +289,7 @@ class Firmware:
         self._rest(time_s, LATCHED if self.faults else IDLE)
 
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
+        """Watch the resting device; motion by itself opens the gap, and other new causes are latched."""
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)
             return
@@ -283,7 +299,8 @@ class Firmware:
 
     @staticmethod
     def _bounded(output: Output, sensors: Sensors) -> Output:
-        """A carriage at its open switch is not driven on into the stop."""
+        """Return the output without an opening duty for a carriage at its open switch: it must not run on into the
+        stop."""
         if not sensors.switches:
             return output
         return Output(
@@ -295,7 +312,7 @@ class Firmware:
     # -- transitions ---------------------------------------------------------------------------------------------
 
     def _fail(self, time_s: float, fault: DeviceFault, sensors: Sensors) -> None:
-        """Latch a fault and open the gap; drives that are off stay off, unless the carriages move by themselves."""
+        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves."""
         self.faults |= fault
         if not self._motors_on and DeviceFault.UNCOMMANDED_MOTION not in fault:
             self._rest(time_s, LATCHED)
@@ -303,6 +320,7 @@ class Firmware:
             self._retract(time_s, sensors)
 
     def _retract(self, time_s: float, sensors: Sensors) -> None:
+        """Begin to open the gap. After RUN the host must send OFF before it can enter RUN again."""
         if self.mode is RUN:
             self._may_run = False
         self.mode = RETRACTING
@@ -318,7 +336,7 @@ class Firmware:
         )
 
     def _rest(self, time_s: float, mode: DeviceMode) -> None:
-        """Drives off; a latched fault also takes away the trust in the zero."""
+        """Open the bridges and enter `mode`; LATCHED also makes the device unhomed."""
         self.mode = mode
         self.output = OFF
         self._motion = None
@@ -334,7 +352,7 @@ class Firmware:
     # -- watches -------------------------------------------------------------------------------------------------
 
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
-        """Faults whose cause is there now, whatever the device does."""
+        """Return the faults whose cause is there now, whatever the device does: supply and temperature."""
         causes = NO_FAULT
         if not LEAST_SUPPLY_V <= sensors.supply_V <= MOST_SUPPLY_V:
             causes |= DeviceFault.SUPPLY
@@ -343,7 +361,11 @@ class Firmware:
         return causes
 
     def _causes(self, time_s: float, sensors: Sensors) -> DeviceFault:
-        """The lasting ones, and OVERCURRENT once a motor has drawn more than the level for too long without a break."""
+        """Return the lasting causes, and OVERCURRENT once a motor's current has been at its level for over
+        OVERCURRENT_S.
+
+        Updates when each motor was last under that level.
+        """
         if abs(sensors.left_current_A) < self._overcurrent_A:
             self._left_calm_s = time_s
         if abs(sensors.right_current_A) < self._overcurrent_A:
@@ -353,11 +375,15 @@ class Firmware:
         return causes | DeviceFault.OVERCURRENT if time_s - calm_s > OVERCURRENT_S else causes
 
     def _calm(self, time_s: float) -> None:
+        """Restart the overcurrent watch of both motors."""
         self._left_calm_s = time_s
         self._right_calm_s = time_s
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
-        """How far a carriage has moved from where it rested; while opening, inward from where it had come to."""
+        """Return how far a carriage has moved from where it rested; while opening, inward from its most open place.
+
+        0 within COASTING_S of the last transition. Updates the place that it measures from.
+        """
         if time_s - self._watch_since_s < COASTING_S:
             return 0.0
         left, right = sensors.left_counts, sensors.right_counts
@@ -386,11 +412,12 @@ class Firmware:
     # -- reports -------------------------------------------------------------------------------------------------
 
     def identity(self) -> Identity:
-        """Who this device is."""
+        """Return the schema hash, firmware version and serial number."""
         return Identity(SCHEMA_HASH, VERSION[0], VERSION[1], SERIAL_NUMBER)
 
     def status(self, sensors: Sensors) -> Status:
-        """Mode, switches, faults, and what was last accepted (0 before anything was)."""
+        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before
+        any)."""
         ends: int = sensors.switches
         return Status(
             mode=self.mode,
@@ -403,7 +430,7 @@ class Firmware:
         )
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """State and Sense of that moment."""
+        """Return State and Sense of that moment; each call counts State's counter up."""
         left_mm, right_mm = self._positions_mm(sensors)
         self._state_counter = (self._state_counter + 1) % 256
         return (

@@ -11,7 +11,7 @@ SMALLEST_GAP_MM: Final = 45.0
 
 @final
 class GapField:
-    """The radial moment, T m, of a plant's magnets, off by at most `branch_Tm` either way for its hysteresis."""
+    """Radial moment of a plant's magnets, T m, with rate-independent hysteresis of at most `branch_Tm` either way."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float) -> None:
         self._moment = moment_over_gap(plant)
@@ -23,15 +23,15 @@ class GapField:
 
     @property
     def moment_Tm(self) -> float:
-        """At the newest gap, hysteresis and all."""
+        """Radial moment at the newest gap, with hysteresis, T m."""
         return self._moment_Tm + self._lag_Tm
 
     def static_Tm(self, gap_mm: float) -> float:
-        """At a gap, without hysteresis."""
+        """Return the radial moment at `gap_mm` without hysteresis, T m; the state stays."""
         return self._moment.at(gap_mm)
 
     def advance(self, gap_mm: float) -> float:
-        """The moment once the gap has become `gap_mm`."""
+        """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m."""
         moment_Tm = self._moment.at(gap_mm)
         change_Tm = moment_Tm - self._moment_Tm
         if change_Tm != 0.0:

@@ -19,7 +19,7 @@ PRESSES_AT_S: Final = 10.0
 PRESSING_MM_S: Final = 1.0
 EXACT_N: Final = 1e-9
 ROUNDS: Final = 100
-"Within this, and at most so often, a step of a hand that feels is solved."
+"A step of a hand that feels is solved to within EXACT_N, in ROUNDS rounds at most."
 RECORDED = {"t_s": TIME, "position_mm": (-1e6, 1e6, "mm")}
 KNOWN = (
     "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], felt[=KEY=VALUE,...], "
@@ -28,19 +28,19 @@ KNOWN = (
 
 
 class HandError(ValueError):
-    """A hand specification or recording that cannot be used."""
+    """Hand specification or recording that cannot be used; the message says what is allowed."""
 
 
 class Hand(Protocol):
-    """A motion of the roller's surface, or of a finger."""
+    """Prescribed motion of the roller's surface, or of a finger into a pad."""
 
     def position_mm(self, time_s: float) -> float:
-        """Travel of the roller surface since time 0, or the depth in the pad, mm."""
+        """Return the travel of the roller's surface since time 0, or the finger's depth in the pad, mm."""
 
 
 @final
 class SteadyHand(Value):
-    """Turns at a constant speed, 42 mm/s at the 20 rpm of the thesis's measurements."""
+    """Hand that turns at a constant speed: 42 mm/s at the 20 rpm of the thesis's measurements."""
 
     def __init__(self, rpm: float = DEFAULT_RPM) -> None:
         self.rpm: Final = rpm
@@ -51,7 +51,8 @@ class SteadyHand(Value):
 
 @final
 class ReversingHand(Value):
-    """Forth, rest, back, rest: smooth strokes of 30 mm (0.35 of the period each) with full stops (0.15 each)."""
+    """Hand that goes forth, rests, goes back, rests: smooth strokes of 30 mm (0.35 of the period each), full stops
+    (0.15 each)."""
 
     def __init__(self, period_s: float = DEFAULT_PERIOD_S) -> None:
         self.period_s: Final = period_s
@@ -66,8 +67,10 @@ class ReversingHand(Value):
 
 @final
 class PressingHand(Value):
-    """The dummy finger of the thesis's pulse experiment: it touches the pad after 10 s, when the device is homed,
-    presses in at 1 mm/s, and stays."""
+    """The dummy finger of the thesis's pulse experiment: it presses `depth_mm` into the pad at 1 mm/s, and stays.
+
+    It touches the pad after 10 s, when the device is homed.
+    """
 
     def __init__(self, depth_mm: float = DEFAULT_DEPTH_MM) -> None:
         self.depth_mm: Final = depth_mm
@@ -78,7 +81,7 @@ class PressingHand(Value):
 
 @final
 class RecordedHand(Value):
-    """A recording, linear between its points and standing before the first and after the last."""
+    """Recorded motion: linear between its points, standing before the first and after the last. Times rise."""
 
     def __init__(self, times_s: tuple[float, ...], positions_mm: tuple[float, ...]) -> None:
         self.times_s: Final = times_s
@@ -97,7 +100,8 @@ class RecordedHand(Value):
 
 @final
 class StrokingHand(Value):
-    """Rests until the device is homed, 10 s; then pushes to its reach, rests, withdraws, rests, and again."""
+    """Hand that rests for 10 s, until the device is homed. Then it pushes to `reach_mm`, rests, withdraws, rests, and
+    so on."""
 
     def __init__(self, push_mm_s: float, reach_mm: float, rest_s: float) -> None:
         self.push_mm_s: Final = push_mm_s
@@ -113,7 +117,8 @@ class StrokingHand(Value):
 
 @final
 class Impedance(Value):
-    """What a hand is to the handle: the mass that moves with it, and the spring and damper behind that mass."""
+    """Mechanical impedance of a hand at the handle: the mass that moves with it, and spring and damper behind that
+    mass."""
 
     def __init__(self, mass_kg: float, stiffness_N_mm: float, damping_N_s_mm: float) -> None:
         self.mass_kg: Final = mass_kg
@@ -123,14 +128,14 @@ class Impedance(Value):
 
 @final
 class FeltHand:
-    """A hand that feels: spring and damper draw its mass x towards a motion x_i that it intends, friction f resists.
+    """Hand that feels: spring and damper draw its mass x towards an intended motion x_i, while the friction f resists.
 
         m dv/dt = k (x_i - x) + d (dx_i/dt - v) - f(v)
 
-    Each step is solved with the friction of this very step, for its mean speed (implicit midpoint): the energies close,
-    where a force that came late would drive what it should damp. Of several speeds that fit, where friction falls with
-    speed, it is one near the speed before: what sticks goes on to stick. Bristles act with their force at a
-    step's end, which damps their ringing, at 8 N/mm as 0.004 N s/mm would. From `lets_go_s` on the mass is alone.
+    Each step is solved with its own friction at its mean speed (implicit midpoint). So the energies close, where a late
+    force would drive what it should damp. Where friction falls with speed and several speeds fit, the one found is near
+    the speed before: what sticks goes on to stick. Bristles act with their force at a step's end, which damps their
+    ringing, at 8 N/mm as 0.004 N s/mm would. From `lets_go_s` on the mass is alone.
     """
 
     def __init__(self, intended: Hand, impedance: Impedance, lets_go_s: float = math.inf) -> None:
@@ -142,16 +147,17 @@ class FeltHand:
         self.speed_mm_s = 0.0
         "At the end of the last step."
         self.force_N = 0.0
-        "By which spring and damper pushed the mass, in the mean of the last step."
+        "Mean force of spring and damper on the mass in the last step."
 
     def position_mm(self, time_s: float) -> float:
-        """Where it means to be; `moved_mm` says where it is."""
+        """Return the intended place at `time_s`; `moved_mm` gives the real one."""
         return self._intended.position_mm(time_s)
 
     def moved_mm(self, time_s: float, resisting_N: Callable[[float], float]) -> float:
-        """Where it is at the end of a step, at that time: `resisting_N` is what resists a mean speed in it.
+        """Advance the hand to `time_s` and return its place then, mm; `resisting_N` gives the friction at a mean speed
+        in the step.
 
-        Raises ValueError for a time that has been: a hand that feels has a state, and moves one plant.
+        Raises ValueError for a time not after the last one: a hand that feels has a state, and moves one plant.
         """
         dt_s, speed_mm_s, impedance = time_s - self._time_s, self.speed_mm_s, self._impedance
         if dt_s <= 0.0:
@@ -186,20 +192,26 @@ _PUBLISHED: Final = (
 
 
 def drawn_impedance(seed: int) -> Impedance:
-    """A person's hand: a finger's, a wrist's and an arm's by turns, evenly in the logarithms of what was published.
+    """Draw a person's hand by `seed`: a finger's, a wrist's or an arm's in turn, evenly in the logarithms of published
+    sizes.
 
-    All are of the order that these give: of a finger tip Hajian and Howe (J Biomech Eng 119, 1997); of a wrist that
-    holds a stylus Kuchenbecker, Park and Niemeyer (ASME IMECE, 2003); of a hand on the arm Hogan (IEEE ICRA, 1989),
-    Dolan, Friedman and Nagurka (IEEE Trans SMC 23, 1993), Tsuji, Morasso, Goto and Ito (Biol Cybern 72, 1995). The
-    handle's own mass is not in them.
+    The same seed gives the same hand. The handle's own mass is not included. Sizes are of the order found for
+
+        a finger tip      Hajian and Howe (J Biomech Eng 119, 1997)
+        a held stylus     Kuchenbecker, Park and Niemeyer (ASME IMECE, 2003)
+        a hand on an arm  Hogan (IEEE ICRA, 1989), Dolan, Friedman and Nagurka (IEEE Trans SMC 23, 1993),
+                          Tsuji, Morasso, Goto and Ito (Biol Cybern 72, 1995)
     """
     draw = random.Random(f"hand {seed}")
     return Impedance(*[low * (high / low) ** draw.random() for low, high in _PUBLISHED[seed % len(_PUBLISHED)]])
 
 
 def _root(function: Callable[[float], float], start: float, slope: float) -> float:
-    """Where a function that rises far out is 0: bracketed from `start` on, by steps that grow (the first is that of a
-    straight line of this slope), then found by the Illinois method."""
+    """Return a zero of a function that rises far out, to within EXACT_N or as near as ROUNDS rounds come.
+
+    The zero is bracketed from `start` on by growing steps, the first by a line of `slope`; the Illinois method finds
+    it.
+    """
     near, at_near = start, function(start)
     step = -at_near / slope
     far = near + step
@@ -226,7 +238,7 @@ _SIZED: dict[str, tuple[Callable[..., Hand], float, float]] = {
     "reversing": (ReversingHand, 0.1, 1000.0),
     "pressing": (PressingHand, 0.1, 6.0),
 }
-"By its name, a hand that has a size, and what that may be."
+"By name, a hand with one size: its class, and the least and greatest size."
 _FELT: dict[str, tuple[float, float, float]] = {
     "mass_kg": (0.1, 0.001, 20.0),
     "stiffness_N_mm": (0.4, 0.0, 100.0),
@@ -235,11 +247,14 @@ _FELT: dict[str, tuple[float, float, float]] = {
     "reach_mm": (20.0, 0.1, 1000.0),
     "rest_s": (1.0, 0.0, 1000.0),
 }
-"By its name, a size of a hand that feels: without a word, the least, the most."
+"By name, a size of a hand that feels: its default, least and greatest."
 
 
 def parse_hand(spec: str) -> Hand:
-    """The hand that a command-line word stands for. Raises HandError naming what is allowed."""
+    """Return the hand that a command-line word stands for, reading a recording where the word names one.
+
+    Raises HandError that lists what is allowed.
+    """
     name, _, value = spec.partition("=")
     if name in _SIZED:
         hand, low, high = _SIZED[name]
@@ -252,6 +267,7 @@ def parse_hand(spec: str) -> Hand:
 
 
 def _felt(spec: str, text: str) -> FeltHand:
+    """Return the hand of `felt=KEY=VALUE,...`, with usual sizes where none is given. Raises HandError."""
     sizes = {key: usual for key, (usual, _, _) in _FELT.items()}
     for word in filter(None, text.split(",")):
         key, _, value = word.partition("=")
@@ -264,6 +280,7 @@ def _felt(spec: str, text: str) -> FeltHand:
 
 
 def _number(spec: str, text: str, low: float, high: float) -> float:
+    """Return `text` as a number from `low` to `high`. Raises HandError, also for no number."""
     try:
         number = float(text)
     except ValueError:
@@ -274,7 +291,7 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
 
 
 def read_recording(path: Path) -> RecordedHand:
-    """Read a CSV with the columns t_s and position_mm. Raises HandError naming file and row."""
+    """Read a CSV with the columns t_s and position_mm, within +-1e6 mm. Raises HandError naming file and row."""
     try:
         table = read_table(path, RECORDED)
     except ForceFileError as error:

@@ -1,7 +1,7 @@
 """The firmware's own motions: opening at a bounded speed, and homing. Positive is opening.
 
-Both move each carriage along a position ramp and let the drive duty follow it: the ramp's speed as feed-forward, the
-distance to the ramp as the integral part. The duty is bounded too, and with it, through the motor's back-EMF, the speed
+Both move each carriage along a position ramp and let the drive duty follow it. The ramp's speed is the feed-forward,
+the distance to the ramp the integral part. The duty is bounded too; through the motor's back-EMF that bounds the speed
 of a carriage whose encoder is dead.
 """
 
@@ -32,7 +32,7 @@ LATE_S: Final = 0.5  # to turn round, to taper, to settle at the switch
 
 @final
 class Carriage(Value):
-    """What the firmware knows of one carriage: encoder position, its open switch, its motor's current."""
+    """What the firmware knows of one carriage: encoder position, state of its open switch, motor current."""
 
     def __init__(self, position_mm: float, at_open_end: bool, current_A: float) -> None:
         self.position_mm: Final = position_mm
@@ -41,7 +41,7 @@ class Carriage(Value):
 
 
 class Outcome(Enum):
-    """Where a motion stands."""
+    """Whether a motion goes on, is done, has failed, or found a reversed motor or encoder."""
 
     MOVING = auto()
     DONE = auto()
@@ -51,14 +51,17 @@ class Outcome(Enum):
 
 @final
 class Ramp:
-    """Moves one carriage at a bounded speed, by way of a position that runs ahead of it."""
+    """Position ramp that leads one carriage at a bounded speed, and the duty that follows the ramp."""
 
     def __init__(self, position_mm: float, lead_mm_rev: float) -> None:
         self._reference_mm = position_mm
         self._full_speed_mm_s = NO_LOAD_REV_S * lead_mm_rev
 
     def duty(self, position_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Duty for the next `dt_s` at that signed speed."""
+        """Advance the ramp by `dt_s` at the signed `speed_mm_s` and return the duty for the carriage at `position_mm`.
+
+        The ramp stays within RAMP_LEAD_MM of the carriage, the duty within DUTY_LIMIT.
+        """
         reference_mm = self._reference_mm + speed_mm_s * dt_s
         self._reference_mm = min(max(reference_mm, position_mm - RAMP_LEAD_MM), position_mm + RAMP_LEAD_MM)
         duty = speed_mm_s / self._full_speed_mm_s + RAMP_GAIN_PER_MM * (self._reference_mm - position_mm)
@@ -67,7 +70,7 @@ class Ramp:
 
 @final
 class Opening:
-    """Brings one carriage to its open switch and brakes it there.
+    """Motion that brings one carriage to its open switch and brakes it there.
 
     A carriage that comes no further has failed when its current says why: a stall, or no current at all. Standing still
     at a travelling current is a dead encoder, and the motion goes on.
@@ -83,7 +86,7 @@ class Opening:
         self.outcome = Outcome.MOVING
 
     def step(self, time_s: float, dt_s: float, carriage: Carriage, speed_mm_s: float) -> None:
-        """One tick towards the open end, at that speed at most."""
+        """Advance by one tick towards the open end at `speed_mm_s` at most: set `duty` and `outcome`."""
         if self.outcome is Outcome.FAILED:
             return
         if carriage.at_open_end:
@@ -102,17 +105,17 @@ class Opening:
             self.outcome = Outcome.FAILED
 
     def went_back(self, carriage: Carriage) -> bool:
-        """Whether the carriage has gone towards closed while it was driven open."""
+        """Return whether the carriage went more than WRONG_WAY_MM towards closed while it was driven open."""
         return carriage.position_mm < self._progress_mm - WRONG_WAY_MM
 
 
 @final
 class Retraction:
-    """Opens the gap: both carriages to their switches, each as far as it comes.
+    """Motion that opens the gap: both carriages to their open switches, each as far as it comes.
 
-    With a valid zero the speed tapers towards the open end; without one the search for the switch is slow throughout.
-    It is late after the time of the whole stroke, wherever it began: a dead encoder says nothing of what is left. It
-    goes on then, for it may still arrive.
+    With `tapered`, which needs a valid zero, the speed falls towards the open end; otherwise one speed holds
+    throughout. A motion counts as late after the time of the whole stroke, wherever it began: a dead encoder says
+    nothing of what is left. A late one goes on, for it may still arrive.
     """
 
     def __init__(
@@ -133,25 +136,28 @@ class Retraction:
 
     @property
     def duties(self) -> tuple[float, float]:
-        """Left and right duty."""
+        """Left and right duty, in -1..1."""
         left, right = self._openings
         return left.duty, right.duty
 
     @property
     def blocked(self) -> bool:
-        """Whether a carriage has been given up; its screw springs back from the stall."""
+        """Whether a carriage has been given up; its screw then springs back from the stall."""
         return Outcome.FAILED in [opening.outcome for opening in self._openings]
 
     def is_late(self, time_s: float) -> bool:
-        """Whether it has taken longer than the whole stroke takes a device that can open."""
+        """Return whether the motion has taken longer than the whole stroke takes a device that can open."""
         return time_s > self._late_s
 
     def is_reversed(self, carriages: tuple[Carriage, Carriage]) -> bool:
-        """Whether a carriage has gone back towards closed."""
+        """Return whether a carriage has gone back towards closed while it was driven open."""
         return True in [opening.went_back(each) for opening, each in zip(self._openings, carriages, strict=True)]
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """One tick; FAILED when a carriage could not be brought to its switch and neither moves any more."""
+        """Advance both carriages by one tick and return the outcome.
+
+        FAILED when a carriage did not reach its switch and neither moves any more, or when the time limit is over.
+        """
         for opening, carriage in zip(self._openings, carriages, strict=True):
             opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))
         outcomes = [opening.outcome for opening in self._openings]
@@ -160,6 +166,8 @@ class Retraction:
         return Outcome.DONE if outcomes == [Outcome.DONE, Outcome.DONE] else Outcome.FAILED
 
     def _bounded_mm_s(self, carriage: Carriage) -> float:
+        """Return the speed for this carriage now: lower towards the open end, and beyond it a search, as the zero is
+        wrong there."""
         if not self._tapered:
             return self._speed_mm_s
         # beyond where its switch should have been the zero is wrong, as after an encoder's leap: it searches there
@@ -169,7 +177,7 @@ class Retraction:
 
 @final
 class Homing:
-    """Finds the open switches twice: at speed, then, after backing off, creeping, so that the zero repeats.
+    """Motion that finds both open switches twice: at speed, then creeping after a back-off, so that the zero repeats.
 
     `zeros_mm` holds the encoder positions of the two switches once the outcome is DONE.
     """
@@ -196,12 +204,16 @@ class Homing:
 
     @property
     def zeros_mm(self) -> tuple[float, float]:
-        """Encoder positions at which the open switches closed; 0 for one that was not found."""
+        """Encoder positions at which the left and right open switch closed; 0 for one that was not found."""
         left_mm, right_mm = self._edges_mm
         return left_mm or 0.0, right_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """One tick: outward, back off, creep outward. REVERSED when a carriage has gone back, and was braked."""
+        """Advance by one tick and return the outcome; set `duties`.
+
+        FAILED after the time limit, a failed search or a back-off that takes too long. REVERSED once a carriage that
+        went back towards closed has been braked.
+        """
         if time_s >= self._deadline_s:
             return Outcome.FAILED
         if self._search is None:
@@ -224,11 +236,13 @@ class Homing:
         return Outcome.MOVING
 
     def _begin_back_off(self, time_s: float, carriages: tuple[Carriage, Carriage]) -> None:
+        """Note where and when a back-off begins."""
         self._back_off_since_s = time_s
         self._starts_mm = [carriage.position_mm for carriage in carriages]
         self._ramps = [Ramp(carriage.position_mm, self._lead_mm_rev) for carriage in carriages]
 
     def _back_off(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
+        """Drive both carriages off their switches; begin the creeping search once both are clear."""
         if time_s - self._back_off_since_s > BACK_OFF_LIMIT_S:
             return Outcome.FAILED
         sides = zip(carriages, self._ramps, self._starts_mm, strict=True)
@@ -240,6 +254,7 @@ class Homing:
         return Outcome.MOVING
 
     def _inward_duty(self, carriage: Carriage, ramp: Ramp, start_mm: float, dt_s: float) -> float:
+        """Return the duty that closes this carriage's side, 0 once it is BACK_OFF_MM in and off its switch."""
         clear = carriage.position_mm <= start_mm - BACK_OFF_MM and not carriage.at_open_end
         return 0.0 if clear else ramp.duty(carriage.position_mm, -self._speed_mm_s, dt_s)
 

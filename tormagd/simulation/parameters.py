@@ -14,7 +14,7 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import require
 
 PLANTS_INSERT = "MRE-50-40"
-"What the committed samples have in them."
+"Insert of the committed samples."
 _PLANTS = resources.files(__package__) / "plants"
 
 PlantError = ConfigError
@@ -25,7 +25,7 @@ Share = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
 class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
-    """The MRE insert, as in tables 2.3 and 2.4 of the thesis."""
+    """The MRE insert around the shaft, as in tables 2.3 and 2.4 of the thesis."""
 
     shear_modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
     relative_permeability: Annotated[float, Meta(ge=1.0, le=10.0)]
@@ -33,7 +33,8 @@ class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Friction(Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the contact between insert and shaft departs from a constant kinetic level."""
+    """Contact of insert and shaft: static over kinetic friction, Stribeck speed, pre-sliding stiffness and
+    viscosity."""
 
     static_to_kinetic: Annotated[float, Meta(ge=1.0, le=3.0)]
     stribeck_speed_mm_s: Positive
@@ -42,9 +43,10 @@ class Friction(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Field(Struct, frozen=True, forbid_unknown_fields=True):
-    """Radial moment over gap, and its memory.
+    """Radial moment of the magnets over their gap, with hysteresis in percent of its value at a gap of 45 mm.
 
-    `power` is coefficient * gap_mm**exponent; `thesis` is Eq. 7 up to 95 mm, going over smoothly into that power law.
+    `power` is coefficient * gap_mm**exponent, T m. `thesis` is Eq. 7 up to 95 mm, and goes over smoothly into that
+    power law.
     """
 
     law: Literal["power", "thesis"]
@@ -54,7 +56,10 @@ class Field(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
-    """Prony terms of the insert: what share of a force step dies away with which time constant."""
+    """Prony terms of an elastomer: each share of a force step dies away with its time constant.
+
+    Raises ValueError where the two differ in length, or the shares sum to 1 or more.
+    """
 
     fractions: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
     times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
@@ -93,7 +98,10 @@ class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """The second plant's element, in the place of the insert: see `SecondElement`, whose laws name what these are."""
+    """The element of the second plant, in the place of the insert; `SecondElement` states the laws of these constants.
+
+    Raises ValueError where shares do not match what they belong to, or have another sum than their law allows.
+    """
 
     concentration: Annotated[float, Meta(ge=1.0, le=3.0)]
     without_field_N: NotNegative
@@ -122,7 +130,7 @@ class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
-    """Temperature of the insert: its effect on the force, and how fast it starts to warm."""
+    """Temperature of the insert: its effect on the force, and how fast the insert begins to warm."""
 
     force_percent_K: Annotated[float, Meta(ge=-5.0, le=5.0)]
     drift_K_h: Annotated[float, Meta(ge=0.0, le=20.0)]
@@ -145,7 +153,8 @@ class Motor(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Gear(Struct, frozen=True, forbid_unknown_fields=True):
-    """`output_friction_Nm` is what the no-load current shows; the mesh loses a share of the torque beyond it."""
+    """One gearbox. The mesh loses 1 - `efficiency` of the torque above `output_friction_Nm`, which the no-load current
+    shows."""
 
     ratio: Annotated[float, Meta(ge=1.0)]
     efficiency: Annotated[float, Meta(gt=0.0, le=1.0)]
@@ -164,7 +173,7 @@ class Screw(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
-    """Drive stage and encoders; the counts are per turn of the gearbox output."""
+    """Drive stage and encoders; an encoder's counts are per turn of the gearbox output."""
 
     encoder_counts_per_rev: Annotated[int, Meta(ge=16, le=1_000_000)]
     supply_V: Annotated[float, Meta(gt=0.0, le=25.0)]
@@ -173,7 +182,8 @@ class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True):
-    """Noise is the standard deviation of one sample; the offset drifts steadily, its sign falls with the seed."""
+    """The force sensor: noise is one sample's standard deviation. The offset drifts steadily, up or down by the
+    seed."""
 
     noise_mN: Annotated[float, Meta(ge=0.0, le=1000.0)]
     drift_mN_min: Annotated[float, Meta(ge=0.0, le=1000.0)]
@@ -182,14 +192,17 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FirmwareTiming(Struct, frozen=True, forbid_unknown_fields=True):
-    """How far the device's clock is off the host's, and the width of the uniform delay before a reply."""
+    """How far the device's clock is off the host's, and the width of the uniform random delay before a reply."""
 
     clock_ppm: Annotated[float, Meta(ge=-1000.0, le=1000.0)]
     reply_jitter_us: Annotated[float, Meta(ge=0.0, le=5000.0)]
 
 
 class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
-    """What the plant card leaves open. Every default is an assumption, with its reason beside it."""
+    """What the plant card leaves open. Every default is an assumption, with its reason beside it.
+
+    Raises ValueError where switches, stops, starting places or temperatures contradict each other.
+    """
 
     screw_mean_diameter_mm: Positive = 7.0  # an 8 mm trapezoidal screw, thread depth 1 mm
     ambient_C: Annotated[float, Meta(ge=-20.0, le=60.0)] = 25.0  # where the thesis's temperature range begins
@@ -222,7 +235,10 @@ class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """One simulated device, in the units of the plant card."""
+    """One simulated device, in the units of the plant card.
+
+    Raises ValueError where `assumed.overcurrent_A` is not under the current limit of the electronics.
+    """
 
     elastomer: Elastomer
     friction: Friction
@@ -238,9 +254,9 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     firmware: FirmwareTiming
     assumed: Assumed = Assumed()
     pad: PadParameters | None = None
-    "With one the device is a pad under a finger: `elastomer`, `friction` and `relaxation` are of no part of it."
+    "In the place of insert and shaft; `elastomer`, `friction` and `relaxation` are then unused. None: no pad."
     second: SecondParameters | None = None
-    "With one the element is the second plant's: nor are they, or `field`, of any part of it."
+    "In the place of the insert; `elastomer`, `friction`, `relaxation` and `field` are then unused. None: the insert."
 
     def __post_init__(self) -> None:
         limit_A = self.electronics.current_limit_A
@@ -263,7 +279,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Between(Struct, frozen=True, forbid_unknown_fields=True):
-    """A file of a pad, or of the second plant's element: of what plant the magnets and carriages about it are."""
+    """A plant file with a pad or the second plant's element. `carriages` names the plant with all the other parts."""
 
     carriages: str
     pad: PadParameters | None = None
@@ -290,8 +306,8 @@ def plant_names() -> tuple[str, ...]:
 def load_plant(path_or_name: str | Path) -> PlantParameters:
     """Read a plant by the name of a packaged one (`sample_1`) or from a TOML file.
 
-    Raises PlantError for a missing or unreadable file, bad TOML, unknown or missing keys, values that are not
-    finite or out of range, and values that contradict each other.
+    Raises PlantError for a missing or unreadable file, bad TOML, and unknown or missing keys. So it does for values
+    that are not finite, out of range, or contradict each other.
     """
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)
@@ -302,8 +318,11 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
-    """The device with another insert in it. By how much the plant's own elastomer is off the registry's PLANTS_INSERT,
-    the other one is off, too: a sample of the kind stays what it is. Raises `DomainError` for an unknown insert."""
+    """Return the plant with the insert called `name` in the place of its own.
+
+    The elastomer deviates from the registry's `name` by the factors by which the plant's own deviates from
+    PLANTS_INSERT. Relative permeability stays at 1 or above. Raises `DomainError` for an unknown insert.
+    """
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
     own = plant.elastomer
     fitted = Elastomer(

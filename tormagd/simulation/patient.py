@@ -23,14 +23,16 @@ T = TypeVar("T")
 PERIOD_S: Final = 2e-3
 VALID_MS: Final = 100.0
 FORCE, WAY, LAW = MODES = ("force", "way", "law")
-"What a setpoint says: the tip's force; that of each way; or the law by which the force follows the handle."
+"What a setpoint says: the tip's force; the force of each way; or the law by which the force follows the handle."
 VESSEL: Final = Friction(presliding_stiffness_N_mm=2.0, viscous_N_s_mm=0.0, static_ratio=1.2, stribeck_speed_mm_s=2.0)
-"An assumption: it sticks, and slips at less."
+"An assumption: the tip sticks, and slips at less force."
 
 
 class Felt(NamedTuple):
-    """What the tip feels. `force_N` resists its way in; `friction_N` is that of the vessel, where it slides;
-    `contact_mm` is the handle's place at the wall where that was met last, None before."""
+    """Forces at the tip at one time. `force_N` resists the way in, `friction_N` is the vessel's while the tip slides.
+
+    `contact_mm` is the handle's place where the wall was met last; None before a first contact.
+    """
 
     tip_mm: float
     force_N: float
@@ -41,10 +43,10 @@ class Felt(NamedTuple):
 
 
 class Patient:
-    """A tip that follows the handle with a lag of first order, in a vessel with an elastic wall, which may beat.
+    """Robot's tip that follows the handle with a first-order lag, in a vessel with an elastic wall, which may beat.
 
-    `wall_mm` counts from the handle's place at the first update, where the tip is then. Over `buckling_N` the catheter
-    buckles: the force grows no more, and the tip stays behind.
+    `wall_mm` counts from the handle's place at the first update, where the tip begins. Over `buckling_N` the catheter
+    buckles: the force grows no more, and the tip stays behind. Raises ValueError for sizes that make no sense.
     """
 
     def __init__(
@@ -74,7 +76,10 @@ class Patient:
         self._contact_mm: float | None = None
 
     def update(self, time_s: float, handle_mm: float) -> Felt:
-        """What is felt at that time, the handle having been there since the last update."""
+        """Advance to `time_s`, with the handle at `handle_mm` since the last update, and return what the tip feels.
+
+        Times never fall. The first update puts tip and robot at the handle's place.
+        """
         if math.isnan(self._time_s):
             self._time_s, self._start_mm, self._robot_mm, self._tip_mm = time_s, handle_mm, handle_mm, handle_mm
         dt_s, self._time_s = time_s - self._time_s, time_s
@@ -94,7 +99,10 @@ class Patient:
 
 
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
-    """The fields of a setpoint that says it in that way. A wall that was not met yet is in no law."""
+    """Return a setpoint's fields that say `felt` in `mode`, one of MODES.
+
+    Mode `law` names the wall only once the tip has met it.
+    """
     if mode == FORCE:
         return {"servo_cf": abs(felt.force_N)}
     fields: dict[str, Any] = {"servo_cf": felt.wall_N + felt.friction_N}
@@ -110,10 +118,10 @@ def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
 
 
 class Delay(Generic[T]):
-    """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage from .. to.
+    """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage from .. to, seconds.
 
-    `loss` is the share of messages that is lost in the long run, `burst` how many in a row, in the mean. What is sent
-    later may arrive sooner, where there is jitter.
+    `loss` is the share of messages lost in the long run, `burst` the mean number lost in a row. Jitter may let a later
+    message arrive sooner. Raises ValueError for negative times, a loss outside 0..0.5, or bursts under 1.
     """
 
     def __init__(
@@ -138,7 +146,7 @@ class Delay(Generic[T]):
         self._under_way: list[tuple[float, int, float, T]] = []
 
     def send(self, time_s: float, value: T) -> None:
-        """Give the network a value at that time."""
+        """Send `value` at `time_s`; it may be lost."""
         chance, arrives_s = self._draw.random(), time_s + self._delay_s + self._jitter_s * self._draw.random()
         self._is_losing = chance < (self._goes_on if self._is_losing else self._begins)
         self._sent += 1
@@ -146,7 +154,8 @@ class Delay(Generic[T]):
             heapq.heappush(self._under_way, (arrives_s, self._sent, time_s, value))
 
     def arrived(self, time_s: float) -> list[tuple[float, T]]:
-        """What has arrived since the last call, in the order of arrival: when it was sent, and the value."""
+        """Return (time it was sent, value) of all that has arrived by `time_s` since the last call, in order of
+        arrival."""
         found = []
         while self._under_way and self._under_way[0][0] <= time_s:
             found.append(heapq.heappop(self._under_way)[2:])
@@ -163,7 +172,11 @@ def run(
     clock_s: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Let the patient feel until it is over: handle there, setpoints back. Gives how many were published."""
+    """Run the patient until `is_over`: every PERIOD_S send the handle's motions there and setpoints back.
+
+    Returns the number of published setpoints. A setpoint that arrives after a later one is dropped; its stamp is the
+    time when it was sent. `is_over` is asked with seconds of `clock_s`.
+    """
     began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
     newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0
     while not is_over(now_s := clock_s()):
@@ -182,7 +195,7 @@ def run(
 
 
 def parser() -> argparse.ArgumentParser:
-    """What the simulated patient understands."""
+    """Return the argument parser of `python -m tormagd.simulation.patient`."""
     made = argparse.ArgumentParser(
         prog="python -m tormagd.simulation.patient", description="A simulated patient, the source of setpoints."
     )
@@ -199,7 +212,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0: setpoints were published, 1: none were, or the daemon was not reached, 2: usage."""
+    """Run the simulated patient from the command line and return the exit code.
+
+    0: setpoints were published; 1: none were, or the daemon was not reached; 2: usage.
+    """
     command = parser()
     options = command.parse_args(arguments)
     try:

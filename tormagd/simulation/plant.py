@@ -26,8 +26,10 @@ _ROUNDING: Final = 1e-6
 
 @final
 class Truth(Value):
-    """What really is, as no sensor sees it; `force_N` has the sign of the motion it resists. Of a pad the handle is the
-    finger's depth in it, and force pushes the finger out."""
+    """The plant's true state at one time. `force_N` has the sign of the motion that it resists.
+
+    At a pad, `handle_mm` is the finger's depth in it and `force_N` pushes the finger out.
+    """
 
     def __init__(
         self,
@@ -57,24 +59,25 @@ class Truth(Value):
 
 
 class Sensor(Protocol):
-    """What shows the force: a `ForceSensor`, or what is put in its place."""
+    """What shows the rendered force: a `ForceSensor`, or a test's own in its place."""
 
     @property
     def reading_N(self) -> float:
-        """What is shown now."""
+        """Reading now, N."""
 
     def advance(self, time_s: float, force_N: float) -> None:
-        """Bring the sensor to that time, at which the rendered force is `force_N`."""
+        """Bring the sensor to `time_s`, at which the rendered force is `force_N`."""
 
 
 @final
 class Plant:
-    """The device without its electronics, in fixed substeps of its own time; see `Axis` and `Element` for the laws.
+    """The device without its electronics, in fixed substeps of its own time; `Axis` and `Element` state the laws.
 
-    `advance` may be called with any time step; the remainder of a substep is kept for the next call. A voltage that
-    changes within a substep acts in it with its mean; a bridge opens at the nearer end of one, which moves a carriage
-    that is cut off at full speed by up to 25 um. Screws and currents can be read within a substep; the rest of the
-    state is that at its beginning. At power-on both bridges are open.
+    `advance` takes any time step and keeps the remainder of a substep for the next call. A voltage that changes within
+    a substep acts in it with its mean. A bridge opens at the nearer end of a substep, which moves a carriage at full
+    speed by up to 25 um. Screws and currents can be read within a substep; all other state is that at its beginning. At
+    power-on both bridges are open. Raises HandError for a hand that feels at a pad, and what `Axis` and the element
+    raise.
     """
 
     def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
@@ -111,7 +114,7 @@ class Plant:
 
     @property
     def time_s(self) -> float:
-        """Time since power-on, at the last whole substep."""
+        """Time since power-on at the last whole substep, s."""
         return self._substeps * self._substep_s
 
     @property
@@ -121,12 +124,12 @@ class Plant:
 
     @property
     def sensed_force_N(self) -> float:
-        """What the force sensor shows now."""
+        """Reading of the force sensor now, N."""
         return self.force_sensor.reading_N
 
     @property
     def shafts(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """(angle_rad, current_A) of the left and the right motor's screw now, which may be within a substep."""
+        """(angle_rad, current_A) of the left and the right screw now, which may be within a substep."""
         left, right, left_V, right_V = self.left, self.right, self._left_V, self._right_V
         age_s = self._target_s - self._substeps * self._substep_s
         if age_s < _ROUNDING * self._substep_s:
@@ -139,7 +142,7 @@ class Plant:
 
     @property
     def truth(self) -> Truth:
-        """The state at `time_s`; force and handle are at the last whole millisecond."""
+        """State at `time_s`; force and handle are those of the last whole millisecond."""
         left, right, element = self.left, self.right, self.element
         return Truth(
             self._substeps * self._substep_s,
@@ -156,14 +159,15 @@ class Plant:
         )
 
     def drive(self, left_V: float | None, right_V: float | None) -> None:
-        """Put these voltages at the motors from now on; None opens a bridge."""
+        """Put `left_V` and `right_V` at the motors from now on; None opens that motor's bridge."""
         share = self._target_s / self._substep_s - self._substeps
         self._left_early_V += _early_V(self.left, share, self._left_V, left_V)
         self._right_early_V += _early_V(self.right, share, self._right_V, right_V)
         self._left_V, self._right_V = left_V, right_V
 
     def advance(self, dt_s: float) -> None:
-        """Let time pass."""
+        """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each
+        millisecond."""
         self._target_s = target_s = self._target_s + dt_s
         due = int(target_s / self._substep_s + _ROUNDING)
         if due == self._substeps:
@@ -184,6 +188,7 @@ class Plant:
         self._substeps = due
 
     def _advance_element(self, time_s: float) -> None:
+        """Move the hand to `time_s`, then advance the element and the force sensor by their step."""
         hand, element, before_mm = self._hand, self.element, self.handle_mm
         if isinstance(element, PressedPad):
             self.handle_mm = hand.position_mm(time_s)
@@ -200,32 +205,35 @@ class Plant:
         self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:
-        """Divide what holds the carriages, gearbox and screw friction, by that number."""
+        """Divide the friction of both gearboxes and screws by `divisor`."""
         for axis in (self.left, self.right):
             axis.gear_friction_Nm /= divisor
             axis.screw_friction_m /= divisor
 
 
 def _applied_V(axis: Axis, voltage_V: float | None) -> float:
-    """An open bridge drives no current, as the back-EMF itself would not."""
+    """Return the voltage at the motor: at an open bridge (None) its back-EMF, which drives no current."""
     return axis.back_emf_V if voltage_V is None else voltage_V
 
 
 def _early_V(axis: Axis, share: float, before_V: float | None, voltage_V: float | None) -> float:
-    """What the voltage before, for that share of a substep, adds to its mean. A bridge opens at the nearer end of the
-    substep: it takes the current away at once, which no mean voltage does."""
+    """Return what the voltage before the change adds to the mean over the substep, of which `share` has passed, V.
+
+    A bridge opens (None) at the nearer end of the substep: no mean voltage takes the current away at once.
+    """
     share = float(round(share)) if voltage_V is None else share
     return share * (_applied_V(axis, before_V) - _applied_V(axis, voltage_V))
 
 
 def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None:
-    """Over the substep that has begun; None only where the bridge was open all the time."""
+    """Return the mean voltage over the substep that has begun; None only where the bridge was open all the time."""
     return None if voltage_V is None and not early_V else _applied_V(axis, voltage_V) + early_V
 
 
 @final
 class ForceSensor:
-    """Samples at its own rate, adds noise and a drifting offset, saturates, and shows each sample after a delay."""
+    """The force sensor: samples at its own rate, adds noise and a drifting offset, saturates, and shows a sample after
+    a delay."""
 
     def __init__(self, plant: PlantParameters, noise: random.Random) -> None:
         sensor = plant.force_sensor
@@ -242,7 +250,8 @@ class ForceSensor:
         self.reading_N = 0.0
 
     def advance(self, time_s: float, force_N: float) -> None:
-        """Bring the sensor to that time, at which the rendered force is `force_N`."""
+        """Bring the sensor to `time_s`, at which the rendered force is `force_N`: sample when due, show what has
+        arrived."""
         # half an element step of tolerance: a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
             self._samples += 1
@@ -253,8 +262,10 @@ class ForceSensor:
             self.reading_N = self._in_flight.popleft()[1]
 
     def _normal(self) -> float:
-        """The next standard normal number, of two at a time (Box and Muller, 1958). It is `random.Random.gauss`, whose
-        numbers may be others in another Python: only those of `random` are promised to stay, and figures with them."""
+        """Return the next standard normal number, of two at a time (Box and Muller, 1958).
+
+        `random.Random.gauss` may give other numbers in another Python; only those of `random` are promised to stay.
+        """
         if self._has_spare:
             self._has_spare = False
             return self._spare

@@ -18,10 +18,11 @@ MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
 
 @final
 class PressedPad:
-    """State of the element: the field's branch, the pad with its past, the temperature. It was worked, and rested.
+    """The pad between the magnets, with its state: magnetic branch, conditioned pad, temperature. It starts worked and
+    rested.
 
-    `force_N` pushes the finger out, and is never negative: plates only push. Deeper than 6 mm the plates meet: the pad
-    gives no more there.
+    `force_N` pushes the finger out and is never negative: plates only push. Below 6 mm depth the plates meet, and the
+    force rises no further. Raises ValueError for a plant without `pad`.
     """
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
@@ -35,16 +36,20 @@ class PressedPad:
 
     @property
     def kinetic_N(self) -> float:
-        """The level that the force is at: nothing slides."""
+        """`force_N`: at a pad nothing slides."""
         return self.force_N
 
     @property
     def temperature_C(self) -> float:
-        """Of the pad."""
+        """Temperature of the pad."""
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
-        """One step that ends at that time, at that gap, with the finger that deep and pressing in at that speed."""
+        """Advance by one step that ends at `time_s` and `gap_mm`, with the finger `depth_mm` deep and pressing at
+        `speed_mm_s`.
+
+        Depth and speed are clamped to 0..6 mm and +-100 mm/s.
+        """
         field_mT = MT_PER_TM * self._field.advance(gap_mm)
         depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)
         speed_mm_s = min(max(speed_mm_s, -FASTEST_MM_S), FASTEST_MM_S)

@@ -17,9 +17,9 @@ MAX_UNREAD_BYTES = 4096
 
 
 class Pty:
-    """A pseudo-terminal in raw mode that hosts may open and close as they like.
+    """Pseudo-terminal in raw mode that hosts may open and close as they like.
 
-    The host's side is kept open too: so the line stays raw and there is no end of file between hosts.
+    The host's side is kept open too: so the line stays raw, and no end of file comes between hosts.
     """
 
     def __init__(self) -> None:
@@ -29,20 +29,21 @@ class Pty:
         self.address = os.ttyname(self._theirs)
 
     def close(self) -> None:
-        """Take the line away."""
+        """Close both ends of the line."""
         os.close(self._ours)
         os.close(self._theirs)
 
     def descriptors(self) -> Sequence[int]:
-        """The device's end."""
+        """Return the descriptor of the device's end."""
         return (self._ours,)
 
     def read(self) -> bytes:
-        """What the host has written; call it when there is something."""
+        """Return what the host has written. Raises BlockingIOError where there is nothing."""
         return os.read(self._ours, READ_BYTES)
 
     def write(self, data: bytes) -> None:
-        """Hand bytes to the host. When nobody reads, the oldest are lost, as in any receiver that overruns."""
+        """Hand bytes to the host. When nobody reads, the unread ones are thrown away, as in any receiver that
+        overruns."""
         (unread,) = struct.unpack("i", fcntl.ioctl(self._theirs, termios.FIONREAD, bytes(4)))
         if unread + len(data) > MAX_UNREAD_BYTES - 1:
             termios.tcflush(self._theirs, termios.TCIFLUSH)
@@ -53,14 +54,14 @@ class Pty:
 
 
 class PtyDoor(Pty):
-    """One device on a serial line."""
+    """The serial device behind a pseudo-terminal."""
 
     def __init__(self, device: VirtualDevice) -> None:
         super().__init__()
         self._device = device
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Bytes in, bytes out."""
+        """Hand the device the host's bytes if there are any, and the host what the device has sent by `now_s`."""
         if readable:
             self._device.receive(now_s, self.read())
         if out := self._device.transmit(now_s):

@@ -1,7 +1,7 @@
 """Runs a simulated device in real time, in one thread, behind whatever door the host comes through.
 
-Between events the process sleeps, until the next word from a host or the next thing the device has to do, so a reply
-leaves when its last bit would have.
+Between events the process sleeps, until a host sends something or the device has something to do. So a reply leaves
+when its last bit would have.
 """
 
 import gc
@@ -15,47 +15,47 @@ from tormagd.simulation.plant import Truth
 LATE_S = 2e-3
 """From this lateness on, a wake-up counts as falling behind: two firmware ticks."""
 SLIP_S = 5e-3
-"""From this lateness on, the device's time stands still instead: the process did not run, which no microcontroller
-knows, and the device must not take its own sleep for the host's silence: that would come on top of a stall of the host,
-which it survives for no longer than 50 ms."""
+"""From this lateness on, the device's time stands still instead, because the process did not run, as no microcontroller
+would. The device must not take its own sleep for the host's silence, of which it survives 50 ms."""
 TRUTH_PERIOD_S = 1e-3
 TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C,kinetic_N\n"
 
 
 class PacedDevice(Protocol):
-    """A device and the wire in front of it; times are seconds from power-on and never fall."""
+    """A device with its wire, run by calls; times are seconds from power-on and never fall."""
 
     @property
     def truth(self) -> Truth:
-        """What really is, at the time of the last call."""
+        """The plant's true state at the time of the last call."""
 
     @property
     def next_event_s(self) -> float:
-        """When there is next something to do."""
+        """When the device has something to do next."""
 
     def advance(self, now_s: float) -> None:
-        """Lets time pass."""
+        """Let time pass until `now_s`."""
 
 
 class Door(Protocol):
-    """Where hosts come to a device."""
+    """Where hosts reach a device: a pseudo-terminal, a socket, or a CAN bus."""
 
     @property
     def address(self) -> str:
         """What a host opens."""
 
     def descriptors(self) -> Sequence[int]:
-        """What to wait for: something came from a host."""
+        """Return the file descriptors to wait for until something comes from a host."""
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Takes in what has come on `readable` and hands out what is due."""
+        """Hand the device what has come on the `readable` descriptors, and hosts what the device has sent by
+        `now_s`."""
 
     def close(self) -> None:
-        """Takes the door away."""
+        """Close everything that the door opened."""
 
 
 class Punctuality(NamedTuple):
-    """How well real time was kept."""
+    """How well real time was kept: late wake-ups, the worst lateness, and how long the device's time stood still."""
 
     late: int
     worst_s: float
@@ -63,7 +63,10 @@ class Punctuality(NamedTuple):
 
 
 def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: TextIO | None = None) -> Punctuality:
-    """Run until `stopped()`, asked about once a millisecond; `truth` gets a CSV row a millisecond."""
+    """Run the device in real time until `stopped()`, asked at each of its events; return how well time was kept.
+
+    `truth`, if given, gets a CSV header and one row a millisecond. Freezes the garbage collector's present objects.
+    """
     # nothing made so far will die: keep the collector from walking it while the device runs
     gc.freeze()
     power_on_s = time.monotonic()

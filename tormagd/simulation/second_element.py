@@ -11,8 +11,8 @@ the order that the literature gives; they stand in `plants/second.toml`, with th
                  L = N (1 + a ln(v_c + |v|) + c ln(1 + A / A_c)), and 1 N at v_ref   rubber on steel (Grosch 1963)
     before it slides: springs k_i side by side, each of which slips at its share of L (Iwan 1966)
 
-So the force creeps with the logarithm of time, a large step sooner than a small one; friction grows with the logarithm
-of the speed, and of the time at rest; and what the handle feels after it turned depends on where it turned before.
+So the force creeps with the logarithm of time, a large step sooner than a small one. Friction grows with the logarithm
+of the speed, and of the time at rest. What the handle feels after a turn depends on where it turned before.
 """
 
 import math
@@ -26,7 +26,10 @@ RESTED_S: Final = 1000.0
 
 
 def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) -> float:
-    """The flux density at the shaft: of a block on its axis, half a gap away, twice, and what the iron draws in."""
+    """Return the flux density at the shaft: a block's on its axis, half a gap away, times 2 and times `concentration`.
+
+    Two equal blocks make the 2; `concentration` is what the iron shaft draws in (Furlani 2001).
+    """
     width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
 
     def angle(from_mm: float) -> float:
@@ -38,13 +41,15 @@ def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) 
 
 
 def fresh_N(field_mT: float, second: SecondParameters) -> float:
-    """Kinetic friction of the fresh, cool element in that field, at the speed of reference."""
+    """Return the kinetic friction of the fresh, cool element in the field `field_mT`, sliding at the reference
+    speed."""
     saturation = math.tanh(field_mT / second.saturating_mT)
     return second.without_field_N + second.saturated_N * saturation * saturation
 
 
 def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> float:
-    """Friction at that speed and age of the contact over that while it slides at the speed of reference."""
+    """Return the friction at `speed_mm_s` and contact age `age_s` over that of steady sliding at the reference
+    speed."""
     reference_mm_s, slow_mm_s = second.reference_mm_s, second.slow_mm_s
     reference_age = second.renewed_mm / reference_mm_s / second.ageing_s
     faster = math.log((slow_mm_s + abs(speed_mm_s)) / (slow_mm_s + reference_mm_s))
@@ -54,10 +59,11 @@ def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> fl
 
 @final
 class SecondElement:
-    """State of the second plant's element, behind the interface of `Element`: the plays, what still creeps, the age of
-    the contact, its springs. Advances in equal steps of `dt_s`.
+    """The second plant's element, behind the interface of `Element`; advances in equal steps of `dt_s`.
 
-    `kinetic_N` is the level at the speed of reference. Passive: springs are stretched by the handle alone, and slip.
+    State are the plays, the creeping force, the contact's age and its springs. `kinetic_N` is the friction at the
+    reference speed. The element is passive: the handle alone stretches its springs, and they slip. Raises ValueError
+    for a plant without `second`.
     """
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
@@ -79,16 +85,20 @@ class SecondElement:
 
     @property
     def temperature_C(self) -> float:
-        """Of the elastomer."""
+        """Temperature of the elastomer."""
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
-        """One step that ends at that time, at that gap, with the handle at that mean speed."""
+        """Advance by one step that ends at `time_s` and at gap `gap_mm`, with the handle at the mean speed
+        `speed_mm_s`."""
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
-        """What of a step does not depend on the handle: plays, creep, warmth, the level at the speed of reference."""
+        """Begin a step that ends at `time_s` and `gap_mm`: advance plays, creep, temperature and `kinetic_N`.
+
+        None of these depends on the handle; `slide` ends the step.
+        """
         second = self._second
         driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self._warmth.advance(time_s)
         self._creeping_N = self._crept_N(self._creeping_N + second.creeping_share * (driving_N - self._fresh_N))
@@ -96,7 +106,10 @@ class SecondElement:
         self.kinetic_N = max((1.0 - second.creeping_share) * driving_N + self._creeping_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """The force at the end of the step that is prepared, were this the handle's mean speed; nothing changes."""
+        """Return the friction that the step begun by `prepare` would end with at the mean handle speed `speed_mm_s`.
+
+        The state stays.
+        """
         return self._slid(speed_mm_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
@@ -104,7 +117,8 @@ class SecondElement:
         self.force_N, self._age_s, self._stretched_mm = self._slid(speed_mm_s)
 
     def _slid(self, speed_mm_s: float) -> tuple[float, float, list[float]]:
-        """At the step's end: the force, the age of the contact, how far its springs are stretched."""
+        """Return force, contact age and spring lengths at the end of a step at the mean speed `speed_mm_s`; the state
+        stays."""
         second, dt_s = self._second, self._dt_s
         # exact for a constant speed: what is left of the age, and what the step adds to it
         renewed = abs(speed_mm_s) * dt_s / second.renewed_mm
@@ -121,6 +135,7 @@ class SecondElement:
         return force_N, age_s, springs_mm
 
     def _magnetised_mT(self, gap_mm: float) -> float:
+        """Move the plays to the field at `gap_mm` and return the field with their hysteresis."""
         second = self._second
         field_mT = shaft_field_mT(gap_mm, self._plant, second.concentration)
         found_mT = field_mT
@@ -131,7 +146,10 @@ class SecondElement:
         return found_mT
 
     def _crept_N(self, creeping_N: float) -> float:
-        """After a step, exactly: tanh(s / 2 V) falls by exp(-dt / T), written so that a large s loses no digits."""
+        """Return what `dt_s` leaves of the creeping force, by the exact solution: tanh(s / 2 V) falls by exp(-dt / T).
+
+        The form loses no digits at a large s.
+        """
         scale_N = self._second.creep_scale_N
         large = math.exp(-abs(creeping_N) / scale_N)
         kept, lost = self._kept, self._lost

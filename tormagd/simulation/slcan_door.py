@@ -1,7 +1,7 @@
 """The door of a CAN adapter on a serial line: the Lawicel ASCII protocol ("slcan") on a pseudo-terminal.
 
-What a CANable or a Lawicel CAN232 does between a host's serial port and the bus; commands end with CR and are answered
-with CR, or BEL when they are refused (Lawicel CAN232 manual, version 3).
+What a CANable or a Lawicel CAN232 does between a host's serial port and the bus (Lawicel CAN232 manual, version 3).
+Commands end with CR and are answered with CR, or with BEL when they are refused.
 """
 
 import re
@@ -23,7 +23,7 @@ _FRAME = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
 class SlcanAdapter:
-    """The adapter between the serial characters and the frames; no I/O and no clock."""
+    """Translator between the serial characters of the Lawicel protocol and CAN frames; no I/O and no clock."""
 
     def __init__(self) -> None:
         self.is_open = False
@@ -31,7 +31,10 @@ class SlcanAdapter:
         self._pending = b""
 
     def feed(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
-        """What to answer to the host's characters, and the frames it sends."""
+        """Take the host's characters; return the characters to answer, and the frames that the host sends.
+
+        An incomplete command waits for the next call. Without an open channel a frame is refused.
+        """
         *commands, rest = (self._pending + data).split(END)
         # a command that does not end is refused when its end comes; no more than that of it is kept
         self._pending = rest[: LONGEST_COMMAND + 1]
@@ -46,10 +49,11 @@ class SlcanAdapter:
         return answers, frames
 
     def line(self, frame: CanFrame) -> bytes:
-        """A received frame as characters for the host."""
+        """Return a received frame as characters for the host."""
         return b"t%03X%d%s\r" % (frame.identifier, len(frame.data), frame.data.hex().upper().encode())
 
     def _answer(self, command: bytes) -> bytes:
+        """Carry out a command that is no frame, and return its answer; `O` and `C` open and close the channel."""
         match command[:1]:
             case b"":  # hosts send empty lines to end whatever was there before
                 return OK
@@ -65,7 +69,7 @@ class SlcanAdapter:
 
 
 class SlcanDoor(Pty):
-    """One device behind such an adapter."""
+    """The device on a CAN bus, behind an slcan adapter on a pseudo-terminal."""
 
     def __init__(self, device: CanDevice) -> None:
         super().__init__()
@@ -73,7 +77,7 @@ class SlcanDoor(Pty):
         self._adapter = SlcanAdapter()
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Characters in, characters out."""
+        """Hand the device the host's frames, and the host answers and frames; a closed channel hears no frames."""
         out = b""
         if readable:
             out, frames = self._adapter.feed(self.read())
@@ -87,7 +91,7 @@ class SlcanDoor(Pty):
 
 
 def _frame(command: bytes) -> CanFrame | None:
-    """The frame in `tiiildd..`: identifier, length and data in hexadecimal."""
+    """Return the frame in `tiiildd..` (identifier, length and data in hexadecimal), None for any other command."""
     match = _FRAME.fullmatch(command)
     if match is None or len(match[3]) != 2 * int(match[2]):
         return None

@@ -18,11 +18,11 @@ from tormagd.simulation.parameters import PlantParameters
 GRID_MM = 2e-3
 MOMENT_POINTS = 20_000
 JOIN_MM = 10.0
-"""Width over which Eq. 7 goes over into the power law beyond 95 mm."""
+"""Width over which Eq. 7 goes over into the power law beyond a gap of 95 mm."""
 
 
 def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
-    """The plant's field law on an array of gaps, T m, without its hysteresis."""
+    """Return the radial moment at each gap by the plant's field law, T m, without hysteresis."""
     power = PowerFieldLaw(plant.field.coefficient, plant.field.exponent).radial_moment_Tm(gap_mm)
     if plant.field.law == "power":
         return power
@@ -38,24 +38,25 @@ def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
 
 
 def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
-    """Attraction between the magnets over the gap, N: the closed form in air times the factor for the iron shaft."""
+    """Return the attraction between the magnets at a gap, N: the closed form in air times the factor for the iron
+    shaft."""
     return plant.assumed.attraction_factor * attraction_N(gap_mm, _magnet(plant))
 
 
 def moment_over_gap(plant: PlantParameters) -> Curve:
-    """`radial_moment_Tm` over every gap the device can reach, mm to T m."""
+    """Return `radial_moment_Tm` as a table over every gap that the device can reach, mm to T m."""
     ends_mm = _reached_mm(plant)
     return Curve(radial_moment_Tm(_gaps_mm(*ends_mm), plant).tolist(), *ends_mm)
 
 
 def pull_over_gap(plant: PlantParameters) -> Curve:
-    """`pull_of_magnets_N` over every gap the device can reach, mm to N."""
+    """Return `pull_of_magnets_N` as a table over every gap that the device can reach, mm to N."""
     ends_mm = _reached_mm(plant)
     return Curve((plant.assumed.attraction_factor * _attraction_N(_magnet(plant), *ends_mm)).tolist(), *ends_mm)
 
 
 def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: float) -> Curve:
-    """Kinetic friction of the fresh, cool insert over the radial moment, T m to N.
+    """Return the fresh, cool insert's kinetic friction as a table over the radial moment, T m to N.
 
     Raises tormagd.physics.errors.DomainError where the moments leave the force law's domain.
     """
@@ -80,7 +81,7 @@ def _gaps_mm(start_mm: float, end_mm: float) -> FloatArray:
     return np.linspace(start_mm, end_mm, math.ceil((end_mm - start_mm) / GRID_MM) + 1)
 
 
-# the two that take longer than all else of a device: who makes many mostly makes them of the same parts
+# these two take longer than all else of a device; many devices are mostly made of the same parts
 @lru_cache(maxsize=8)
 def _attraction_N(magnet: CuboidMagnet, start_mm: float, end_mm: float) -> FloatArray:
     return attraction_N(_gaps_mm(start_mm, end_mm), magnet)

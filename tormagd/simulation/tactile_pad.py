@@ -1,7 +1,7 @@
 """The tactile pad's law: an elastomer between plates, compressed in a field, with what it remembers.
 
 Elastic force of each part: modulus times the Gent law in compression. The field's part of the modulus grows with the
-square of the field and saturates with the particles; it breaks down with strain, the more the more filler there is
+square of the field and saturates with the particles. It breaks down with strain, the more the more filler there is
 (Payne effect). Both parts stiffen with rate (Eyring) and relax, each with times of its own, the field's part by more. A
 pad not yet worked is stiffer (Mullins). Plates only push.
 """
@@ -25,7 +25,7 @@ FASTEST_MM_S: Final = 100.0
 STRONGEST_MT: Final = 500.0
 
 TOUCHING_MM = 0.2
-"""Where the cycles turn at their open end: plates that leave the pad at every cycle measure air."""
+"""Depth at which cycles turn at their open end: plates that leave the pad would measure air."""
 RATES_MM_S = (1.0, 0.5, 4.0, 2.0)
 """Not in order, so that a drift over the record is not mistaken for an effect of the rate."""
 CYCLES_PER_RATE = 3
@@ -34,7 +34,7 @@ SAMPLES_PER_CYCLE = 175
 
 @final
 class TactilePad:
-    """One pad with its past: what it has been worked, and what its stress remembers. New pads are unworked."""
+    """One pad with its past: conditioning by strain (Mullins effect) and relaxing stress. A new pad is unworked."""
 
     def __init__(self, parameters: PadParameters) -> None:
         self._parameters = parameters
@@ -51,14 +51,14 @@ class TactilePad:
         self._field_memory: PronyState = self._field_series.relaxed(0.0)
 
     def rest(self) -> None:
-        """Take the load off for long enough that the stress forgets; what was worked stays worked."""
+        """Take the load off until all stress has relaxed; conditioning stays."""
         self._displacement_mm = 0.0
         self._memory, self._field_memory = self._series.relaxed(0.0), self._field_series.relaxed(0.0)
 
     def elastic_parts_N(self, displacement_mm: float, rate_mm_s: float, field_mT: float) -> tuple[float, float]:
-        """Force without memory: of the elastomer as it is worked now, and what the field adds.
+        """Return two forces before relaxation, N: the elastomer's as conditioned now, and what the field adds.
 
-        Raises `DomainError` outside 0..6 mm, +-100 mm/s, 0..500 mT.
+        Raises `DomainError` outside 0..6 mm, +-100 mm/s, 0..500 mT. The state stays.
         """
         require("displacement_mm", displacement_mm, 0.0, DEEPEST_MM)
         require("rate_mm_s", rate_mm_s, -FASTEST_MM_S, FASTEST_MM_S)
@@ -81,7 +81,10 @@ class TactilePad:
         return matrix_N, added_kPa * area * gent * (1.0 + pad.field_rate_gain * speed)
 
     def advance(self, dt_s: float, displacement_mm: float, rate_mm_s: float, field_mT: float) -> float:
-        """Force, N, at the end of a step of `dt_s` that ends at that displacement, rate and field."""
+        """Advance by `dt_s` and return the force at the step's end, N, never negative.
+
+        Displacement, rate and field are those at the end. Raises `DomainError` as `elastic_parts_N` does.
+        """
         if dt_s != self._dt_s:
             self._step, self._field_step = self._series.discretise(dt_s), self._field_series.discretise(dt_s)
             self._dt_s = dt_s
@@ -97,14 +100,22 @@ class TactilePad:
         return max(relaxed_N + field_N, 0.0)
 
     def run(self, time_s: Array, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
-        """Forces, N, along a program; the first sample comes one step after what was before, or at once at time 0."""
+        """Advance through a program of n samples and return the force at each, N (n).
+
+        A program from time 0 has its first sample at once; of any other the first step is as long as the second. Raises
+        `DomainError` as `elastic_parts_N` does.
+        """
         steps = np.round(np.diff(time_s, prepend=0.0 if time_s[0] == 0.0 else 2 * time_s[0] - time_s[1]), 9)
         columns = zip(steps.tolist(), displacement_mm.tolist(), rate_mm_s.tolist(), field_mT.tolist(), strict=True)
         return np.array([self.advance(*row) for row in columns])
 
 
 def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Time, displacement, rate and cycle number of one pass: cycles 0.2 to 4.5 mm and back, each rate three times."""
+    """Return time, displacement, rate and cycle number of one pass of the test rig, each (4 rates * 3 cycles *
+    samples).
+
+    A cycle goes from 0.2 to 4.5 mm and back. Units are s, mm and mm/s.
+    """
     times, displacements, rates, cycles, start_s = [], [], [], [], 0.0
     stroke_mm = FULL_INDENTATION_MM - TOUCHING_MM
     share = np.arange(1, samples_per_cycle + 1) / samples_per_cycle
@@ -119,7 +130,7 @@ def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, 
 
 
 def worked_pad(parameters: PadParameters) -> TactilePad:
-    """A pad after ten cycles without field and a rest."""
+    """Return a new pad after one pass of `cycling_program` without field, twelve cycles, and a rest."""
     pad = TactilePad(parameters)
     time_s, displacement_mm, rate_mm_s, _ = cycling_program(50)
     pad.run(time_s, displacement_mm, rate_mm_s, np.zeros_like(time_s))

@@ -8,7 +8,7 @@ from tormagd.simulation.parameters import PlantParameters
 
 @final
 class Warmth:
-    """The elastomer's temperature: from that of the room towards the warmest, ever more slowly."""
+    """Temperature of the elastomer: it rises from the ambient temperature towards the warmest, exponentially."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self._force_per_K: Final = plant.thermal.force_percent_K / 100.0
@@ -18,7 +18,8 @@ class Warmth:
         self.temperature_C = self._ambient_C
 
     def advance(self, time_s: float) -> float:
-        """The force at that time over that of a cool elastomer."""
+        """Set `temperature_C` to that of `time_s`, seconds since power-on; return the force there over that of a cool
+        elastomer."""
         if self._warming_K > 0.0:
             self.temperature_C = self._ambient_C - self._warming_K * math.expm1(
                 -self._drift_K_s * time_s / self._warming_K
