@@ -1,6 +1,6 @@
-"""Files that anybody may have made: nothing but a regular file is read, and no more of it than it can mean to hold.
+"""Files that anybody may have made: nothing but a regular file is read, and never more than a given size.
 
-What is written takes the place of what was there in one go.
+What is written replaces an earlier file in one step.
 """
 
 import contextlib
@@ -13,9 +13,9 @@ from tormagd_client.regular_file import require_regular
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """All of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is allowed.
+    """Return all bytes of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is allowed.
 
-    Whatever lies there: nothing is waited for, and nothing opened that does something when it is, as a port does.
+    Never waits, and opens nothing that acts on being opened, as a port does.
     """
     require_regular(path, most_bytes)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -28,7 +28,10 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 
 @contextlib.contextmanager
 def in_place_of(path: Path) -> Iterator[Path]:
-    """What to write to: in the end it takes the place of `path`, whole or, where there is an OSError, not at all."""
+    """Give a path to write to, which replaces `path` at the end.
+
+    After an OSError, inside or at the end, that file is removed and `path` stays as it was.
+    """
     beside = path.with_name(f"{path.name}.part")
     try:
         yield beside

@@ -33,17 +33,19 @@ Array = npt.NDArray[np.float64]
 HOMING_S: Final = 10.0
 "Longer than the slowest homing from a closed gap."
 SEARCH_S: Final = 0.012
-"Of a search beside the plans, from the question to its answer: a period of the thesis's 83 Hz."
+"Time from question to answer of a search beside the plans: a period of the thesis's 83 Hz."
 MAX_UNREAD_BYTES: Final = 4096
-"What a serial port keeps for a program that does not read."
+"Bytes that a serial port keeps for a program that does not read."
 MAX_UNREAD_FRAMES: Final = 512
-"What a CAN socket keeps, about."
+"Frames that a CAN socket keeps, about."
 
 
 @final
 class Sample(Value):
-    """One control tick: what was asked, what the controller knew, and what really was. The step was given the
-    `measurement`; what it drove may have changed the connection's by now."""
+    """One control tick: what was asked, what the controller knew, and the plant's true state.
+
+    `measurement` is what the step was given; the connection's may be newer by now.
+    """
 
     def __init__(
         self,
@@ -67,10 +69,7 @@ class Sample(Value):
 
 
 class VirtualPort:
-    """A backend whose far end is the simulated device.
-
-    `device` may be changed for one that behaves as badly as a test wants.
-    """
+    """Backend whose far end is the simulated device; `device` may be replaced by one that behaves badly."""
 
     def __init__(self, device: SerialDevice) -> None:
         self.now_s = 0.0
@@ -79,12 +78,13 @@ class VirtualPort:
         self._unread = b""
 
     def open(self) -> Self:
-        """The same port again, with a line that has carried nothing yet."""
+        """Forget everything under way and return this port, with a new codec."""
         self.stream, self._unread = FrameStream(), b""
         return self
 
     def advance(self, now_s: float) -> None:
-        """Lets time pass; what the device sends waits for its reader, as much of it as a port keeps."""
+        """Let time pass until `now_s`; the device's bytes wait for their reader, MAX_UNREAD_BYTES and the newest at
+        most."""
         self.now_s = now_s
         self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
 
@@ -94,20 +94,20 @@ class VirtualPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """All valid messages that have arrived."""
+        """Return all valid messages that have arrived."""
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
 
     def send(self, message: Message) -> None:
-        """Hands one message to the device's line."""
+        """Hand one message to the device's line."""
         self.device.receive(self.now_s, self.stream.pack(message))
 
     def close(self) -> None:
-        """There is nothing to give back."""
+        """Do nothing: a virtual port holds no resource."""
 
 
 class VirtualBus:
-    """The same with a device on a CAN bus, through the backend's own codec of frames."""
+    """Backend whose far end is a simulated device on a CAN bus, through the real backend's codec of frames."""
 
     def __init__(self, device: CanLine) -> None:
         self.now_s = 0.0
@@ -116,13 +116,13 @@ class VirtualBus:
         self._unread: list[CanFrame] = []
 
     def open(self) -> Self:
-        """The same bus again."""
+        """Forget all received frames and return this bus, with a new codec."""
         self.stream = CanStream(DEFAULT_NODE)
         self._unread.clear()
         return self
 
     def advance(self, now_s: float) -> None:
-        """Lets time pass; what goes by waits for its reader, as much of it as a socket keeps."""
+        """Let time pass until `now_s`; the device's newest MAX_UNREAD_FRAMES frames wait for their reader."""
         self.now_s = now_s
         arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
         self._unread = [*self._unread, *arrived][-MAX_UNREAD_FRAMES:]
@@ -133,28 +133,30 @@ class VirtualBus:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """All valid messages of the device that have arrived."""
+        """Return all valid messages of the device that have arrived."""
         arrived, self._unread = self._unread, []
         self.stream.received = []
         return self.stream.unpack_all(arrived)
 
     def send(self, message: Message) -> None:
-        """Hands one frame to the bus."""
+        """Hand one message to the bus as a frame."""
         identifier, data = self.stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
 
     def close(self) -> None:
-        """There is nothing to give back."""
+        """Do nothing: a virtual bus holds no resource."""
 
 
 class ClosedLoop:
-    """A daemon and its device in one process and one virtual time, which starts at 0."""
+    """A daemon's core and its simulated device in one process and one virtual time, which starts at 0."""
 
     def __init__(
         self, config: Config, stepper: Stepper, planner: Planner | None, device: SerialDevice | VirtualBus
     ) -> None:
-        """`planner` may be missing where every tick is given its plan. The device is behind a serial line, or it comes
-        with its bus."""
+        """Connect the core with `device`, which is behind a serial line or comes with its bus.
+
+        `planner` is None where every tick is given its plan.
+        """
         self._config, self.stepper, self.planner = config, stepper, planner
         self._period_s = 1.0 / config.rates.control_hz
         self._inference_s = 1.0 / config.rates.inference_hz
@@ -168,7 +170,7 @@ class ClosedLoop:
 
     @property
     def now_s(self) -> float:
-        """Virtual time."""
+        """Virtual time, s."""
         return self._ticks * self._period_s
 
     @property
@@ -180,22 +182,27 @@ class ClosedLoop:
 
     @device.setter
     def device(self, device: SerialDevice) -> None:
+        """The device at the other end of the serial line. Raises TypeError where it is on a bus."""
         if isinstance(self._port, VirtualBus):
             raise TypeError("this device is on a bus")
         self._port.device = device
 
     @property
     def simulated(self) -> MessageDevice:
-        """The device itself, whatever carries its messages."""
+        """The simulated device itself, whatever carries its messages."""
         return self._port.device.messages
 
     @property
     def measurement(self) -> Measurement | None:
-        """The newest measurement while the link runs."""
+        """The newest measurement while the link runs; None otherwise."""
         return self.connection.measurement
 
     def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
-        """One control period. A given `plan` is used instead of planning: a bench sweep asks for gaps, not forces."""
+        """Run one control period and return what happened in it.
+
+        A given `plan` is used instead of planning: a bench sweep asks for gaps, not forces. Raises ValueError without a
+        plan in a loop without a planner.
+        """
         self._ticks += 1
         now_s = self.now_s
         self._port.advance(now_s)
@@ -213,16 +220,17 @@ class ClosedLoop:
         return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
 
     def skip(self) -> None:
-        """One control period in which the daemon does nothing: it was stopped, or killed. What comes waits for it."""
+        """Let one control period pass in which the daemon, stopped or killed, does nothing. What the device sends
+        waits."""
         self._ticks += 1
         self._port.advance(self.now_s)
 
     def command(self, name: str) -> None:
-        """An operator's command. Raises RefusedError."""
+        """Carry out an operator's command. Raises RefusedError."""
         self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
-        """What commands are decided on."""
+        """Return what commands are decided on, as of now."""
         believe = None if self.planner is None else self.planner.believe
         return conditions(
             self.now_s,
@@ -238,12 +246,16 @@ class ClosedLoop:
     def run(
         self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
     ) -> Iterable[Sample]:
-        """The ticks of the next `duration_s`; `setpoint` gives the newest setpoint at a time."""
+        """Yield the ticks of the next `duration_s`; `setpoint` gives the newest setpoint at a time, None for none."""
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
     def arm(self, plan: Plan | None = None) -> None:
-        """Connects, homes and enables, as an operator does. Raises RuntimeError if the device does not get there."""
+        """Connect, home and enable, as an operator does. Raises RuntimeError if the device does not get there within
+        HOMING_S.
+
+        `plan` is used in every tick, as in `tick`.
+        """
         self._until(lambda m: True, "answer", plan)
         self.command("home")
         self._until(lambda m: m.is_busy, "start homing", plan)
@@ -258,6 +270,7 @@ class ClosedLoop:
         return self.planner.planned
 
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
+        """Plan where a setpoint is new or the inference period is over; hand over a search's answer before."""
         planner = self.planner
         if planner is None:
             return
@@ -269,13 +282,14 @@ class ClosedLoop:
             self._asked = self._asked or planner.question
 
     def _search(self, planner: Planner, now_s: float) -> None:
-        """The search beside the plans, if there is one, as if it ran in a process of its own."""
+        """Answer the pending question to the search once SEARCH_S is over, as a process of its own would."""
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
             planner.answered(planner.aim.answer_to(asked))
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
+        """Tick until a measurement has `reached` what is wanted. Raises RuntimeError after HOMING_S."""
         for _ in range(round(HOMING_S / self._period_s)):
             self.tick(plan=plan)
             if self.measurement is not None and reached(self.measurement):
@@ -288,7 +302,11 @@ class ClosedLoop:
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
-    """A publisher in virtual time: each force is sent at its time, and nothing before the first."""
+    """Return a publisher in virtual time: a function of the time that gives the newest setpoint sent, None before the
+    first.
+
+    `times_s` (n) rise, `forces_N` (n) are sent at these times.
+    """
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()
     sent = 0

@@ -6,11 +6,14 @@ from functools import partial
 from importlib import import_module
 
 INTERRUPTED = 130
-"""What a shell makes of a process that SIGINT has ended."""
+"""Exit code that a shell shows of a process ended by SIGINT."""
 
 
 def _run(module: str) -> int:
-    """The exit code of the module's `main`, which sees to SIGINT itself as soon as it runs."""
+    """Import `module`, run its `main` and return the exit code; Ctrl-C while importing ends the process.
+
+    `main` handles SIGINT itself; a KeyboardInterrupt that leaves it makes INTERRUPTED.
+    """
     interrupt = signal.getsignal(signal.SIGINT)
     if interrupt is signal.default_int_handler:  # a shell's background job ignores it, and goes on doing so
         signal.signal(signal.SIGINT, signal.SIG_DFL)

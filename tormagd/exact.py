@@ -1,15 +1,15 @@
 """Values as plain data, and back, with nothing lost: every float to the bit, every type by its name.
 
-Plain data are what msgpack holds. What it does not know is a map with one key, the type's name:
+Plain data are what msgpack holds. Any other thing is a map with one key, its type's name:
 
     a value        {"Turn": {"direction": 1.0, ...}}
     an enumerator  {"Limit": "RATE"}
     a list         {"list": [...]}, as a bare one is a tuple; a deque, too
 
 Two equal values come back as two: nothing in the core asks whether a value is the very one that it made before. What
-changes in place, such as a stage of the core or the device's link, is written like a value, and read into one that is
-there already. Its fields are those that its class annotates, or its methods make; one that begins with an underscore is
-a constant.
+changes in place, such as a stage of the core or the device's link, is written like a value. It is read back into an
+existing object. Fields are those that a class annotates, or its methods make; a name with a leading underscore is a
+constant.
 """
 
 from collections import deque
@@ -25,24 +25,26 @@ LIST = "list"
 _AS_THEY_ARE = (float, int, bool, str, bytes, type(None))
 
 Kinds = Mapping[str, type[Value] | type[Enum]]
-"By name, what may come back."
+"By name, the types that may come back."
 
 
 _ENCODER = msgspec.msgpack.Encoder()
 
 
 class InexactError(ValueError):
-    """Plain data that stand for no value of a known kind: the text says which, and what is wrong with it."""
+    """Plain data that stand for no value of a known kind: the message says which, and what is wrong with it."""
 
 
 def kinds(*types: type[Value] | type[Enum]) -> Kinds:
-    """These types by name."""
+    """Return these types by name."""
     return {each.__name__: each for each in types}
 
 
 def plain(thing: object) -> Any:
-    """`thing` as plain data. Raises TypeError for what has no fields, and is neither plain, an enumerator, a tuple, a
-    list nor a deque."""
+    """Return `thing` as plain data.
+
+    Raises TypeError for what has no fields, and is neither plain, an enumerator, a tuple, a list nor a deque.
+    """
     if type(thing) in _AS_THEY_ARE:
         return thing
     names = _fields(thing)
@@ -60,6 +62,7 @@ def plain(thing: object) -> Any:
 
 
 def _fields(thing: object) -> tuple[str, ...]:
+    """Return the names of the fields of `thing`, in order; empty for an enumerator and for what has none."""
     if isinstance(thing, Enum):
         return ()
     if hasattr(thing, "__match_args__"):
@@ -72,7 +75,7 @@ def _fields(thing: object) -> tuple[str, ...]:
 
 
 def restored(data: Any, known: Kinds) -> Any:
-    """What `data` stand for. Raises InexactError."""
+    """Return the value that `data` stand for, of the types in `known`. Raises InexactError."""
     if type(data) in _AS_THEY_ARE:
         return data
     if isinstance(data, list | tuple):
@@ -100,7 +103,8 @@ def restored(data: Any, known: Kinds) -> Any:
 
 
 def restore(thing: Any, data: Any, known: Kinds) -> None:
-    """Gives `thing`, which changes in place, the fields that `data` stand for. Raises InexactError."""
+    """Give `thing`, which changes in place, the fields that `data` stand for. Raises InexactError; some may be set by
+    then."""
     name = type(thing).__name__
     fields = data.get(name) if isinstance(data, dict) else None
     if not isinstance(fields, dict) or set(fields) != set(_fields(thing)):
@@ -120,13 +124,15 @@ def restore(thing: Any, data: Any, known: Kinds) -> None:
 
 
 def packed(data: Any) -> bytes:
-    """Plain data as msgpack: the same bytes for the same data, and for no others."""
+    """Return plain data as msgpack: equal bytes for equal data, and for no others."""
     return _ENCODER.encode(data)
 
 
 def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
-    """Where two plain data differ first, as in "measured.handle.rate_mm_s", and what is there; None where they are the
-    same to the bit."""
+    """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with the value of each there.
+
+    None where they are the same to the bit. Where the right one has no such place, its value is None.
+    """
     if packed(left) == packed(right):
         return None
     for (path, one), (other_path, other) in zip(_leaves("", left), _leaves("", right), strict=False):
@@ -136,10 +142,11 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
 
 
 def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
+    """Yield path and value of each plain value in `data`, depth first; a type's name is no part of a path."""
     if not isinstance(data, dict | list | tuple):
         yield path, data
         return
     for name, each in data.items() if isinstance(data, dict) else enumerate(data):
-        # a type's name says nothing that its field's does not
+        # the field's name says enough: a type's is left out of the path
         is_kind = isinstance(data, dict) and len(data) == 1 and isinstance(each, dict | list | tuple)
         yield from _leaves(path if is_kind else f"{path}.{name}" if path else str(name), each)

@@ -1,4 +1,5 @@
-"""A quantity over time in a CSV file: a force that is sent, asked for by a scene or designed for; a hand's motion."""
+"""Quantities over time in a CSV file: a force that is sent, asked for by a scene or designed for, or a hand's
+motion."""
 
 import csv
 import io
@@ -18,29 +19,30 @@ ALLOWED = {
     "displacement_mm": (0.0, MAX_DISPLACEMENT_MM, "mm"),
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
 }
-"Least, most and unit of each column; of what a setpoint carries, as in the messages."
+"Least, most and unit of each column; those of a setpoint's fields are the messages'."
 LEAST_ROWS = 2
 MAX_FILE_BYTES = 16_000_000
-"More than a quarter of an hour at 1 kHz."
+"Enough for over a quarter of an hour at 1 kHz."
 
 
 Allowed = Mapping[str, tuple[float, float, str]]
 
 
 class ForceFileError(ValueError):
-    """A file that is no such table: names the file, row, column, value and what is allowed."""
+    """CSV file that is not as allowed: the message names file, row, column, value and what is allowed."""
 
 
 def read_forces(path: Path) -> dict[str, "array[float]"]:
-    """The columns `t_s`, `force_N`, and of the optional ones those that the file has. Raises as `read_table`."""
+    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has. Raises as `read_table`."""
     return read_table(path, ALLOWED, OPTIONAL_COLUMNS)
 
 
 def read_table(path: Path, allowed: Allowed, optional: tuple[str, ...] = ()) -> dict[str, "array[float]"]:
-    """The columns by name, equally long: `t_s`, which rises from row to row, and the others of `allowed`, of which a
-    file may lack those that are `optional`. Raises ForceFileError.
+    """Read a CSV file's columns into arrays of equal length, by name; a million rows fit.
 
-    Arrays, for a million rows of lists would not fit in the memory that a command may take.
+    `allowed` names the columns with their least, most and unit. `t_s` is one of them, and rises from row to row. A file
+    may lack the `optional` ones. Raises ForceFileError also for an unreadable file, over MAX_FILE_BYTES, or under
+    LEAST_ROWS.
     """
     try:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
@@ -65,6 +67,7 @@ def read_table(path: Path, allowed: Allowed, optional: tuple[str, ...] = ()) -> 
 
 
 def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> list[str]:
+    """Return `columns`. Raises ForceFileError for one that is missing, unknown or there twice."""
     required = [name for name in known if name not in optional]
     also = f" and optionally {','.join(optional)}" if optional else ""
     allowed = f"allowed is {','.join(required)}{also}"
@@ -82,6 +85,11 @@ def _check_header(path: Path, columns: list[str], known: list[str], optional: tu
 def _check_row(
     path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]", allowed: Allowed
 ) -> list[float]:
+    """Return a row's numbers in the order of `columns`.
+
+    Raises ForceFileError for another number of cells, one that is not allowed, or a time not above `before_s`, which is
+    empty in the first row.
+    """
     if len(cells) != len(columns):
         raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
     row = [_number(path, line, name, text, *allowed[name]) for name, text in zip(columns, cells, strict=True)]
@@ -94,6 +102,8 @@ def _check_row(
 
 
 def _number(path: Path, line: int, name: str, text: str, least: float, most: float, unit: str) -> float:
+    """Return `text` as a finite number from `least` to `most`. Raises ForceFileError, also for digits with
+    underscores."""
     try:
         value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else
     except ValueError:

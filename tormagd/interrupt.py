@@ -8,9 +8,9 @@ from types import FrameType
 
 @contextmanager
 def interrupted_by(*signals: signal.Signals) -> Iterator[Callable[[], bool]]:
-    """Gives a function that says whether one of `signals` has come; the handlers before are put back at the end.
+    """Give a function that says whether one of `signals` has come; put the earlier handlers back at the end.
 
-    To be used in the main thread, where Python allows signal handlers.
+    For the main thread alone: Python allows signal handlers nowhere else (ValueError).
     """
     arrived: list[int] = []
 

@@ -1,22 +1,23 @@
-"""What the daemon says to the process that keeps its black box, and what that answers: msgpack, one a packet."""
+"""Messages between the daemon and the process that keeps its black box, both ways: msgpack, one a packet."""
 
 import msgspec
 
 KEEPER = "tormagd.recording.keeper"
-"The module that runs there; the descriptor of its socket is the argument."
+"Module that the keeper's process runs, with its socket's descriptor as the argument."
 READ, WROTE = "read", "wrote"
 "Entries of what passed between daemon and device: `[READ, time_s, raw, ...]`, raw as `hardware/backend.py` has it."
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
-    """The first: where black boxes go, and what stands in each."""
+    """First message of the daemon: the folder for black boxes, and the header of each."""
 
     folder: str
     header: dict[str, str]
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
-    """Some control periods: entries as `assembly/journal.py` encodes them. `time_s` and `t_ns` are the last one's."""
+    """Some control periods, as entries that `assembly/journal.py` encoded. `time_s` and `t_ns` are those of the last
+    period."""
 
     time_s: float
     t_ns: int
@@ -24,7 +25,7 @@ class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
 
 
 class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
-    """What is kept shall be written, with what has come `after_s` later, to this name in the folder."""
+    """Request to write the kept entries, and what comes within `after_s` from now, to the file `name` in the folder."""
 
     name: str
     reason: str
@@ -33,11 +34,11 @@ class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
 
 
 class End(msgspec.Struct, frozen=True, array_like=True, tag="end"):
-    """The daemon ends as it should: one that is gone without this leaves a black box."""
+    """Last message of a daemon that ends as it should; a daemon that is gone without it leaves a black box."""
 
 
 class Written(msgspec.Struct, frozen=True, array_like=True, tag="written"):
-    """This one is on the disk; empty is `refusal`, or it says why it is not."""
+    """Answer of the keeper: the black box `name` is on the disk, unless `refusal` says why not."""
 
     name: str
     refusal: str = ""

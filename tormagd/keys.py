@@ -9,22 +9,25 @@ from tormagd_client.endpoints import ROLES, ConfigError, Endpoints
 from tormagd_client.keys import PUBLIC, load_pair, load_public, regular
 
 MAX_KEYS = 256
-"Public keys in the folder of one role."
+"Most public keys in the folder of one role."
 
 
 class Listed(NamedTuple):
-    """A key that is let in: its file's name, and what it may do."""
+    """A client's key that the daemon accepts: its file's name, and the roles of its folders."""
 
     name: str
     roles: frozenset[str]
 
 
 Allowed = Mapping[str, Listed]
-"Who is let in, by the 40 characters of the public key."
+"Accepted keys by the 40 characters of the public key."
 
 
 class KeyRing:
-    """The daemon's own keys, and the lists of those that are let in. Raises ConfigError naming file and remedy."""
+    """The daemon's own key pair, and the accepted public keys of each role.
+
+    Raises ConfigError naming file and remedy where keys are missing, damaged, or open to others.
+    """
 
     def __init__(self, endpoints: Endpoints) -> None:
         curve = endpoints.curve
@@ -36,7 +39,10 @@ class KeyRing:
         self.allowed: Allowed = self.load_allowed()
 
     def load_allowed(self) -> Allowed:
-        """The lists as they are in the folders now. Raises ConfigError; `allowed` stays as it is."""
+        """Read the key folders of all roles again and return the accepted keys; `allowed` stays as it is.
+
+        Raises ConfigError as `load_folder`.
+        """
         found: dict[str, Listed] = {}
         for role, folder in self._folders.items():
             for name, public in load_folder(folder):
@@ -46,9 +52,10 @@ class KeyRing:
 
 
 def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
-    """Name and public key of every `NAME.key` in a folder. Raises ConfigError.
+    """Yield name and public key of every `NAME.key` in `folder`, sorted by name.
 
-    Whoever can write there lets himself in, so nobody but its owner may.
+    Raises ConfigError for an unreadable folder, more than MAX_KEYS keys, and a damaged key. So does a folder or key
+    that others can write: they could let themselves in.
     """
     try:
         information = folder.stat()
@@ -66,6 +73,7 @@ def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
 
 
 def _refuse_writable(path: Path, mode: int) -> None:
+    """Raise ConfigError if `mode` lets the group or others write to `path`."""
     if mode & 0o022:
         raise ConfigError(
             f"{path} can be written by others (mode {stat.S_IMODE(mode):04o}): they could let themselves in; "

@@ -1,4 +1,4 @@
-"""What a user may name: a file that comes with the package, by its name, or one of his own."""
+"""Files that a user names: one that comes with the package, by its name, or one of his own, by its path."""
 
 from collections.abc import Iterable
 from importlib.resources.abc import Traversable
@@ -9,12 +9,15 @@ from tormagd_client.printable import in_short
 
 
 def shipped(folder: Traversable, ending: str) -> tuple[str, ...]:
-    """The names of the files in a package's folder, without their ending."""
+    """Return the names of a package folder's files that end with `ending`, sorted and without it."""
     return tuple(sorted(each.name.removesuffix(ending) for each in folder.iterdir() if each.name.endswith(ending)))
 
 
 def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = Path()) -> Path:
-    """The file of a shipped name, or a path, relative to `beside`. Raises ConfigError naming `key` and the shipped."""
+    """Return the path of a shipped file by its name, or of a file that exists at `name`, relative to `beside`.
+
+    Raises ConfigError naming `key`, its value and the shipped names where there is neither.
+    """
     names, reason = shipped(folder, ending), ""
     if name in names:
         return Path(str(folder / f"{name}{ending}"))
@@ -28,7 +31,8 @@ def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = 
 
 
 def did_you_mean(word: str, allowed: Iterable[str]) -> str:
-    """`; did you mean ...?` where one of the allowed words is near, or nothing."""
+    """Return `; did you mean ...?` with the allowed word that is nearest to `word`, or an empty text where none is
+    near."""
     import difflib  # takes a moment, and most configurations are right
 
     near = difflib.get_close_matches(word, list(allowed), n=1)

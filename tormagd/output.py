@@ -1,7 +1,7 @@
 """Lines on a standard stream that may be closed or full, or whose reader may have gone.
 
-A terminal obeys what is printed to it. Words of a file, a device or somebody else's process are made `printable` where
-they come in; whatever else is not printable is escaped where it goes out, all but line ends and our own colours.
+A terminal obeys what is printed to it. So words of a file, a device or another process are made `printable` where they
+come in. Whatever else is not printable is escaped where it goes out, all but line ends and our own colours.
 """
 
 import os
@@ -15,10 +15,10 @@ _OURS = re.compile("(\n|\t|\x1b\\[(?:0|1|31|32|33)m)")
 
 
 def write_line(text: str, stream: TextIO | None) -> OSError | None:
-    """Write `text` and a line end at once; what kept that from being done, or None.
+    """Write `text`, escaped, and a line end at once; return the error that kept this from being done, or None.
 
-    Nothing is written to None, which Python has for a descriptor that was closed when it started. A stream that failed
-    takes everything from then on and drops it: what was done is done, whoever reads of it or not.
+    Nothing is written to a `stream` of None, which Python has for a descriptor closed at its start. A stream that
+    failed is redirected to /dev/null: it takes everything from then on and drops it.
     """
     if stream is None:
         return None
@@ -34,7 +34,7 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
 
 
 def escaped(text: str) -> str:
-    """`text` with each character escaped that is not printable, but for line ends, tabulators and our own colours."""
+    """Return `text` with each unprintable character escaped, but for line ends, tabulators and our own colours."""
     parts = _OURS.split(text)
     parts[::2] = [printable(part) for part in parts[::2]]
     return "".join(parts)

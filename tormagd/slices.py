@@ -1,8 +1,8 @@
 """Short slices of the processor: what Linux gives an ordinary thread that wakes often and has little to do.
 
 A thread without real-time priority waits, when it wakes up, for whoever runs to use up a slice, 1.4 ms on two
-processors. From Linux 6.12 on, one that asked for shorter slices itself goes before it (EEVDF: see sched_setattr(2) and
-the kernel's Documentation/scheduler/sched-eevdf.rst). It has no more of the processor for that, in all, and needs no
+processors. From Linux 6.12 on, a thread that asked for shorter slices itself goes first (EEVDF). See sched_setattr(2)
+and the kernel's Documentation/scheduler/sched-eevdf.rst. In all it gets no more of the processor, and it needs no
 privilege.
 """
 
@@ -11,9 +11,9 @@ import os
 import sys
 
 SHORTEST_NS = 100_000
-"The kernel gives none shorter."
+"The shortest slice that the kernel gives."
 _SYSTEM_CALL = {"x86_64": 314, "aarch64": 274}
-"The number of sched_setattr(2), for which the C library has a function from glibc 2.41 on; of 64-bit programs."
+"Number of sched_setattr(2) for 64-bit programs; the C library has a function for it only from glibc 2.41 on."
 
 
 class _Attributes(ctypes.Structure):
@@ -30,9 +30,10 @@ class _Attributes(ctypes.Structure):
 
 
 def ask_for_slices(slice_ns: int = SHORTEST_NS) -> None:
-    """Asks for slices of this length, 0 for the kernel's own, for this thread and those it will begin.
+    """Ask the kernel for slices of `slice_ns`, 0 for its own length, for this thread and those that it begins.
 
-    An older kernel takes no notice, and nothing is asked for a thread that is not an ordinary one.
+    Nothing is asked on an unknown processor or for a thread of another policy than SCHED_OTHER. A refusal goes
+    unnoticed, as an older kernel's does.
     """
     number = _SYSTEM_CALL.get(os.uname().machine)
     if number is None or sys.maxsize < 2**32 or os.sched_getscheduler(0) != os.SCHED_OTHER:

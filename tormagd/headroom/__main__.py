@@ -25,12 +25,15 @@ from tormagd_client.printable import printable
 
 TIMER_S = 2.0
 CORE_S = 0.7
-"Of virtual time, and then as long again in real time."
+"Virtual time of the loop whose calls are timed; repeating them takes as long again in real time."
 SHARES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measures; returns 0, or 2 where scene and configuration do not fit each other."""
+    """Measure this machine for a configuration, print the result as one JSON object, and return the exit code.
+
+    0; 1 where stdout cannot be written; 2 for a configuration that is refused, or whose scene does not fit it.
+    """
     parser = argparse.ArgumentParser(prog="python -m tormagd.headroom", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's configuration")
     options = parser.parse_args(arguments)
@@ -43,9 +46,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
-    """Times are in us: `machine_us`, the core's `step_us` and `plan_us`, and the bare timer's `lateness_us`.
+    """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer for `timer_s`.
 
-    Raises ConfigError where scene and configuration do not fit each other.
+    `core_s` is the virtual time that the core's calls are taken from. Times in the result are us: `machine_us`,
+    `step_us`, `plan_us` and the bare timer's `lateness_us`. Gives this thread the daemon's scheduling for good. Raises
+    ConfigError where scene and configuration do not fit each other.
     """
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority
@@ -67,19 +72,20 @@ def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
 async def _in_real_time(
     config: Config, timer_s: float, steps: list[Call], plans: list[Call]
 ) -> tuple[Lateness, CoreCost]:
+    """Run the bare timer and then the core's calls in one thread: the first asks for the scheduling of both."""
     rate_hz = config.rates.control_hz
     return await lateness(config.realtime, rate_hz, timer_s), await core_cost(steps, plans, rate_hz)
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Mean, p50, p99, p99.9 and the largest."""
+    """Return mean, p50, p99, p99.9 and the largest of `values`, rounded to 0.1; `values` has one at least."""
     return {"mean": round(float(np.mean(values)), 1)} | {
         name: round(float(np.percentile(values, share)), 1) for name, share in SHARES.items()
     }
 
 
 def build() -> str:
-    """Which build of the core this interpreter runs: `compiled` or `interpreted`."""
+    """Return which build of the core this interpreter runs: `compiled` or `interpreted`."""
     return "compiled" if settle().is_compiled else "interpreted"
 
 

@@ -1,6 +1,6 @@
 """A bare timer: what this machine gives a thread that asks for nothing but to be woken in every control period.
 
-It has the daemon's heartbeat, event loop and scheduling, and no controller and no device: what it misses the daemon
+It has the daemon's heartbeat, event loop and scheduling, but no controller and no device. What it misses, the daemon
 would have missed too.
 """
 
@@ -21,7 +21,7 @@ OnBeat = Callable[[Heartbeat, int, int], None]
 
 
 class Lateness(NamedTuple):
-    """How late each beat was, us, and how many more were missed; `not_granted` is what the kernel refused."""
+    """How late each beat was, us, how many beats were missed besides, and what scheduling the kernel refused."""
 
     beats_us: list[float]
     missed: int
@@ -29,7 +29,10 @@ class Lateness(NamedTuple):
 
 
 async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
-    """Calls `on_beat` in every period until `ended` is set. `prepare` has been called before."""
+    """Call `on_beat` in every period until `ended` is set; missed beats are told in its arguments.
+
+    The caller has asked for the thread's scheduling (`prepare`). Freezes the garbage collector's present objects.
+    """
     heartbeat = Heartbeat(period_ns)
 
     def woken() -> None:
@@ -46,7 +49,10 @@ async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
 
 
 async def lateness(realtime: RealTime, rate_hz: int, seconds: float) -> Lateness:
-    """What a bare timer finds at this rate. The thread keeps the scheduling that is asked for here."""
+    """Measure for `seconds` how late a bare timer of `rate_hz` beats; WARM_UP_BEATS are left out.
+
+    The thread keeps the scheduling that is asked for here.
+    """
     not_granted = prepare(realtime)
     late_us: list[float] = []
     missed = -WARM_UP_BEATS

@@ -1,9 +1,8 @@
 """What `plan` and `step` cost on this machine: the scene in virtual time, then both once more, each call timed.
 
-Both are deterministic, so that what they were given in the closed loop can be given to them again without plant and
-protocol, and in the control period's own pace: a processor that sleeps between two ticks finds its caches colder than
-one that does not, and the same step takes two or three times as long. Processor time: what others take of the machine
-is the bare timer's to say.
+Both are deterministic, so they can be called again with what they were given in the closed loop, without plant and
+protocol. They are called in the control period's own pace. A processor that sleeps between two ticks finds colder
+caches, and a step takes two or three times as long. Figures are processor time; the bare timer says what others take.
 """
 
 import asyncio
@@ -25,22 +24,27 @@ from tormagd.simulation.parameters import load_plant
 
 PLANT = "sample_1"
 SWING_SHARE, PULSE_HZ = 0.2, 1.2
-"The force asked for: the middle of what the scene asks, and a share of it up and down, as often as a heart beats."
+"The asked force: the middle of the scene's range, and a share of the middle up and down, as often as a heart beats."
 
 Call = Callable[[], object]
 
 
 class CoreCost(NamedTuple):
-    """Processor time of each call, us."""
+    """Processor time of each call of `step` and of `plan`, us."""
 
     step_us: list[float]
     plan_us: list[float]
 
 
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
-    """Each step and each plan of an armed device that renders a pulse, to be called again in turn."""
+    """Run `core` for `seconds` of virtual time on a pulse; return its calls of `step` and `plan`, one each a tick, to
+    repeat.
+
+    The repeated calls act on a second core, which was armed in the same way. Raises RuntimeError if a device does not
+    arm.
+    """
     period_s = 1.0 / config.rates.control_hz
-    # stages change in place, so what is called again are those of another loop that has come as far
+    # stages change in place, so the calls are repeated on those of another loop, which has come as far
     loop, again = _armed(config, core), _armed(config, core)
     stepper, planner = again.stepper, again.planner
     assert planner is not None, "this loop plans"
@@ -66,7 +70,10 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
-    """Makes one call of each kind a beat, until all are made. The thread's scheduling has been asked for before."""
+    """Repeat one plan and one step a beat until all are done, and return the processor time of each.
+
+    There are as many plans as steps. The caller has asked for the thread's scheduling.
+    """
     found = CoreCost([], [])
     ended = asyncio.Event()
 

@@ -1,9 +1,9 @@
 """A fixed piece of pure Python: how long it takes says what interpreter and processor are worth right now.
 
-Two carriages under a PID, and the CRC of what they would send: the float arithmetic, attributes, calls, tuples and
-whole numbers of a control tick, and nothing of ours, of NumPy or of the kernel. It stands beside every figure, so that
-figures of two machines, or of two hours on a shared one, can be told apart. It is never compiled, and changing it would
-make every earlier figure incomparable: a test holds its result.
+Two carriages under a PID, and the CRC of what they would send. So it has the float arithmetic, attributes, calls,
+tuples and whole numbers of a control tick. It has nothing of ours, of NumPy or of the kernel. It stands beside every
+figure, so that figures of two machines, or of two hours on a shared one, can be told apart. It is never compiled. A
+change would make every earlier figure incomparable: a test holds its result.
 """
 
 import statistics
@@ -26,7 +26,8 @@ class _Carriage:
 
 
 def work() -> tuple[float, float, int]:
-    """One round of the loop: where both carriages end, mm, and the CRC-16 of the way there. The same everywhere."""
+    """Run one round and return both carriages' last places, mm, and the CRC-16 of their way: the same on every
+    machine."""
     left, right, crc = _Carriage(), _Carriage(), 0xFFFF
     for tick in range(TICKS):
         wanted_mm = 0.01 * tick
@@ -44,7 +45,7 @@ def work() -> tuple[float, float, int]:
 
 
 def machine_us(repetitions: int = REPETITIONS) -> float:
-    """Processor time of one round in the median, us."""
+    """Return the median processor time of one round, us."""
     work()
     taken_ns = []
     for _ in range(repetitions):

@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    """The client and its errors, loaded when they are asked for: who reads messages alone need not wait for ZeroMQ."""
+    """Load the client and its errors when asked for: a program that reads messages alone need not wait for ZeroMQ."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from tormagd_client import blocking, errors

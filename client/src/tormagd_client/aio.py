@@ -1,4 +1,4 @@
-"""The same client for asyncio: other tasks run while a call waits."""
+"""The client of `tormagd_client.blocking` for asyncio: other tasks run while a call waits."""
 
 import asyncio
 import math
@@ -35,9 +35,9 @@ from tormagd_client.wire import (
 
 
 class AsyncClient(Connections[zmq.asyncio.Socket]):
-    """As `blocking.Client`, with the same arguments, results and errors; an asynchronous context manager.
+    """Asyncio client of the daemon at `endpoints`: arguments, results and errors of `blocking.Client`.
 
-    `ask` and `answer` are not needed here: a task may wait for a `request` while others run.
+    An asynchronous context manager. It has no `ask` and `answer`: a task may wait for a `request` while others run.
     """
 
     _made = zmq.asyncio.Context
@@ -47,19 +47,26 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         self._turn = asyncio.Lock()
 
     async def request(self, command: str, **args: Any) -> dict[str, Any]:
-        """The result of `command`; one after the other where several tasks ask."""
+        """Give `command` and return its result; requests of several tasks wait for each other.
+
+        Raises UnreachableError without an answer in time, RefusedError, InFaultError.
+        """
         return await self._result(command, args, self._wait_s)
 
     async def status(self, wait_s: float = math.inf) -> Status:
-        """What the daemon is doing."""
+        """Return what the daemon is doing, waiting at most `wait_s`, and no longer than for any answer. Raises as
+        `request`."""
         return understood(await self._result("status", {}, min(wait_s, self._wait_s)), Status)
 
     async def describe(self) -> Description:
-        """What the daemon runs."""
+        """Return what the daemon runs: configuration, scene, model, device. Raises as `request`."""
         return understood(await self.request("describe"), Description)
 
     async def arm(self, timeout_s: float = 30.0) -> None:
-        """Home both carriages and enable: whoever holds the handle has to know."""
+        """Home both carriages and enable; whoever holds the handle has to know. Raises as `request`.
+
+        A command that is refused for the moment is repeated for at most `timeout_s`.
+        """
         until_s = asyncio.get_running_loop().time() + timeout_s
         for command in ("home", "enable"):
             while True:
@@ -74,7 +81,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
     async def publish(
         self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any
     ) -> None:
-        """Ask for a force at the roller; waits until the daemon takes setpoints."""
+        """Ask for a force at the roller, with arguments and errors of `blocking.Client.publish`."""
         setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
         while await setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
             self._is_taken = (await setpoints.recv()).startswith(SUBSCRIBED)
@@ -83,15 +90,16 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         await setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def telemetry(self) -> AsyncIterator[Telemetry]:
-        """Every message from now on, without an end. Raises MessageError for what is none."""
+        """Yield every telemetry message from now on, without an end. Raises MessageError for a message that is not
+        valid."""
         return self._heard(TELEMETRY_TOPIC, Telemetry)
 
     def motions(self) -> AsyncIterator[Motion]:
-        """The handle's motion, `rates.motion_hz` times a second; as `telemetry`."""
+        """Yield the handle's motion, `rates.motion_hz` times a second. Raises as `telemetry`."""
         return self._heard(MOTION_TOPIC, Motion)
 
     def verdicts(self) -> AsyncIterator[Verdict]:
-        """What becomes of every setpoint, whoever sent it; as `telemetry`."""
+        """Yield what becomes of every setpoint, whoever sent it. Raises as `telemetry`."""
         return self._heard(VERDICT_TOPIC, Verdict)
 
     async def _heard(self, topic: bytes, kind: type[Told]) -> AsyncIterator[Told]:

@@ -1,4 +1,4 @@
-"""A client whose calls return when they are done."""
+"""The blocking client: its calls return when they are done."""
 
 import contextlib
 import math
@@ -35,27 +35,37 @@ RETRY_S = 0.1
 
 
 class Client(Connections["zmq.Socket[bytes]"]):
-    """The daemon at `endpoints`: commands, setpoints, telemetry. A context manager; sockets open as they are needed.
+    """Blocking client of the daemon at `endpoints`: commands, setpoints, telemetry.
 
-    `wait_s` is the longest wait for the daemon. `source` names the publisher. Not to be shared between threads.
+    A context manager; sockets open as they are needed. `wait_s` is the longest wait for the daemon. `source` names the
+    publisher. Not to be shared between threads.
     """
 
     _made = zmq.Context
 
     def request(self, command: str, **args: Any) -> dict[str, Any]:
-        """The result of `command`. Raises UnreachableError without an answer in time, RefusedError, InFaultError."""
+        """Give `command` and return its result.
+
+        Raises UnreachableError without an answer in time, RefusedError, InFaultError.
+        """
         return self._result(self.ask(command, **args), self._wait_s)
 
     def ask(self, command: str, **args: Any) -> Pending:
-        """Give `command` and do not wait: what `answer` is asked with."""
+        """Send `command` without waiting, and return what `answer` takes.
+
+        To a daemon that cannot be reached nothing is sent: no answer comes then.
+        """
         pending = self._pending(command)
-        # a daemon that has refused the key is nobody to send to, for good: the answer is what does not come then
+        # a daemon that refused the key is no peer of the socket: sending would block for ever
         with contextlib.suppress(zmq.Again):
             self._socket(zmq.DEALER, self._endpoints.control).send(asked(pending, args), zmq.NOBLOCK)
         return pending
 
     def answer(self, pending: Pending, wait_s: float = 0.0) -> dict[str, Any] | None:
-        """The result of what was asked; None where it does not come within `wait_s`. Raises as `request`."""
+        """Return the result of an asked command; None where no answer comes within `wait_s`. Raises as `request`.
+
+        Late answers to other requests are dropped.
+        """
         deadline_s = time.monotonic() + wait_s
         left_s = wait_s
         control = self._socket(zmq.DEALER, self._endpoints.control)
@@ -63,20 +73,23 @@ class Client(Connections["zmq.Socket[bytes]"]):
             result = answered(control.recv_multipart()[-1], pending)
             if result is not None:
                 return result
-            left_s = deadline_s - time.monotonic()  # it was the late answer to a request that was given up
+            left_s = deadline_s - time.monotonic()  # the late answer to a request that was given up
         return None
 
     def status(self, wait_s: float = math.inf) -> Status:
-        """What the daemon is doing; an answer is waited for no longer than `wait_s` or what the client waits for any.
-        Raises as `request` and `understood` do."""
+        """Return what the daemon is doing, waiting at most `wait_s`, and no longer than for any answer. Raises as
+        `request`."""
         return understood(self._result(self.ask("status"), min(wait_s, self._wait_s)), Status)
 
     def describe(self) -> Description:
-        """What the daemon runs. Raises as `status`."""
+        """Return what the daemon runs: configuration, scene, model, device. Raises as `request`."""
         return understood(self.request("describe"), Description)
 
     def arm(self, timeout_s: float = 30.0) -> None:
-        """Home both carriages and enable: whoever holds the handle has to know. Raises as `request`."""
+        """Home both carriages and enable; whoever holds the handle has to know. Raises as `request`.
+
+        A command that is refused for the moment is repeated for at most `timeout_s`.
+        """
         until_s = time.monotonic() + timeout_s
         for command in ("home", "enable"):
             while True:
@@ -89,17 +102,18 @@ class Client(Connections["zmq.Socket[bytes]"]):
                 time.sleep(RETRY_S)
 
     def publish(self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any) -> None:
-        """Ask for a force at the roller. `stamp_ns` (now) is when it is meant; `fields` as in `messages.Setpoint`, a
-        `contact` as what has its names, too.
+        """Ask for a force at the roller, meant at `stamp_ns`, CLOCK_REALTIME, now by default.
 
-        Waits until the daemon takes setpoints: the first time, and where it has gone since. Raises ValueError naming
-        what is not allowed, and UnreachableError where nobody takes setpoints within `wait_s`.
+        `fields` are those of `messages.Setpoint`; `contact` may be a mapping of its names. Waits until the daemon takes
+        setpoints: the first time, and after the daemon has gone. Raises ValueError naming what is not allowed, and
+        UnreachableError where nobody takes setpoints within `wait_s`.
         """
         self.require_taken().send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def require_taken(self) -> "zmq.Socket[bytes]":
-        """Where setpoints go, once the daemon takes them. Raises UnreachableError as `publish`."""
-        # XPUB speaks to SUB as PUB does, and is told of the subscription: without that the first would be lost
+        """Wait until the daemon takes setpoints, and return the socket for them. Raises UnreachableError as
+        `publish`."""
+        # XPUB speaks to SUB as PUB does, and hears of the subscription: before it, setpoints would be lost
         setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
         while setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
             self._is_taken = setpoints.recv().startswith(SUBSCRIBED)
@@ -108,16 +122,20 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return setpoints
 
     def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
-        """What has arrived since the last call, the oldest first; waits up to `wait_s` for the first. Listens from the
-        first call on. Raises MessageError for what is none."""
+        """Return the telemetry that has arrived since the last call, oldest first; wait up to `wait_s` for the first
+        message.
+
+        Listens from the first call on. Raises MessageError for a message that is not valid.
+        """
         return self._arrived(TELEMETRY_TOPIC, Telemetry, wait_s)
 
     def motions(self, wait_s: float = 0.0) -> list[Motion]:
-        """The handle's motion, `rates.motion_hz` times a second; as `telemetry`."""
+        """Return the handle's motions since the last call, `rates.motion_hz` a second. Waits and raises as
+        `telemetry`."""
         return self._arrived(MOTION_TOPIC, Motion, wait_s)
 
     def verdicts(self, wait_s: float = 0.0) -> list[Verdict]:
-        """What becomes of every setpoint, whoever sent it; as `telemetry`."""
+        """Return what became of setpoints since the last call, whoever sent them. Waits and raises as `telemetry`."""
         return self._arrived(VERDICT_TOPIC, Verdict, wait_s)
 
     def _arrived(self, topic: bytes, kind: type[Told], wait_s: float) -> list[Told]:

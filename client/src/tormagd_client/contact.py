@@ -1,4 +1,4 @@
-"""The wall that a robot's tip touches, estimated from its place and its force: what a setpoint's `contact` says.
+"""The wall that a robot's tip touches, estimated from the tip's place and force: the `contact` of a setpoint.
 
     F = f + k max(x - x0, 0)     x tip's place on the handle's way, mm; F force, N; f friction, k stiffness, x0 the wall
 
@@ -10,28 +10,31 @@ import math
 from tormagd_client.messages import MAX_PLACE_MM, MAX_STIFFNESS_N_MM, Contact
 
 SETTLES = 20
-"Samples of a point: a running mean takes the noise of place and force off."
+"Samples in the running mean of a point, which takes the noise off place and force."
 STEP_MM = 0.2
-"A point for so much of the way: a tip that rests teaches nothing, and makes nothing forgotten."
+"Way from point to point: a tip that rests teaches nothing, and makes nothing forgotten."
 KEPT, LEAST = 0.98, 6
-"Of the points before, at each new one; and so many points a line takes."
+"Weight that earlier points keep at each new one; fewest points of a line."
 TOUCHES_N = 0.1
-"More than friction by this is a wall."
+"A force above friction by this much is a wall's."
 OFF, STRIKES = 5.0, 3
-"Deviations from the line, and so many points in a row: the wall is another one."
+"Deviations from the line, and points in a row beyond them, after which the wall is another one."
 MOST_SHARE, MOST_MM = 0.2, 0.5
-"Standard deviations of stiffness and place, from which on there is no wall to tell."
+"Largest standard deviations of a known wall: of stiffness, as a share, and of place."
 
 
 class ContactEstimator:
-    """Takes samples of 20 mN and 0.2 mm of noise, some hundred a second. A wall that has moved is learned anew."""
+    """Estimator of one wall, for samples with 20 mN and 0.2 mm of noise, some hundred a second.
+
+    A wall that has moved is learned anew. `friction_N` is learned before the wall.
+    """
 
     def __init__(self) -> None:
         self._mean_mm = self._mean_N = 0.0
         self._samples = self._strikes = self._free = 0
         self._point_mm = math.inf
         self.friction_N = 0.0
-        "On the way in, before the wall."
+        "Friction on the way in, before the wall."
         self._begin()
 
     @property
@@ -45,9 +48,11 @@ class ContactEstimator:
         return Contact(handle_mm=place_mm, stiffness_N_mm=stiffness_N_mm, friction_N=max(self.friction_N, 0.0))
 
     def update(self, tip_mm: float, force_N: float, way: float) -> None:
-        """One sample. `tip_mm` counts as the handle's place does, `force_N` resists the way in, and `way` is above 0
-        while the tip goes in or is held: out of the wall, friction is another one. Raises ValueError for a number that
-        is not finite."""
+        """Take one sample. `tip_mm` counts as the handle's place does, and `force_N` resists the way in.
+
+        `way` is above 0 while the tip goes in or is held. On the way out the sample is dropped, because friction
+        differs there. Raises ValueError for a number that is not finite.
+        """
         for name, value in (("tip_mm", tip_mm), ("force_N", force_N), ("way", way)):
             if not math.isfinite(value):
                 raise ValueError(f"{name} = {value}: allowed are finite numbers")
@@ -62,11 +67,13 @@ class ContactEstimator:
             self._take(self._mean_mm, self._mean_N)
 
     def _begin(self) -> None:
+        """Forget the line of the wall; friction stays."""
         self._weight = self._at_mm = self._at_N = 0.0
         self._mm2 = self._mm_N = self._N2 = 0.0
-        "Weighted means, and sums of squares around them."
+        "Weighted means, and sums of squares around these means."
 
     def _take(self, place_mm: float, force_N: float) -> None:
+        """Learn from one mean point: friction before the wall, the line behind it. A point off the line is dropped."""
         if self._is_off(place_mm, force_N):
             return
         if self._free < LEAST or force_N - self.friction_N < TOUCHES_N:
@@ -84,7 +91,8 @@ class ContactEstimator:
         self._N2 += off_N * (force_N - self._at_N)
 
     def _is_off(self, place_mm: float, force_N: float) -> bool:
-        """Whether a point is none of the wall's. Forgets a wall with which one after the other does not agree."""
+        """Return whether a point does not belong to the wall's line; after STRIKES of them in a row, forget the
+        wall."""
         slope_N_mm, wall_mm, _, _, sd_N = self._line()
         is_off = False
         if slope_N_mm > 0.0:
@@ -100,7 +108,10 @@ class ContactEstimator:
         return is_off
 
     def _line(self) -> tuple[float, float, float, float, float]:
-        """Slope, the wall's place, the standard deviations of both, and of a point from the line."""
+        """Return slope and wall's place, the standard deviations of both, and a point's deviation from the line, N.
+
+        Slope and place are 0 and the deviations infinite while there are too few points.
+        """
         if self._weight < LEAST * KEPT**LEAST or self._mm_N <= 0.0:
             return 0.0, 0.0, math.inf, math.inf, math.inf
         slope_N_mm = self._mm_N / self._mm2

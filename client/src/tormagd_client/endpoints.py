@@ -17,11 +17,11 @@ _TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
 
 
 class ConfigError(ValueError):
-    """A configuration that was refused: the text names the key, the value and what is allowed."""
+    """Configuration that was refused: the message names the key, the value and what is allowed."""
 
 
 class Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the configuration."""
+    """A table of the configuration; unknown keys are refused."""
 
 
 class Curve(Strict, frozen=True):
@@ -61,14 +61,14 @@ class Endpoints(Strict, frozen=True):
     "Keys, for who connects from elsewhere."
 
     def is_guarded(self, name: str) -> bool:
-        """Whether the daemon lets in only whom it has the key of."""
+        """Return whether the endpoint `name` accepts only clients whose key is listed."""
         matched = _TCP.fullmatch(getattr(self, name))
         is_local = matched is None or _is_loopback(matched[1])
         return not is_local or (self.curve is not None and self.curve.also_local)
 
 
 def require_usable(endpoints: Endpoints) -> None:
-    """Raises ValueError naming an address that cannot be used, is another's, or demands keys that are not there."""
+    """Raise ValueError naming an address that cannot be used, is used twice, or needs keys that are not given."""
     taken: dict[str, str] = {}
     curve = endpoints.curve
     has_keys = curve is not None and bool(curve.server_secret or curve.client_secret)
@@ -91,7 +91,8 @@ def require_usable(endpoints: Endpoints) -> None:
 
 
 def in_folder(folder: str) -> Endpoints:
-    """The endpoints of a daemon whose sockets are in `folder`. Raises ConfigError: the path is too long, or none."""
+    """Return the endpoints of a daemon whose sockets are in `folder`. Raises ConfigError for a path that is none or too
+    long."""
     try:
         placed = msgspec.convert({name: f"ipc://{folder}/{name}" for name in ENDPOINTS}, Endpoints)
         require_usable(placed)
@@ -101,7 +102,7 @@ def in_folder(folder: str) -> Endpoints:
 
 
 def _ipc_place(name: str, address: str) -> str:
-    """What an `ipc://` address comes to, however it is spelt."""
+    """Return the socket path that an `ipc://` address comes to, links resolved. Raises ValueError naming `name`."""
     path = address.removeprefix("ipc://")
     require(
         path not in ("", "@", "*")
@@ -116,7 +117,10 @@ def _ipc_place(name: str, address: str) -> str:
 
 
 def _tcp_place(name: str, address: str, has_keys: bool) -> str:
-    """The same of a `tcp://` address. IPv4 only: a ZeroMQ socket speaks no IPv6 unless it is told to, at both ends."""
+    """Return host and port of a `tcp://` address; without keys only loopback. Raises ValueError naming `name`.
+
+    IPv4 only: a ZeroMQ socket speaks no IPv6 unless it is told to, at both ends.
+    """
     matched = _TCP.fullmatch(address)
     host, port = matched.groups() if matched else ("", "0")
     require(

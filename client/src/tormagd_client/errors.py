@@ -8,7 +8,7 @@ from tormagd_client.printable import printable
 
 
 class ClientError(Exception):
-    """Something that was asked for was not done: a stable code, what happened, and what to do next.
+    """A call that was not carried out: a stable code, what happened, and what to do next.
 
     `message` and `hint` may be the daemon's own words; as a text the error is printable, on one line.
     """
@@ -30,11 +30,11 @@ class RefusedError(ClientError):
 
 
 class InFaultError(RefusedError):
-    """It refused because the device is in FAULT."""
+    """The daemon refused a command because the device is in FAULT."""
 
 
 class UnreachableError(ClientError):
-    """Nobody answers, or what answers is not understood."""
+    """Nobody answers, or the answer is not understood."""
 
 
 class SettingError(ClientError):
@@ -42,7 +42,7 @@ class SettingError(ClientError):
 
 
 def not_understood(what: str, why: Exception) -> UnreachableError:
-    """What was heard is of another version's making, or of another program's."""
+    """Return the error for a message of another version or another program; `what` names the message."""
     return UnreachableError(
         "unintelligible",
         f"the {what} that came is not what tormagctl {__version__} knows: {why}",
@@ -51,7 +51,7 @@ def not_understood(what: str, why: Exception) -> UnreachableError:
 
 
 def unreachable(address: str, what: str) -> UnreachableError:
-    """Nobody answers at `address`: says why where that can be seen, and what to do."""
+    """Return the error that nobody answers at `address`: why, where the file system shows it, and what to do."""
     message, hint = f"daemon not reachable at {address}: {what}", "is it running? systemctl status tormagd"
     if address.startswith("tcp://"):
         hint += (

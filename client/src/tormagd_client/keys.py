@@ -22,21 +22,24 @@ from tormagd_client.regular_file import require_regular
 
 PUBLIC, SECRET = ".key", ".key_secret"
 SERVER = "server"
-"The name of the daemon's own pair."
+"Name of the daemon's own key pair."
 MAX_KEY_FILE_BYTES = 4_096
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _KEY_CHARACTERS = 40
 
 
 class KeyPair(NamedTuple):
-    """A public and a secret key, as their 40 characters of Z85."""
+    """A public and a secret key, each as its 40 characters of Z85."""
 
     public: bytes
     secret: bytes
 
 
 def load_pair(path: Path) -> KeyPair:
-    """The pair in a `.key_secret` file that only its owner can read. Raises ConfigError."""
+    """Read the key pair in a `.key_secret` file.
+
+    Raises ConfigError for an unreadable file, one that others can read or own, and keys that do not match.
+    """
     information = regular(path)
     if information.st_mode & 0o077:
         raise ConfigError(
@@ -54,20 +57,20 @@ def load_pair(path: Path) -> KeyPair:
 
 
 def load_public(path: Path) -> bytes:
-    """The public key in a file. Raises ConfigError."""
+    """Read the public key in a key file. Raises ConfigError."""
     regular(path)
     return _certificate(path)[0]
 
 
 def fingerprint(public: bytes | str) -> str:
-    """What people compare when a key has changed hands: 16 hexadecimal digits of SHA-256 over the key."""
+    """Return what people compare when a key has changed hands: 16 hexadecimal digits of SHA-256 over the key."""
     return hashlib.sha256(z85.decode(public)).digest()[:8].hex(":", 2)
 
 
 def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
-    """Makes a pair: the paths of its secret and of its public file, both 0600, in these folders (made where missing).
+    """Make a key pair, both files with mode 0600, and return the paths of its secret and its public file.
 
-    Raises ConfigError where the name cannot be one, or a file is there already: nothing is ever overwritten.
+    Missing folders are made. Raises ConfigError where `name` is not allowed, or a file exists: nothing is overwritten.
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(
@@ -97,7 +100,8 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
 
 
 def regular(path: Path) -> os.stat_result:
-    """What is known of a file that may hold a key. Raises ConfigError."""
+    """Return the status of a file that may hold a key. Raises ConfigError for another kind of file, or one too
+    large."""
     try:
         return require_regular(path, MAX_KEY_FILE_BYTES)
     except OSError as error:
@@ -105,6 +109,7 @@ def regular(path: Path) -> os.stat_result:
 
 
 def _certificate(path: Path) -> KeyPair | tuple[bytes, None]:
+    """Read the keys in a file, the secret one None where there is none. Raises ConfigError."""
     try:
         public, secret = zmq.auth.load_certificate(path)
     except OSError as error:
@@ -124,7 +129,8 @@ def _is_key(text: bytes) -> bool:
 
 
 def main(arguments: list[str]) -> str:
-    """Makes a client's pair, from NAME and FOLDER: what became of it. Ends the process where none was made."""
+    """Make a client's key pair from NAME and FOLDER, and return what to tell the user. Raises SystemExit where none was
+    made."""
     try:
         name, folder = arguments
         secret, public = generate(name, Path(folder), Path(folder))

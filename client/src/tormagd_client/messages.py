@@ -17,7 +17,7 @@ from tormagd_client.printable import require
 
 VERSION = 1
 TELEMETRY_TOPIC, MOTION_TOPIC, VERDICT_TOPIC = b"\xde", b"motion", b"verdict"
-"What to subscribe to at the telemetry socket: its snapshots are maps of more than 15 fields, which begin so."
+"What to subscribe to at the telemetry socket. A snapshot is a map of over 15 fields, which msgpack begins so."
 MAX_MESSAGE_BYTES = 16_384  # a setpoint with the longest preview is under 3 kB; libzmq drops what is larger
 MAX_SOURCE_CHARACTERS = 64
 MAX_PREVIEW_SAMPLES = 256
@@ -30,18 +30,24 @@ MAX_STIFFNESS_N_MM = 100.0  # bone
 
 
 class MessageError(ValueError):
-    """A message that was refused: the text says which field, its value and what is allowed."""
+    """Message that was refused: the text names the field, its value and what is allowed."""
 
 
 def _require_within(key: str, value: float | None, least: float, most: float) -> None:
-    """Raises ValueError as `require`; None is allowed. Five hundred setpoints a second put no range into words."""
+    """Raise ValueError as `require` unless `value` is None or from `least` to `most`.
+
+    The range is put into words only on refusal, as five hundred setpoints a second come.
+    """
     if not (value is None or least <= value <= most):
         require(False, key, value, f"{least:g}..{most:g}")
 
 
 class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """An elastic wall on the way of the handle, as `handle_mm` of the telemetry counts it, positive pushing on: the
-    force is `friction_N` before it, and `stiffness_N_mm` more for each mm behind it."""
+    """Elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on.
+
+    The force is `friction_N` before the wall, and `stiffness_N_mm` more for each mm behind it. Raises ValueError for a
+    field out of range.
+    """
 
     handle_mm: float
     stiffness_N_mm: float
@@ -54,14 +60,15 @@ class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A force to render, from one publisher. `stamp_ns` is CLOCK_REALTIME at the publisher.
+    """A force to render, from one publisher. `stamp_ns` is CLOCK_REALTIME at the publisher. Raises ValueError out of
+    range.
 
-    `servo_cf` is of a handle that pushes on; `withdraw_cf` of one that withdraws, and without it both are alike. With a
-    `contact` the force follows the handle against that wall, and `servo_cf` is not looked at.
+    `servo_cf` is the force on a handle that pushes on, `withdraw_cf` on one that withdraws; None: `servo_cf` both ways.
+    With a `contact` the force follows the handle against that wall, and `servo_cf` is not used.
 
-    `displacement_mm` (since the handle turned) and `rate_mm_s` say at which handle motion the force is meant; without
-    them, and of a brake's handle that slides, the daemon uses the motion it measures. `preview_N` holds the forces that
-    follow, `preview_dt_ms` apart. A publisher that is started again raises its `session` and starts `seq` anew.
+    `displacement_mm` (since the handle turned) and `rate_mm_s` say for which handle motion the force is meant. Without
+    them, and for a brake's handle that slides, the daemon uses the measured motion. `preview_N` holds the forces that
+    follow, `preview_dt_ms` apart. A publisher that starts again raises its `session` and starts `seq` anew.
     """
 
     v: int
@@ -108,7 +115,7 @@ class Tick(msgspec.Struct, frozen=True):
 
 
 class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One believed value in its unit, its standard deviation where one is known, and whether it acts now."""
+    """One believed value in its unit, its standard deviation (null: not known), and whether it acts now."""
 
     value: float
     sd: float | None
@@ -117,8 +124,10 @@ class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True):
-    """The handle, on the topic `motion`: positive pushing on. `t_ns` is when it was read, CLOCK_REALTIME; `device_s`
-    the same by the device's own clock."""
+    """The handle's motion, on the topic `motion`: positive pushing on.
+
+    `t_ns` is the time of reading, CLOCK_REALTIME, `device_s` that time by the device's own clock.
+    """
 
     v: int
     t_ns: int
@@ -142,10 +151,10 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME.
 
-    `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion; `belief` is what is
-    believed of the device, by name. `search_age_ms` is how long ago the search for `field_mT` began, where it runs
-    beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest setpoint's. A value
-    that is not known (no device, no setpoint) is null.
+    `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion. `belief` has the
+    believed values of the device by name. `search_age_ms` is how long ago the search for `field_mT` began, where it
+    runs beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest setpoint's. A
+    value that is not known (no device, no setpoint) is null.
     """
 
     v: int
@@ -177,7 +186,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Explained(msgspec.Struct, frozen=True):
-    """A fault or a limit with its cause, in the figures of this very time where they are known, and its remedy."""
+    """A fault or a limit with its cause, in the figures of that moment where they are known, and its remedy."""
 
     code: str
     cause: str
@@ -185,7 +194,7 @@ class Explained(msgspec.Struct, frozen=True):
 
 
 class RoundTripReport(msgspec.Struct, frozen=True):
-    """From a Drive that is handed to the wire until its State has been read: percentiles of the newest ones, us."""
+    """Time from handing a Drive to the wire until its State was read: percentiles of the newest ones, us."""
 
     least: float
     p50: float
@@ -193,7 +202,7 @@ class RoundTripReport(msgspec.Struct, frozen=True):
 
 
 class ClockReport(msgspec.Struct, frozen=True):
-    """The line through the device's clock: host - device, and by how much the device's runs fast."""
+    """Line through the device's clock: host minus device, and by how much the device's clock runs fast."""
 
     offset_s: float
     drift_ppm: float
@@ -203,9 +212,9 @@ class ClockReport(msgspec.Struct, frozen=True):
 
 
 class LinkReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Who is at the other end of the wire, and how well it carries; `tormagctl firmware --json`.
+    """The device at the other end of the wire, and how well the wire carries; `tormagctl firmware --json`.
 
-    The counters are those of this opening of the port, `losses` those since the start. What is not known is null.
+    Counters are since the port was last opened, `losses` since the daemon's start. What is not known is null.
     """
 
     state: str
@@ -246,8 +255,8 @@ class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
 class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
     """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's.
 
-    `delay_us` is from the stamp, by the corrected clock, until the message was read; counters are since it was first
-    heard. `clock_behind_ms` is what its stamps are corrected by; null while that is not known.
+    `delay_us` is from the stamp, by the corrected clock, until the message was read; counters are since its first
+    message. `clock_behind_ms` corrects its stamps; null while it is not known.
     """
 
     state: str
@@ -268,7 +277,7 @@ class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of the setpoints since the start; `sources` has each publisher's newest `seq`."""
+    """Counts of setpoints since the daemon's start; `sources` has each publisher's newest `seq`."""
 
     accepted: int
     refused: int
@@ -281,7 +290,7 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WayReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The whole way of a setpoint, from its stamp to the force, against a budget. What is not known yet is null.
+    """Time of a setpoint from its stamp to the force, against a budget. What is not known yet is null.
 
     `to_duty_us`: from the stamp, by the corrected clock, until the first duty that follows it. `device_us`: from a
     Drive to its State, median. `carriages_ms`: how late the carriages are believed to be.
@@ -295,7 +304,7 @@ class WayReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LatenessReport(ExecReport, frozen=True, kw_only=True):
-    """The same of how late runs began; `worst` is the longest since the start."""
+    """Percentiles of how late runs began over the last seconds, us; `worst` is the longest since the start."""
 
     worst: float
 
@@ -314,8 +323,11 @@ class RateReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device as far as it has shown itself: its force is `scale` times the model's plus `offset_N`; what its force
-    sensor reads without one; and how late its carriages are, as far as that is learned."""
+    """Learned correction of the device: its force is `scale` times the model's plus `offset_N`.
+
+    `sensor_zero_N` is what its force sensor reads without a force. `lag_ms` is how late its carriages are; null while
+    that is not learned.
+    """
 
     scale: float
     scale_sd: float
@@ -327,8 +339,10 @@ class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What was kept of this device: whether it is in use, how old what is on the disk is, why there is nothing, and the
-    folder of the profiles, empty where none are kept."""
+    """The device's stored profile: whether it is used, its age on the disk (null: none), and why there is none.
+
+    `folder` is where profiles are kept, empty where none are.
+    """
 
     is_used: bool
     age_s: float | None
@@ -337,7 +351,7 @@ class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BlackBoxReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Where black boxes are kept, the newest of this run, why there is none, and parts that were lost on the way."""
+    """Folder of the black boxes, the newest of this run, why there is none, and how many parts were lost on the way."""
 
     folder: str = ""
     newest: str = ""
@@ -346,7 +360,7 @@ class BlackBoxReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StallReport(msgspec.Struct, frozen=True):
-    """How long the control loop stood still, and what most of that went into."""
+    """How long the control loop stood still, and what took most of that time."""
 
     ms: float
     culprit: str
@@ -355,8 +369,8 @@ class StallReport(msgspec.Struct, frozen=True):
 class PeerReport(msgspec.Struct, frozen=True):
     """A peer that was refused, or whose messages were dropped: where, who, why, and how often.
 
-    `address` is a host or a process, `key` the fingerprint of the key it showed, with the name that we know it by;
-    empty where it showed none.
+    `address` is a host or a process. `key` is the fingerprint of the shown key with its listed name, empty where none
+    was shown.
     """
 
     endpoint: str
@@ -367,9 +381,9 @@ class PeerReport(msgspec.Struct, frozen=True):
 
 
 class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Who connects: open connections by endpoint, peers that were not let in, and messages that were not read.
+    """Connections by endpoint, peers that were refused, and messages that were dropped unread.
 
-    Counts since the start. Of both kinds the newest or worst are named, the rest are `others`.
+    Counts are since the start. Of both kinds the newest or worst are named, the rest are `others`.
     """
 
     connections: dict[str, int] = msgspec.field(default_factory=dict)
@@ -380,8 +394,9 @@ class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
-    """In how many control ticks each stage of the output has acted since the start, in the order in which they stand:
-    the speed and the acceleration of the gap's reference were limited, a number was not finite, a duty was cut.
+    """In how many control ticks each output stage has acted since the start, in the order of the stages.
+
+    The gap reference's speed and its acceleration were limited, a number was not finite, a duty was cut.
     """
 
     rate: int = 0
@@ -391,7 +406,7 @@ class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Status(Telemetry, frozen=True, kw_only=True):
-    """The answer to the command `status`: the newest telemetry, and what is worth asking for."""
+    """Answer to the command `status`: the newest telemetry, and all else that is told only on demand."""
 
     version: str
     build: str = ""
@@ -425,15 +440,15 @@ class Status(Telemetry, frozen=True, kw_only=True):
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device's phase portrait, as far as it has shown itself: forces, rising, and how fast each may change at most,
-    either way, by the speed of the gap."""
+    """Learned phase portrait of the device: forces, rising, and the fastest change of each, either way, by the gap's
+    speed."""
 
     force_N: tuple[float, ...]
     rate_N_s: tuple[float, ...]
 
 
 class Description(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to the command `describe`: what a recording is of. What is not known is null."""
+    """Answer to the command `describe`: what a recording is of. What is not known is null."""
 
     version: str
     build: str
@@ -447,12 +462,11 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One control tick: all that the step was given, and all that it gave. Units as in `Telemetry`; times in ns and s.
+    """One control tick: all inputs of the step, and all outputs. Units as in `Telemetry`; times in ns and s.
 
-    A row of the recording endpoint's message, its columns in this order. `device_*` is what the device said itself,
-    beside what is concluded from it. What is not known (no device, no setpoint) is null. `received_s`, `sensed_s` and
-    `reported_s` (of the clock of `monotonic_s`) and `delay_s` are the measurement's: from them a step decides how old
-    it is.
+    A row of the recording endpoint's message, its columns in this order. `device_*` is the device's own word, beside
+    what is concluded. What is not known (no device, no setpoint) is null. `received_s`, `sensed_s` and `reported_s` (of
+    the clock of `monotonic_s`) and `delay_s` are the measurement's: from them a step decides how old it is.
     """
 
     t_ns: int
@@ -525,7 +539,8 @@ class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True):
-    """A command to the daemon's control endpoint."""
+    """A command to the daemon's control endpoint. Raises ValueError for another version, or a command of another
+    length."""
 
     v: int
     id: int | str
@@ -546,7 +561,7 @@ class ErrorReply(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The answer to a `Request`: `result` where ok, `error` otherwise."""
+    """The answer to a `Request`: `result` where `ok`, `error` otherwise."""
 
     v: int
     id: int | str | None
@@ -559,7 +574,7 @@ M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Request, Reply)
 
 
 def decode(data: bytes, message_type: type[M]) -> M:
-    """The message in `data`. Raises MessageError for anything but a valid map of this type."""
+    """Return the message in `data`. Raises MessageError for anything but a valid map of this type."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise MessageError(f"message of {len(data)} bytes: allowed is {MAX_MESSAGE_BYTES}")
     try:
@@ -575,12 +590,12 @@ def decode(data: bytes, message_type: type[M]) -> M:
 
 
 def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -> bytes:
-    """The msgpack map of `message`."""
+    """Return `message` as msgpack."""
     return _ENCODER.encode(message)
 
 
 def encode_ticks(rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> bytes:
-    """The recording endpoint's message with these rows; `tormagd.recording.ticks` reads it."""
+    """Return the recording endpoint's message with these rows; `tormagd.recording.ticks` reads it."""
     return _ENCODER.encode({"v": VERSION, "columns": columns, "rows": rows})
 
 

@@ -1,25 +1,25 @@
-"""Text of a file, a device or another process, as it may be shown to a person."""
+"""Text of a file, a device or another process, made fit to be shown to a person."""
 
 import json
 
 LONGEST_SHOWN = 80
-"Characters of a value that a refusal shows: an answer with it has to stay readable itself."
+"Characters of a value that a refusal shows, so that the refusal stays readable."
 
 
 def printable(text: str) -> str:
-    """`text` on one line, with each character that is not printable as JSON escapes it: `\\n`, `\\u001b`."""
+    r"""Return `text` on one line, with each character that is not printable as JSON escapes it: `\n`, `\u001b`."""
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else json.dumps(each)[1:-1] for each in text)
 
 
 def in_short(value: object) -> str:
-    """A value as a refusal shows it."""
+    """Return a value as a refusal shows it: its repr, cut to LONGEST_SHOWN characters."""
     shown = repr(value)
     return shown if len(shown) <= LONGEST_SHOWN else f"{shown[: LONGEST_SHOWN - 3]}..."
 
 
 def require(condition: bool, key: str, value: object, allowed: str) -> None:
-    """Raises ValueError naming the key, its value and what is allowed, unless the condition holds."""
+    """Raise ValueError naming the key, its value and what is allowed, unless `condition` holds."""
     if not condition:
         raise ValueError(f"{key} = {in_short(value)}: allowed is {allowed}")

@@ -15,7 +15,8 @@ _KINDS = {
 
 
 def require_regular(path: Path, most_bytes: int) -> os.stat_result:
-    """What is known of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is allowed."""
+    """Return the status of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is
+    allowed."""
     try:
         found = path.stat()
     except ValueError as error:  # a name with a zero in it

@@ -1,4 +1,4 @@
-"""What goes over the sockets, whoever waits for it: addresses and keys, requests and their answers, setpoints."""
+"""What both clients, blocking and asyncio, share: addresses and keys, requests and their answers, setpoints."""
 
 import itertools
 import time
@@ -37,14 +37,14 @@ SocketT = TypeVar("SocketT", bound="zmq.Socket[Any]")
 FAULT_CODES = ("fault", "device_latched")
 "Refusals that mean: the device is in FAULT."
 NOT_YET = ("busy", "not_homed", "not_fresh")
-"Refusals of `enable` that go away by themselves once homing is over and the newest measurement is new."
+"Refusals of `enable` that end by themselves, once homing is over and the newest measurement is fresh."
 
 SUBSCRIBED = b"\x01"
-"What an XPUB socket is told starts with this when somebody subscribes, and with 0 when the last one has gone."
+"First byte of what an XPUB socket receives when somebody subscribes; 0 when the last subscriber has gone."
 
 
 class Keys(NamedTuple):
-    """What a client shows, and the only daemon that it believes."""
+    """The client's key pair, and the public key of the only daemon that it believes."""
 
     public: bytes
     secret: bytes
@@ -53,14 +53,17 @@ class Keys(NamedTuple):
 
 
 class Pending(NamedTuple):
-    """A request whose answer may still come."""
+    """Request whose answer may still come."""
 
     number: int
     command: str
 
 
 def keys_of(curve: Curve | None) -> Keys | None:
-    """The client's keys in a configuration; None where it has none. Raises SettingError: a file is no good."""
+    """Read the client's keys that a configuration names; None where it names none.
+
+    Raises SettingError for a file that is no good, or no key of the daemon.
+    """
     if curve is None or not curve.client_secret:
         return None
     from tormagd_client.keys import PUBLIC, SECRET, load_pair, load_public  # takes a moment, and most have no keys
@@ -80,7 +83,7 @@ def keys_of(curve: Curve | None) -> Keys | None:
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
-    """Connect `socket`, showing the keys at `tcp://`, and at `ipc://` where the configuration says so.
+    """Connect `socket`, with the keys at `tcp://`, and at `ipc://` where they say so.
 
     Raises SettingError for an address that ZeroMQ cannot use.
     """
@@ -98,11 +101,13 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
 
 
 def opened(socket: SocketT, address: str, keys: Keys | None, topic: bytes = b"") -> SocketT:
-    """A client's socket, blocking or of asyncio, with its bounds, connected. `topic` is what a subscriber listens to.
-    Raises SettingError as `connect` does."""
+    """Set the bounds of a client's new socket, connect it and return it; a subscriber listens to `topic`.
+
+    Raises SettingError as `connect` does.
+    """
     is_setpoints = socket.type == zmq.XPUB
     socket.setsockopt(zmq.LINGER, 200 if is_setpoints else 0)
-    socket.setsockopt(zmq.IMMEDIATE, 1 if is_setpoints else 0)  # or it is not told who goes
+    socket.setsockopt(zmq.IMMEDIATE, 1 if is_setpoints else 0)  # or it is not told who unsubscribes
     socket.setsockopt(zmq.MAXMSGSIZE, 16 * MAX_MESSAGE_BYTES)
     if socket.type == zmq.SUB:
         socket.subscribe(topic)
@@ -111,12 +116,12 @@ def opened(socket: SocketT, address: str, keys: Keys | None, topic: bytes = b"")
 
 
 def asked(pending: Pending, args: dict[str, Any]) -> bytes:
-    """A request to the control endpoint."""
+    """Return the bytes of a request to the control endpoint."""
     return encode(Request(v=VERSION, id=pending.number, command=pending.command, args=args))
 
 
 def answered(data: bytes, pending: Pending) -> dict[str, Any] | None:
-    """The result in an answer; None where it is one to an earlier request, which was given up.
+    """Return the result in an answer; None where the answer is to another request, which was given up.
 
     Raises RefusedError, InFaultError, or UnreachableError for what is no answer.
     """
@@ -141,10 +146,9 @@ def answered(data: bytes, pending: Pending) -> dict[str, Any] | None:
 
 
 def understood(result: dict[str, Any], kind: type[T]) -> T:
-    """The answer to `status` or to `describe`; what a newer daemon says besides is passed over.
+    """Return the result of `status` or `describe` as its type, its texts made printable; unknown fields are ignored.
 
-    Its texts are made printable: they are a person's to read. Raises UnreachableError, naming the daemon's version,
-    where something is missing or of another type.
+    Raises UnreachableError, naming the daemon's version, where a field is missing or of another type.
     """
     try:
         return msgspec.convert(_printable(result), kind)
@@ -158,6 +162,7 @@ def understood(result: dict[str, Any], kind: type[T]) -> T:
 
 
 def _printable(value: Any) -> Any:
+    """Return `value` with all its texts and keys made printable."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, dict):
@@ -166,7 +171,8 @@ def _printable(value: Any) -> Any:
 
 
 def _contact(fields: Mapping[str, float]) -> Contact:
-    """Raises ValueError for names that are none, or missing, and for what is not allowed."""
+    """Return the contact of these fields. Raises ValueError for names that are unknown or missing, and for values out
+    of range."""
     try:
         return Contact(**fields)
     except TypeError as error:
@@ -175,7 +181,7 @@ def _contact(fields: Mapping[str, float]) -> Contact:
 
 
 class Numbering:
-    """Numbers the setpoints of one publisher, from 0. Its session is above every earlier one of the same source."""
+    """Maker of one publisher's setpoints, numbered from 0, in a session above every earlier one of its source."""
 
     def __init__(self, source: str) -> None:
         self.source, self.session = source, time.time_ns()
@@ -191,7 +197,8 @@ class Numbering:
         contact: Contact | Mapping[str, float] | None = None,
         **fields: Any,
     ) -> bytes:
-        """The next one. `stamp_ns`: when the force is meant, now by default; the others as in `messages.Setpoint`.
+        """Return the next setpoint as bytes. `stamp_ns`: when the force is meant, None for now; others as
+        `messages.Setpoint`.
 
         Raises ValueError naming what is not allowed.
         """
@@ -212,13 +219,14 @@ class Numbering:
 
 
 class Connections(Generic[SocketT]):
-    """What a client is, however it waits: the daemon at `endpoints`, and the sockets to it, opened as they are needed.
+    """Base of both clients: the daemon at `endpoints`, and the sockets to it, opened as they are needed.
 
-    `wait_s` is the longest wait for the daemon. `source` names the publisher.
+    `wait_s` is the longest wait for the daemon. `source` names the publisher. Raises SettingError for keys that are no
+    good.
     """
 
     _made: ClassVar[Callable[[], Any]]
-    "The context that the sockets are of."
+    "Makes the ZeroMQ context of the sockets."
 
     def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
         self._endpoints, self._wait_s = endpoints, wait_s
@@ -231,16 +239,17 @@ class Connections(Generic[SocketT]):
 
     @classmethod
     def local(cls, folder: str, wait_s: float = 1.0, source: str = "client") -> Self:
-        """The daemon of this machine whose sockets are in `folder`."""
+        """Return a client of this machine's daemon whose sockets are in `folder`. Raises ConfigError as `in_folder`."""
         return cls(in_folder(folder), wait_s, source)
 
     def close(self) -> None:
-        """Close the connections; setpoints that are on their way get a moment."""
+        """Close the connections; setpoints under way get 0.2 s."""
         for socket in self._sockets.values():
             socket.close()
         self._context.term()
 
     def _socket(self, kind: int, address: str, topic: bytes = b"") -> SocketT:
+        """Return the socket of this kind and topic, opening it on first use."""
         if (kind, topic) not in self._sockets:
             self._sockets[kind, topic] = opened(self._context.socket(kind), address, self._keys, topic)
         return self._sockets[kind, topic]
