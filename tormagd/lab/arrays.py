@@ -1,4 +1,4 @@
-"""What figures stand in: arrays of numbers, which rows of one are meant, plain data, and the RMS."""
+"""Types of the laboratory's figures, arrays, masks and plain data, and the root mean square."""
 
 from typing import Any
 
@@ -11,5 +11,5 @@ Json = dict[str, Any]
 
 
 def rms(values: Array) -> float:
-    """Root of the mean square."""
+    """Return the root of the mean square of `values`."""
     return float(np.sqrt(np.mean(np.square(values))))

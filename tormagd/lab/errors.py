@@ -1,18 +1,19 @@
-"""What the laboratory tells instead of a traceback: input that it cannot use, and a package that is not there."""
+"""What the laboratory says instead of a traceback: input that it cannot use, and a package that is missing."""
 
 from importlib.metadata import requires
 from pathlib import Path
 
 PACKAGE_OF = {"distributed": "dask[distributed]"}
-"By the name that is imported, where pip knows another."
+"pip's name of a package, by the name that is imported, where they differ."
 
 
 class LabError(ValueError):
-    """Input that cannot be used: names the file or the quantity, where in it, what was found and what is allowed."""
+    """Input that cannot be used: the message names the file or quantity, the place in it, the value and what is
+    allowed."""
 
 
 def not_installed(module: str) -> str:
-    """That `module` is missing, in one sentence with the command that brings it to where tormagd stands."""
+    """Return one sentence that `module` is missing, with the command that installs it where tormagd is installed."""
     package = PACKAGE_OF.get(module, module)
     library = Path(__file__).resolve().parents[2]
     if library.name == "tormagd" and not (library / "pyproject.toml").exists():  # a folder of its own, as packaged

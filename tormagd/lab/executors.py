@@ -1,4 +1,4 @@
-"""Where a tool's runs are done, in processes of this machine or on a Dask cluster; and how they are waited for."""
+"""Executors for a tool's runs, processes of this machine or a Dask cluster, and the wait for the runs."""
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
@@ -14,7 +14,7 @@ ResultT = TypeVar("ResultT")
 
 
 def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> None:
-    """`--workers` processes, or `--dask`; `needed` is what the cluster's workers have to have."""
+    """Add `--workers` and `--dask` to `parser`; `needed` says what a cluster's workers must have installed."""
     parser.add_argument("--workers", type=int, default=workers, help="processes on this machine (%(default)s)")
     parser.add_argument(
         "--dask", metavar="ADDRESS", help=f"scheduler of a Dask cluster instead; its workers need {needed}"
@@ -23,7 +23,10 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 
 @contextmanager
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
-    """What was asked for. Raises OSError where no scheduler answers at the address, ValueError for no worker at all."""
+    """Give the executor that the options ask for, and shut it down at the end.
+
+    Raises OSError where no scheduler answers at the address, ValueError for no worker at all.
+    """
     if options.dask is None:
         # no forks of this one: of threads that libraries have begun they would have the locks and not the threads
         with ProcessPoolExecutor(options.workers, get_context("forkserver")) as here:
@@ -39,7 +42,11 @@ def chosen(options: argparse.Namespace) -> Iterator[Executor]:
 def finished(
     executor: Executor, function: Callable[[ItemT], ResultT], items: Iterable[ItemT], unit: str
 ) -> Iterator[tuple[ItemT, "Future[ResultT]"]]:
-    """Each item as its run is done, beside a bar. Whoever takes no more of them gives up what has not begun."""
+    """Run `function` on every item; yield each item with its done future, in order of completion, beside a progress
+    bar.
+
+    A caller that stops iterating cancels the runs that have not begun.
+    """
     pending = {executor.submit(function, item): item for item in items}
     try:
         for future in tqdm(as_completed(pending), total=len(pending), unit=unit, disable=None):

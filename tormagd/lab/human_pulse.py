@@ -1,7 +1,7 @@
 """A measured human pulse as a force profile.
 
-The pulse is a photoplethysmogram (blood volume under the skin seen by light, not a pressure or a force) that the PyPI
-package heartpy ships as `data.csv`: 100 Hz, 25 s, one person. Shape and rhythm are measured; the newtons are chosen.
+The pulse is a photoplethysmogram: blood volume under the skin seen by light, not a pressure or a force. The PyPI
+package heartpy ships it as `data.csv`: 100 Hz, 25 s, one person. Shape and rhythm are measured; the newtons are chosen.
 """
 
 import importlib.util
@@ -16,12 +16,13 @@ from tormagd.lab.arrays import Array
 
 SOURCE_HZ = 100
 LOW_PASS_HZ = 8.0
-"What is above this in a pulse is noise of the sensor."
+"Frequencies above this in a pulse are the sensor's noise."
 EDGE_S = 0.5
 
 
 def measured_pulse() -> Array:
-    """The recording, as shipped, 100 Hz. Raises ModuleNotFoundError where heartpy is not installed."""
+    """Return heartpy's recording as shipped, sampled at 100 Hz. Raises ModuleNotFoundError where heartpy is not
+    installed."""
     # found, not imported: heartpy's import fails beside a current setuptools
     package = importlib.util.find_spec("heartpy")
     if package is None or package.origin is None:
@@ -30,9 +31,9 @@ def measured_pulse() -> Array:
 
 
 def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int) -> tuple[Array, Array]:
-    """Times, s, and forces, N, of the pulse between two forces: low-passed without lag, scaled, resampled.
+    """Return times, s, and forces, N, of the pulse scaled to `least_N`..`most_N`: low-passed without lag, at `rate_hz`.
 
-    Raises ValueError where the recording is shorter than `duration_s`.
+    Raises ValueError where the recording is shorter than `duration_s`, ModuleNotFoundError as `measured_pulse`.
     """
     raw = measured_pulse()
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=SOURCE_HZ, output="sos"), raw)
@@ -47,12 +48,13 @@ def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int
 
 
 def scaled(values: Array, least: float, most: float) -> Array:
-    """The values with their least and greatest brought to these."""
+    """Return `values` mapped linearly so that they range from `least` to `most`; they must not all be equal."""
     found: Array = least + (values - values.min()) / np.ptp(values) * (most - least)
     return found
 
 
 def recorded(folder: str) -> list[Path]:
-    """The CSV files of a folder of measured data; none unless TORMAG_DATA names where that is."""
+    """Return the CSV files in `folder` of the measured data, sorted; none unless the variable TORMAG_DATA names its
+    place."""
     data = os.environ.get("TORMAG_DATA")
     return sorted((Path(data) / folder).glob("*.csv")) if data else []

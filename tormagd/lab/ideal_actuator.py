@@ -1,7 +1,7 @@
 """Carriages that lose no time: the bound of what a loop can do with the knowledge that it has.
 
 They are in the plan's gap at once, as far as their top speed lets them. Core, protocol, element and sensor stay as they
-are, so what is missed with these is the plan's, and the rest of the error the carriages'.
+are. So the error left with them is the plan's, and the rest is the real carriages'.
 """
 
 import math
@@ -18,7 +18,7 @@ from tormagd.simulation.plant import Plant
 
 
 def put_gap(plant: Plant, gap_mm: float) -> None:
-    """Move both carriages of `plant` at once, by the same way each, to where its gap is `gap_mm`."""
+    """Move both carriages of `plant` at once, each by half the way, to the gap `gap_mm`; screws and encoders follow."""
     before_mm, lead_mm_rad = plant.gap_mm, plant.parameters.screw.lead_mm / math.tau
     for axis in (plant.left, plant.right):
         # the screw turns with the carriage, so the encoder sees it
@@ -28,7 +28,7 @@ def put_gap(plant: Plant, gap_mm: float) -> None:
 
 @final
 class IdealCarriages(Actuator):
-    """Moves the gap of one simulated device, whose motors rest."""
+    """Actuator that moves the gap of one simulated device directly; the device's motors rest."""
 
     def __init__(self, core: Core, plant: Plant) -> None:
         super().__init__()
@@ -39,11 +39,11 @@ class IdealCarriages(Actuator):
         self._plant: Final = plant
 
     def begin(self, gap_mm: float) -> None:
-        """See `Actuator.begin`."""
+        """Begin to move from `gap_mm`, as `Actuator.begin`."""
         self.reference = Reference(gap_mm)
 
     def resume(self, measured: Measured) -> None:
-        """See `Actuator.resume`."""
+        """Begin to move from the measured gap, as `Actuator.resume`."""
         self.begin(measured.gap_mm)
 
     def update(
@@ -55,7 +55,12 @@ class IdealCarriages(Actuator):
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """See `Actuator.update`."""
+        """Put the gap where the plan wants it now, as far as the top speed reaches, and return no duty; see
+        `Actuator.update`.
+
+        RATE is limited where the top speed falls short. Without a plan the gap stays within its ends; with one it opens
+        once `is_over`.
+        """
         before_mm = self._plant.gap_mm
         wanted_mm = min(max(before_mm, self._closed_mm), self._open_mm)
         if plan is not None:
@@ -69,5 +74,5 @@ class IdealCarriages(Actuator):
 
 
 def ideal_stepper(core: Core, plant: Plant) -> Stepper:
-    """Steps of a core whose carriages are ideal, on that simulated device."""
+    """Return a stepper of `core` whose carriages are ideal and move the gap of `plant`."""
     return Stepper(core.config, core.scene, move=IdealCarriages(core, plant))

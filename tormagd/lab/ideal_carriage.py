@@ -40,34 +40,34 @@ from tormagd.simulation.second_element import fresh_N, rate_factor, shaft_field_
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 
 TURNED_MM_S = 42.0
-"The roller's surface at the thesis's 20 rpm."
+"Speed of the roller's surface at the thesis's 20 rpm."
 STEP_S = 1e-3
 MOST_N = 2.0
 "The greatest force of the scenes."
 MOST_STEPS = 300_000
 ROUNDS = 30
 SETTLED = 1e-3
-"Relative change of the RMS error from round to round, below which nothing is left to be found."
+"Relative change of the RMS error from round to round at which the rounds end."
 EXACT_N = 1e-6
 SECANT_MM_S = 5.0
-"Over which a limit is taken to be straight: turning round, it has a kink, and the carriages turn elsewhere next round."
+"Secant over which a limit is linearised: it has a kink at 0, and the carriages turn elsewhere next round."
 LEAST_BRAKING_MM_S2 = 50.0
 
 
 GRID_MM = 2e-3
-"Of the moment over the gap."
+"Grid of the moment over the gap."
 NEWTON_STEPS = 6
 LEAST_GAIN = 0.1
-"Of the field on the gap, just turned round."
+"Least slope of moment and lag together over the moment, just turned round."
 
 
 class Drive(NamedTuple):
-    """What moves the gap, as accelerations of the gap, mm/s^2; opening is positive.
+    """Drive of the gap, as accelerations of the gap, mm/s^2; opening is positive.
 
-    Full voltage gives `stall_mm_s2` at rest and `per_s` less for each mm/s, the current limit no more than
-    `most_mm_s2`. Against it stand the gearbox's friction `gear_mm_s2`, a share `mesh_loss` of all beyond that, the
-    magnets' pull, `pull_mm_s2_N` for each newton, and the guides' drag; `screw_friction` of the last two together is
-    friction besides. Whatever is friction brakes too.
+    Full voltage gives `stall_mm_s2` at rest and `per_s` less for each mm/s; the current limit allows `most_mm_s2`.
+    Against it stand the gearbox's friction `gear_mm_s2`, a share `mesh_loss` of all beyond that, and the nut's load.
+    The load is the magnets' pull, `pull_mm_s2_N` for each newton, and the guides' drag; `screw_friction` of it is
+    friction besides. All friction brakes too.
     """
 
     stall_mm_s2: float
@@ -81,14 +81,19 @@ class Drive(NamedTuple):
     pull_N: Curve = Curve([0.0, 0.0], 0.0, 1.0)
 
     def highest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """The largest speed `dt_s` after that gap and speed; `dt_s` at most 1 / per_s."""
+        """Return the largest speed `dt_s` after this gap and speed, mm/s; `dt_s` is at most 1 / per_s."""
         return self._sped_up(self.pull_mm_s2_N * self.pull_N.at(gap_mm), speed_mm_s, dt_s)
 
     def lowest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """The smallest speed `dt_s` after that gap and speed: seen in a mirror, the pull drives instead of loading."""
+        """Return the smallest speed `dt_s` after this gap and speed, mm/s.
+
+        It is the mirror image of the largest, in which the pull drives instead of loading.
+        """
         return -self._sped_up(-self.pull_mm_s2_N * self.pull_N.at(gap_mm), -speed_mm_s, dt_s)
 
     def _sped_up(self, load_mm_s2: float, speed_mm_s: float, dt_s: float) -> float:
+        """Return the largest speed after `dt_s` under this load, turning round or standing on the way where friction
+        says so."""
         if speed_mm_s < 0.0:
             braking = self._acceleration(load_mm_s2, speed_mm_s, -1.0)
             if speed_mm_s + braking * dt_s <= 0.0:
@@ -108,14 +113,16 @@ class Drive(NamedTuple):
 
 
 class Brake(NamedTuple):
-    """What the gap brakes while the handle slides.
+    """Force of the gap while the handle slides.
 
-    A gap gives a moment of the field (`moment_Tm` over `gap_mm`, from closed to open), which lags behind while it
-    changes: up to `branch_Tm`, and by most of that within a change of `turn_Tm`. Moment and lag together give the force
-    of the fresh, cool insert (`fresh_N` over `strength_Tm`), part of which relaxes; friction makes of it what is felt,
-    `sliding_N` of a kinetic level, N, and of the handle's speed, mm/s. `rested_mm` is the gap at which the insert has
-    rested before. Of the second plant a field in T stands for the moment, one exponential for its creep, and an
-    exponential lag for its play: there a bound is near, but not exact.
+    A gap gives a moment of the field (`moment_Tm` over `gap_mm`, from closed to open). The moment lags while it
+    changes: by up to `branch_Tm`, most of it within a change of `turn_Tm`. Moment and lag together, the strength, give
+    the force of the fresh, cool insert (`fresh_N` over `strength_Tm`), part of which relaxes. `sliding_N` makes the
+    felt force of a kinetic level, N, and the handle's speed, mm/s. `rested_mm` is the gap at which the insert rested
+    before.
+
+    For the second plant a field in T stands for the moment, one exponential for creep, and an exponential lag for play.
+    There a bound is near, but not exact.
     """
 
     gap_mm: Array
@@ -129,20 +136,20 @@ class Brake(NamedTuple):
     sliding_N: Callable[[float, float], float]
 
     def fresh_at_N(self, moment_Tm: float, lag_Tm: float = 0.0) -> float:
-        """The force of the fresh insert at a moment and its lag."""
+        """Return the force of the fresh insert at a moment with its lag."""
         return float(np.interp(moment_Tm + lag_Tm, self.strength_Tm, self.fresh_N))
 
     def open_N(self, hand_mm_s: float) -> float:
-        """What the open gap brakes with its element fresh."""
+        """Return the felt force of the open gap with a fresh element, while the handle moves at `hand_mm_s`."""
         return self.sliding_N(self.fresh_at_N(float(self.moment_Tm[-1])), hand_mm_s)
 
     def lag_after_Tm(self, lag_Tm: float, change_Tm: float) -> float:
-        """The lag once the moment has changed by that much, one way."""
+        """Return the lag once the moment has changed by `change_Tm` in one direction, from the lag `lag_Tm`."""
         branch_Tm = math.copysign(self.branch_Tm, -change_Tm)
         return branch_Tm + (lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm)
 
     def lags_Tm(self, moments_Tm: Array) -> Array:
-        """The lag of every moment of a series, before whose first the gap was open."""
+        """Return the lag at each moment of a series; before the first moment the gap was open."""
         lag_Tm, before_Tm = self.branch_Tm, float(self.moment_Tm[-1])
         found = []
         for moment_Tm in moments_Tm.tolist():
@@ -153,7 +160,8 @@ class Brake(NamedTuple):
         return np.array(found)
 
     def moment_for_Tm(self, strength_Tm: float, moment_Tm: float, lag_Tm: float) -> float:
-        """The moment that makes that strength, from a moment and its lag: Newton's method along the branch."""
+        """Return the moment that makes `strength_Tm`, coming from this moment and lag; Newton's method along the
+        branch."""
         wanted_Tm = moment_Tm
         for _ in range(NEWTON_STEPS):
             change_Tm = wanted_Tm - moment_Tm
@@ -166,7 +174,7 @@ class Brake(NamedTuple):
 
 
 def drive_of(plant: PlantParameters) -> Drive:
-    """The drive of a device."""
+    """Return the drive of a device, both carriages together."""
     motor, gear, screw = plant.motor, plant.gear, plant.screw
     lead_m_rad = screw.lead_mm * 1e-3 / math.tau
     coupling_Nm_A = gear.ratio * motor.back_emf_V_s_rad
@@ -187,7 +195,7 @@ def drive_of(plant: PlantParameters) -> Drive:
 
 
 def brake_of(plant: PlantParameters) -> Brake:
-    """The brake of a device, between its switches."""
+    """Return the brake of a device, between its switches. Raises `DomainError` outside the force law's domain."""
     assumed = plant.assumed
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
@@ -219,6 +227,7 @@ def brake_of(plant: PlantParameters) -> Brake:
 
 
 def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameters) -> Brake:
+    """Return the brake of the second plant over these gaps; an approximation, see `Brake`."""
     field_T = np.array([1e-3 * shaft_field_mT(gap, plant, second.concentration) for gap in gap_mm.tolist()])
     shares_T = [1e-3 * share * half_mT for share, half_mT in zip(second.play_shares, second.play_mT, strict=True)]
     branch_T = sum(shares_T, 0.0)
@@ -239,7 +248,7 @@ def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameter
 
 
 class Asked(NamedTuple):
-    """A force in even steps, clipped to what can be asked for, and the strength of the field that brakes that much.
+    """A force in even steps, clipped to what can be asked, and the field strength that gives it.
 
     `scale`, `offset_N` and `relaxed_N` turn the fresh insert's force into the rendered one.
     """
@@ -251,14 +260,14 @@ class Asked(NamedTuple):
     offset_N: float
 
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
-        """The force along a way of the gap that begins with it open."""
+        """Return the rendered force for gaps in the same steps; before the first the gap was open."""
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)
         return self.scale * (fresh_N - self.relaxed_N) + self.offset_N
 
 
 class Bound(NamedTuple):
-    """The force asked, clipped, and what the ideal carriages render of it without delay and with foresight."""
+    """The asked force, clipped, and what ideal carriages render of it without delay and with foresight; even steps."""
 
     time_s: Array
     asked_N: Array
@@ -266,7 +275,7 @@ class Bound(NamedTuple):
     foresight_N: Array
 
     def figures(self, start_s: float = -math.inf) -> Json:
-        """Of the times from `start_s` on."""
+        """Return the asked force's standard deviation and both RMS errors, N, over the times from `start_s` on."""
         inside = self.time_s >= start_s
         asked_N = self.asked_N[inside]
         return {
@@ -284,7 +293,11 @@ def bound(
     is_held: bool = False,
     step_s: float = STEP_S,
 ) -> Bound:
-    """The bound for forces at rising times, linear in between, or held until the next. Raises `DomainError`."""
+    """Return the bound for forces at rising times, linear in between, or held until the next.
+
+    `step_s` is the step of the result. Raises `DomainError` for under 2 or over MAX_STEPS steps, and RuntimeError as
+    `foresight_mm`.
+    """
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MOST_STEPS:
         raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MOST_STEPS} steps of {step_s:g} s")
@@ -300,7 +313,8 @@ def bound(
 
 
 def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, step_s: float) -> Asked:
-    """The force within the device's range; the insert relaxes as it does while that force is rendered exactly."""
+    """Return the force clipped to the device's range and `most_N`, with the relaxation while exactly that is
+    rendered."""
     offset_N = brake.sliding_N(0.0, hand_mm_s)
     scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
     # a gap that has been opened brakes a little more than one that was never closed
@@ -324,7 +338,8 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
 
 
 def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """The gap that follows a force without delay or foresight, beginning on it at rest."""
+    """Return the gap that follows a force without delay or foresight, one for each step; it begins on the force at
+    rest."""
     gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
     moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.branch_Tm
 
@@ -359,13 +374,12 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
 
 
 def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """The gap over the steps with the least RMS error of force that the drive allows.
+    """Return the gap over the steps with the least RMS error of force that the drive allows.
 
-    A round takes for straight, about the gap of the last round, what is not: the force over the gap, the field's lag,
-    and the speeds that a step reaches over the speed before. It solves the quadratic programme that this makes, whose
-    unknowns are the gaps and the lags. Nothing says that this is convex, so that it ends at the optimum is tested:
-    against a search of everything (`tests/lab/test_bound.py`).
-    Raises RuntimeError where the rounds come to no end.
+    Each round linearises three things about the last round's gap: the force over the gap, the field's lag, and how the
+    speeds that a step reaches depend on the speed before. It then solves a quadratic programme in the gaps and lags.
+    Convexity is not proven, so the optimum is tested against an exhaustive search (`tests/lab/test_bound.py`). Raises
+    RuntimeError where the rounds do not settle, or Clarabel finds no solution.
     """
     steps = len(asked.force_N)
     slope_Tm_mm = np.gradient(brake.moment_Tm, brake.gap_mm)
@@ -392,7 +406,7 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
         lag_Tm = brake.lags_Tm(moment_Tm)
         turned = np.interp(gap_mm, brake.gap_mm, slope_Tm_mm)
         felt = np.interp(moment_Tm + lag_Tm, brake.strength_Tm, slope_N_Tm)
-        # lags counted in millimetres of gap, as which they weigh as much as these
+        # lags are counted in millimetres of gap, so that gaps and lags are of one size
         unit_Tm = float(np.abs(turned).max())
         error_N = asked.rendered_N(brake, gap_mm) - asked.force_N
         sensed = sparse.hstack([sparse.diags(felt * turned), sparse.diags(felt * unit_Tm)], format="csc")
@@ -403,21 +417,23 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
         if abs(now_N - last_N) <= SETTLED * now_N + EXACT_N:
             return gap_mm
         if now_N > last_N:
-            # where the gap turns, one round may undo the other: each goes less far then
+            # where the gap turns, one round may undo the other: the next goes less far
             radius_mm = 0.5 * float(np.abs(moved_mm).max())
         last_N = now_N
     raise RuntimeError(f"foresight: no end after {ROUNDS} rounds, {last_N * 1e3:.2f} mN")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab bound`."""
+    """Add the options of `tormag-lab bound`."""
     parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The figures of a file of forces. Raises DomainError, ForceFileError, PlantError, and LabError where no optimum
-    was found."""
+    """Return the figures of the bound for a file of forces.
+
+    Raises DomainError, ForceFileError, PlantError, and LabError where no optimum was found.
+    """
     table = read_forces(options.force)
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
     try:
@@ -429,7 +445,7 @@ def run(options: argparse.Namespace) -> Found:
 def _reached(
     limit_mm_s: Callable[[float, float, float], float], gap_mm: Array, speeds_mm_s: Array, step_s: float
 ) -> tuple[Array, Array]:
-    """The limit of the speed after every step but the first, and how it changes with the speed before."""
+    """Return the speed limit after every step but the first, and its slope over the speed before (secant)."""
     found = []
     for gap, speed in zip(gap_mm[1:-1].tolist(), speeds_mm_s[:-1].tolist(), strict=True):
         more, less = limit_mm_s(gap, speed + SECANT_MM_S, step_s), limit_mm_s(gap, speed - SECANT_MM_S, step_s)
@@ -439,7 +455,8 @@ def _reached(
 
 
 def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tuple[sparse.spmatrix, sparse.spmatrix]:
-    """Two matrices, for the changes of the gaps and of the lags, whose products with them add up to nothing."""
+    """Return two matrices, for the changes of gaps and of lags: their products with the changes sum to 0 (linearised
+    lag)."""
     steps = len(moment_Tm)
     change_Tm = np.diff(moment_Tm)
     kept = np.exp(-np.abs(change_Tm) / brake.turn_Tm)
@@ -455,18 +472,20 @@ def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tu
 def _least_squares(
     matrix: sparse.spmatrix, error: Array, nothing: sparse.spmatrix, limits: list[tuple[sparse.spmatrix, Array]]
 ) -> Array:
-    """The x with the least |matrix x + error| for which `nothing` x is zero, and limits hold: a matrix times the first
-    elements of x is at most its bounds.
+    """Return the x with the least |matrix x + error|, subject to `nothing` x = 0 and the limits.
+
+    Each limit is a matrix whose product with the first elements of x is at most its bounds. Raises RuntimeError where
+    Clarabel finds no solution.
     """
     unit = float(np.abs(matrix).max())
     below = sparse.vstack([limit for limit, _ in limits], format="csc")
     below.resize(below.shape[0], matrix.shape[1])
     bounds = np.concatenate([bound for _, bound in limits])
-    import clarabel  # only the bound takes it, and who shows a touch has no need of it
+    import clarabel  # only the bound needs it
 
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    # where the rounds go a little way only, the limits leave little room, and it takes ten times as many as at first
+    # late rounds leave little room, and the solver takes ten times the iterations of early ones
     settings.max_iter = 1_000
     solver = clarabel.DefaultSolver(
         sparse.triu(matrix.T @ matrix / unit**2, format="csc"),

@@ -1,7 +1,7 @@
-"""`tormag-lab NAME`: the laboratory's commands. Each is a module, which is loaded when it is asked for.
+"""`tormag-lab NAME`: the laboratory's commands. Each is a module, loaded when asked for.
 
-A module has `add_options(parser)` and `run(options)`, which returns what was found. It is printed as one JSON object
-with --json, and for a person otherwise.
+A module has `add_options(parser)` and `run(options)`, which returns a `Found`. `--json` prints its figures as one JSON
+object; otherwise they are printed for a person.
 """
 
 import argparse
@@ -22,11 +22,11 @@ from tormagd_client.printable import printable
 
 USAGE = 2
 REFUSALS = (LabError, ConfigError, ForceFileError, DomainError, PlantError)
-"What the rooms that are used here refuse input with."
+"Errors with which the laboratory's rooms refuse input."
 
 
 class Found(NamedTuple):
-    """What a command found: plain data, the exit code, and the same for a person where tables do not tell it best."""
+    """Result of a command: plain data, the exit code, and lines for a person where a plain table does not do."""
 
     figures: Any
     lines: Iterable[str] | None = None
@@ -48,11 +48,11 @@ COMMANDS = {
     "wire-log": ("wire_log", "a session between host and device as a CAN log"),
     "fleet": ("consoles.command", "what the recordings of many consoles say of each"),
 }
-"The module of `tormagd.lab` that each is, and what it does."
+"By name, a command's module in `tormagd.lab`, and what it does."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command that is named first; returns its exit code, 2 for what cannot be."""
+    """Run the command that the first argument names and return its exit code; 2 for usage and input that is refused."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     name = given[0] if given else "--help"
     if name in COMMANDS:
@@ -65,7 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
-    """Runs one command and prints what it found."""
+    """Run one command, print what it found and return its exit code.
+
+    Refused input, an OSError and a missing package become one sentence on stderr and exit code 2.
+    """
     try:
         module = import_module(f"tormagd.lab.{COMMANDS[name][0]}")
         parser = argparse.ArgumentParser(

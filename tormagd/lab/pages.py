@@ -1,4 +1,4 @@
-"""Generated pages and their pictures: tables in Markdown, and pictures that say which figures they were drawn from."""
+"""Generated pages and their pictures: tables in Markdown, and pictures that carry the digest of their figures."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -14,18 +14,20 @@ KEY = "Figures"
 
 
 def stamp(figures: object) -> dict[str, str | None]:
-    """The metadata of a PNG drawn from `figures`, which are plain data: their digest, and nothing that changes with
-    time or version, so that the same figures make the same file."""
+    """Return the metadata of a PNG drawn from `figures`, which are plain data: their SHA-256 digest.
+
+    Nothing in it changes with time or version, so the same figures make the same file.
+    """
     return {KEY: hashlib.sha256(msgspec.json.encode(figures, order="sorted")).hexdigest(), "Software": None}
 
 
 def figures_of(page: str) -> list[str]:
-    """The figures of a generated page: the rows of its tables, whatever else it says."""
+    """Return the figures of a generated page: the rows of its tables."""
     return [line for line in page.splitlines() if line.startswith("|")]
 
 
 def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Figure", Any]:
-    """A figure of that size, inches, and its axes."""
+    """Return a new matplotlib figure of `size`, inches, and its axes. Raises ModuleNotFoundError without matplotlib."""
     from matplotlib.figure import Figure  # not every installation draws
 
     figure = Figure(figsize=size, layout="constrained")
@@ -33,7 +35,7 @@ def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Fi
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
-    """Writes a page, and its pictures as PNG into `folder`, stamped with the rows of the page's tables."""
+    """Write a page, and its pictures as PNG into `folder`, stamped with the rows of the page's tables."""
     page = "\n".join(section.rstrip() + "\n" for section in sections)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():
@@ -42,12 +44,12 @@ def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapp
 
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     head = list(columns)
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def percent(share: float) -> str:
-    """To a tenth."""
+    """Return a share as a percentage, to a tenth."""
     return f"{100 * share:.1f}%"

@@ -14,7 +14,7 @@ from tormagd_client.regular_file import require_regular
 
 MAX_ROWS = 5_000_000
 MOST_TABLE_BYTES = 1 << 30
-"A table of measurements, which is read row by row: a day of a testing machine."
+"Largest table of measurements: a day of a testing machine. It is read row by row."
 
 
 def read_columns(
@@ -26,11 +26,11 @@ def read_columns(
     allowed: Mapping[str, tuple[float, float]] | None = None,
     is_exact: bool = False,
 ) -> dict[str, Array]:
-    """The named columns of a CSV file, the optional ones where they are there; `allowed` has bounds of some.
+    """Read the columns `names` of a CSV file, and the `optional` ones that it has; `allowed` bounds some.
 
-    The header is the first row with all the names. Rows before it are skipped (many testing machines write a preamble),
-    and so are other columns and empty rows; where `is_exact`, none of these may be. Raises `LabError`: unreadable, no
-    such header, a cell that is no finite number within its bounds (with its row), too many rows or none.
+    The header is the first row with all `names`. Rows before it (many testing machines write a preamble), other columns
+    and empty rows are skipped; with `is_exact` they are refused. Raises `LabError` for an unreadable file, a missing
+    header, no rows or over MAX_ROWS. So does a cell that is no finite number within its bounds, with its row.
     """
     try:
         require_regular(path, MOST_TABLE_BYTES)
@@ -55,6 +55,7 @@ def _columns(
     allowed: Mapping[str, tuple[float, float]],
     is_exact: bool,
 ) -> dict[str, Array]:
+    """Find the header and read the columns below it. Raises `LabError` as `read_columns`."""
     header: list[str] = []
     for _, header in rows:
         if is_exact or set(names) <= set(header):
@@ -81,6 +82,8 @@ def _columns(
 
 
 def _number(where: str, text: str, bounds: tuple[float, float] | None) -> float:
+    """Return `text` as a finite number within `bounds`, None for any. Raises LabError, also for digits with
+    underscores."""
     try:
         # digits grouped as 1_000 are Python's idea, not CSV's
         number = math.nan if "_" in text else float(text)

@@ -1,11 +1,11 @@
-"""The result of any measurement for a person: a line for a figure or a few that belong together, a table for rows."""
+"""A command's result for a person: a line for a figure or a few that belong together, a table for rows."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 
 def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
-    """What `--json` prints, as text: `path` is the name of what holds these figures."""
+    """Yield what `--json` prints as lines of text; `path` names what holds these figures."""
     for key, value in result.items():
         name = f"{path} {key}".strip()
         if isinstance(value, Mapping) and any(isinstance(inner, Mapping | list) for inner in value.values()):
@@ -18,7 +18,8 @@ def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """Rows under the names of their figures, those of a part behind the part's name; what holds more is left out."""
+    """Yield a table's lines, one for the names and one for each row. Nested figures get both names; lists are left
+    out."""
     flat = [dict(_figures(row)) for row in rows]
     names = list(dict.fromkeys(name for row in flat for name in row))
     cells = [names, *([shown(row.get(name, "")) for name in names] for row in flat)]
@@ -36,7 +37,7 @@ def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def shown(value: Any) -> str:
-    """A figure to four digits; a few of them with their names."""
+    """Return a figure to four digits; several with their names."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {shown(inner)}" for name, inner in value.items())
     if isinstance(value, float):

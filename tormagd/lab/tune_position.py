@@ -44,12 +44,15 @@ class Tuning(NamedTuple):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab tune-position`."""
+    """Add the options of `tormag-lab tune-position`."""
     parser.add_argument("--config", type=Path, help="whose [motor] is tuned for; the defaults otherwise")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The stiffest robust gains, for a person as a table of the configuration. Raises LabError where none is."""
+    """Return the stiffest robust gains, for a person as a table of the configuration.
+
+    Raises LabError where no gains are robust, ConfigError for a configuration that is refused.
+    """
     tunings = search(load_config(options.config))
     if not tunings:
         raise LabError("no gain keeps the margins at every corner of these motor parameters")
@@ -60,7 +63,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def corner_margins(config: Config) -> dict[str, float]:
-    """The smallest margins over every corner of +-30% in the named motor parameters and +-20% in the period."""
+    """Return the smallest gain and phase margin over every corner, and the number of corners.
+
+    Corners are +-30% in each of CORNER_PARAMETERS and +-20% in the loop period.
+    """
     gain, phase = [], []
     for factors in itertools.product((1.0 - CORNER, 1.0 + CORNER), repeat=len(CORNER_PARAMETERS)):
         named = zip(CORNER_PARAMETERS, factors, strict=True)
@@ -75,7 +81,7 @@ def corner_margins(config: Config) -> dict[str, float]:
 
 
 def search(config: Config) -> list[Tuning]:
-    """The largest robust proportional gain for every point of the grid that has one."""
+    """Return the largest robust proportional gain for every point of the grid that has one."""
     grid = list(itertools.product(DERIVATIVE_TIMES_S, FILTER_TIMES_S, INTEGRAL_TIMES_S))
     found = []
     for derivative_s, filter_s, integral_s in tqdm(grid, desc="gains", disable=None):
@@ -96,7 +102,7 @@ def search(config: Config) -> list[Tuning]:
 
 
 def robust(config: Config, position: msgspec.Struct, gain: float) -> tuple[float, float] | None:
-    """The smallest margins over the corners; None where they are too small."""
+    """Return the smallest margins over the corners with this gain, dB and degrees; None where they are too small."""
     tried = msgspec.structs.replace(config, position=msgspec.structs.replace(position, proportional_per_mm=gain))
     found = corner_margins(tried)
     gain_dB, phase_deg = found["gain_margin_dB"], found["phase_margin_deg"]

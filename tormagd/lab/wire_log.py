@@ -41,11 +41,11 @@ MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 
 
 class WireLog:
-    """A log of both directions of one serial line, to be closed.
+    """Log of both directions of one serial line, as a file that CAN tools read; to be closed.
 
-    A frame is stamped with the time its last byte passed. What is no frame, or names a function that CAN has no
-    identifier for, is counted in `damaged` and not in the log. Raises ValueError for a file type that python-can does
-    not know, and OSError where the file cannot be made.
+    A frame is stamped with the time its last byte passed. Bytes that are no frame, or name a function without a CAN
+    identifier, are counted in `damaged` and not logged. Raises ValueError for a file type that python-can does not
+    know, and OSError where the file cannot be made.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,15 +56,15 @@ class WireLog:
 
     @property
     def damaged(self) -> int:
-        """Stretches of bytes that could not be logged."""
+        """Number of stretches of bytes that could not be logged."""
         return self._nameless + sum(decoder.statistics.corrupt for decoder in self._decoders.values())
 
     def close(self) -> None:
-        """Ends the file."""
+        """End the file."""
         self._log.stop()
 
     def add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
-        """Bytes from the device, where the host receives them, or from the host."""
+        """Log the frames that `data` completes: from the device if `is_rx`, else from the host."""
         for frame in self._decoders[is_rx].feed(data):
             if not 1 <= frame.function <= 0x7F:
                 self._nameless += 1
@@ -81,19 +81,22 @@ class WireLog:
             self.frames += 1
 
     def read(self, now_s: float, raw: Any) -> None:
-        """Of a connection's traffic: what was read."""
+        """Log what a connection read from the device."""
         self.add(now_s, raw, is_rx=True)
 
     def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
-        """And what was written."""
+        """Log what a connection wrote to the device."""
         self.add(now_s, b"".join(raw), is_rx=False)
 
     def connected(self, memory: Any) -> None:
-        """That a conversation begins or ends is no frame."""
+        """Do nothing: the beginning and end of a conversation are no frames."""
 
 
 def virtual_session(seconds: float, log: WireLog) -> None:
-    """Connects, homes, enables and follows a swinging force for that long, in virtual time."""
+    """Connect, home, enable and follow a swinging force for `seconds` of virtual time, logging the connection's frames.
+
+    Raises RuntimeError if the device does not arm.
+    """
     config = load_config(None)
     core = build_core(config)
     loop = ClosedLoop(
@@ -110,9 +113,9 @@ def virtual_session(seconds: float, log: WireLog) -> None:
 
 
 def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
-    """Passes bytes between `port` and a pseudo-terminal, whose path is announced, until `stopped()`.
+    """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames.
 
-    Raises OSError when the port goes away.
+    `announce` is called with the pseudo-terminal's path. Raises OSError when the port goes away.
     """
     with contextlib.closing(Pty()) as line:
         announce(line.address)
@@ -134,7 +137,7 @@ def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stop
 
 
 def viewer_formats() -> list[str]:
-    """`ID:FORMAT:DIVISOR...` of each message, as `python -m can.viewer -d FILE` reads them."""
+    """Return `ID:FORMAT:DIVISOR...` of each message, as `python -m can.viewer -d FILE` reads them."""
     lines = []
     for layout in LAYOUTS:
         divisors = [repr(1.0 / signal.scale) if signal.type is float else "1" for signal in layout.signals]
@@ -144,7 +147,7 @@ def viewer_formats() -> list[str]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab wire-log`."""
+    """Add the options of `tormag-lab wire-log`."""
     ways = parser.add_subparsers(dest="way", required=True)
     virtual = ways.add_parser("virtual", help="log a session in virtual time")
     tapped = ways.add_parser("tap", help="log what passes between the daemon and a serial device")
@@ -157,7 +160,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Logs until the session or a signal ends it. Raises LabError, OSError for a file or port that cannot be used."""
+    """Log until the session or a signal ends it, or return the viewer's formats.
+
+    Raises LabError for a file type that is not known, OSError for a file or port that cannot be used.
+    """
     if options.way == "viewer":
         formats = viewer_formats()
         return Found(formats, formats)
@@ -174,6 +180,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:
+    """Tap the port at `path` until SIGINT or SIGTERM, printing where the daemon finds it. Raises OSError."""
     with (
         interrupted_by(signal.SIGINT, signal.SIGTERM) as is_stopped,
         serial.Serial(path, baud, timeout=0, exclusive=True) as port,

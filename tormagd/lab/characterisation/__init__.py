@@ -1,1 +1,2 @@
-"""From a laboratory's records to the constants that the physics room takes; needs the `lab` extra, never the daemon."""
+"""From a laboratory's records to the physics room's constants; needs the `lab` extra, and the daemon never imports
+it."""

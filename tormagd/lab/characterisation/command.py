@@ -27,7 +27,7 @@ from tormagd.lab.tables import read_columns
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab characterise`."""
+    """Add the options of `tormag-lab characterise`."""
     kinds = parser.add_subparsers(required=True)
     for name, handle in (("compression", compression), ("tension", tension), ("relaxation", relaxation)):
         kind = kinds.add_parser(name)
@@ -50,19 +50,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The constants of one record."""
+    """Return the constants of one record. Raises LabError and DomainError."""
     return Found(options.handle(options))
 
 
 def compression(options: argparse.Namespace) -> dict[str, Any]:
-    """Moduli from the evaluated cycle, and where the test differs from the standard."""
+    """Return the moduli from the evaluated cycle, and where the test differs from the standard."""
     record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
     curve = evaluated_cycle(record, sample, options.cycle)
     return {"cycle": options.cycle, "deviations": deviations(record, sample), **moduli(curve, options.terms)}
 
 
 def tension(options: argparse.Namespace) -> dict[str, Any]:
-    """Moduli from the part of a tension test between two strains."""
+    """Return the moduli from the part of a tension test between two strains."""
     names = (options.strain, options.stress_mpa)
     columns = read_columns(options.file, names, delimiter=options.delimiter)
     strain, stress_MPa = (columns[name] for name in names)
@@ -71,7 +71,7 @@ def tension(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
-    """The three laws' shear moduli, kPa, and how well each fits."""
+    """Return the shear moduli of three laws, kPa, and how well each fits."""
     neo_hookean, ogden = fit_neo_hookean(*curve), fit_ogden(*curve, terms=terms)
     thesis = fit_thesis_ogden(*curve)
     return {
@@ -94,7 +94,7 @@ def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
 
 
 def relaxation(options: argparse.Namespace) -> dict[str, Any]:
-    """Fractions and time constants of a relaxation record."""
+    """Return fractions, time constants and quality of the fit of a relaxation record."""
     record = RelaxationRecord(**read_columns(options.file, RelaxationRecord._fields))
     fit = fit_relaxation(record, options.branches)
     return {

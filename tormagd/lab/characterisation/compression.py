@@ -1,4 +1,4 @@
-"""A cyclic compression test after ISO 7743: from force and displacement to the stress and stretch that are fitted.
+"""A cyclic compression test after ISO 7743: from force and displacement to stress and stretch.
 
 Eq. 1 and 2 of the thesis: sigma = force / area and lambda = 1 + displacement / height, with compression negative in
 both. A fresh filled rubber softens over its first cycles, so three cycles condition it and the loading half of the
@@ -56,14 +56,14 @@ class CompressionRecord(NamedTuple):
 
 
 class StressStretch(NamedTuple):
-    """What a law is fitted to: stretch and engineering stress (Pa), both in loading order."""
+    """Stretch and engineering stress (Pa) that a law is fitted to, both in loading order."""
 
     stretch: Array
     stress_Pa: Array
 
 
 def read_compression(path: Path) -> CompressionRecord:
-    """A CSV file with `time_s,displacement_mm,force_N`; raises `LabError`, also where time does not rise."""
+    """Read a CSV file with `time_s,displacement_mm,force_N`. Raises `LabError`, also where time does not rise."""
     record = CompressionRecord(**read_columns(path, CompressionRecord._fields))
     if not (np.diff(record.time_s) > 0.0).all():
         raise LabError(f"{path}: time_s does not rise strictly")
@@ -71,7 +71,7 @@ def read_compression(path: Path) -> CompressionRecord:
 
 
 def loading_halves(record: CompressionRecord) -> list[slice]:
-    """The loading half of each cycle: from the smallest displacement before it to the largest in it.
+    """Return the loading half of each cycle, from the smallest displacement before it to the largest in it.
 
     Raises `LabError` if the plates hardly moved.
     """
@@ -96,7 +96,10 @@ def loading_halves(record: CompressionRecord) -> list[slice]:
 
 
 def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCLES) -> StressStretch:
-    """Stress and stretch while loading in that cycle, counted from 1. Raises `LabError` if there are too few."""
+    """Return stress and stretch while loading in `cycle`, counted from 1; compression is negative.
+
+    Raises `LabError` if the record has no such cycle, or the plates reach the sample's height.
+    """
     halves = loading_halves(record)
     if not 1 <= cycle <= len(halves):
         raise LabError(f"cycle {cycle} of {len(halves)}: the record holds no such cycle")
@@ -108,10 +111,11 @@ def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCL
 
 
 def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
-    """Where a test differs from the standard's method with lubricated plates, one sentence each; empty if nowhere.
+    """Return where a test differs from the standard's method with lubricated plates, one sentence each; empty if
+    nowhere.
 
     Test piece A is 29 +- 0.5 mm by 12.5 +- 0.5 mm. The thesis's 30 mm is outside, which matters little: the shear
-    modulus from lubricated plates does not depend on the diameter.
+    modulus from lubricated plates does not depend on the diameter. Raises `LabError` if the plates hardly moved.
     """
     halves = loading_halves(record)
     found = []
@@ -131,7 +135,7 @@ def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
 
 
 def _latched(values: Array, low: float, high: float) -> Mask:
-    """True from where the values pass `high` until they pass `low`; at first, whether they start above `high`."""
+    """Return a mask: True from where values pass `high` until they pass `low`, False before either."""
     decided = np.where(values >= high, 1, np.where(values <= low, 0, -1))
     known = np.maximum.accumulate(np.where(decided >= 0, np.arange(len(values)), -1))
     return np.where(known >= 0, decided[known], 0).astype(np.bool_)

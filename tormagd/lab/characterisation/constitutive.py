@@ -2,14 +2,14 @@
 
 The deformation is F = diag(lambda_1, lambda_2, lambda_3) in the cylinder's radial, circumferential and axial directions
 and keeps the volume. Vectors and tensors stand in that order, in SI units. The field b is the thesis's a / R e_R with
-an axial part: Eq. 19..21 contract it with C = F^T F, so there it is the field per area of the *undeformed* elastomer
+an axial part. Eq. 19..21 contract it with C = F^T F, so there it is the field per area of the *undeformed* elastomer
 (Lagrangian).
 
-Two readings are needed to make the printed equations agree with each other, and the tests hold them against the energy
-by automatic differentiation:
+Two readings are needed to make the printed equations agree with each other. The tests hold both against the energy by
+automatic differentiation:
 
-- Eq. 25 is called the nominal stress, but with Lambda = F F^T it is the derivative of the energy only if it is the
-  *true* (Cauchy) stress, force per deformed area. `nominal_stress_Pa` is that stress per undeformed area.
+- Eq. 25 is called the nominal stress. With Lambda = F F^T it is the derivative of the energy only as the *true*
+  (Cauchy) stress, force per deformed area. `nominal_stress_Pa` is that stress per undeformed area.
 - The b of its Maxwell term is then the field in the deformed elastomer, F b, not the b of Eq. 19..21.
 """
 
@@ -30,13 +30,12 @@ class MooneyRivlin(NamedTuple):
 
 
 def stretches(radial: float, circumferential: float) -> Array:
-    """The principal stretches (3) with that radial and circumferential part; incompressibility gives the axial one
-    (Eq. 14)."""
+    """Return the principal stretches (3) with these two; incompressibility gives the axial one (Eq. 14)."""
     return np.array([radial, circumferential, 1.0 / (radial * circumferential)])
 
 
 def cauchy_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressure_Pa: float) -> Array:
-    """True stress T, Pa (3 x 3), of a stretch (3) and a field b (3) (Eq. 25 and 27); tension is positive.
+    """Return the true stress T, Pa (3 x 3), of a stretch (3) and a field b (3) (Eq. 25 and 27); tension is positive.
 
     `pressure_Pa` is the multiplier p of the incompressibility, which only the boundary settles: see
     `pressure_for_free_ends_Pa`. Without strain and field, p = 2 C10 + 4 C01 makes the stress zero.
@@ -49,10 +48,10 @@ def cauchy_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressur
 
 
 def nominal_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressure_Pa: float) -> Array:
-    """Force per *undeformed* area, Pa (3 x 3): P = T F^-T, d Omega* / dF less p F^-T."""
+    """Return the force per *undeformed* area, Pa (3 x 3): P = T F^-T, d Omega* / dF less p F^-T."""
     return cauchy_stress_Pa(stretch, b_T, material, pressure_Pa) / stretch
 
 
 def pressure_for_free_ends_Pa(stretch: Array, b_T: Array, material: MooneyRivlin) -> float:
-    """The multiplier p, Pa, that leaves the end faces without axial stress, T_zz = 0."""
+    """Return the multiplier p, Pa, that leaves the end faces without axial stress, T_zz = 0."""
     return float(cauchy_stress_Pa(stretch, b_T, material, 0.0)[2, 2])

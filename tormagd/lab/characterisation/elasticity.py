@@ -27,7 +27,7 @@ from tormagd.lab.errors import LabError
 from tormagd.physics.errors import FloatArray, require
 
 Shape = Callable[[FloatArray, float], FloatArray]
-"The stress of one term over its modulus, by the stretch and the exponent; unchecked."
+"Stress of one term over its modulus, by the stretch and the exponent; unchecked."
 
 MIN_STRETCH, MAX_STRETCH = 0.05, 20.0
 MIN_EXPONENT, MAX_EXPONENT = 0.05, 30.0
@@ -37,20 +37,21 @@ _STARTS = 4
 
 
 def thesis_shape(stretch: FloatArray, exponent: float) -> FloatArray:
-    """Eq. 3 over mu, the true stress of Ogden's law. By expm1 it loses no digits towards lambda = 1."""
+    """Return Eq. 3 over mu, the true stress of Ogden's law; by expm1 no digits are lost towards lambda = 1."""
     log = np.log(stretch)
     return 2.0 / exponent * np.exp(-0.5 * exponent * log) * np.expm1(1.5 * exponent * log)
 
 
 def ogden_shape(stretch: FloatArray, exponent: float) -> FloatArray:
-    """Engineering stress of one Ogden term over its mu."""
+    """Return the engineering stress of one Ogden term over its mu."""
     return thesis_shape(stretch, exponent) / stretch
 
 
 def stress_Pa(
     shape: Shape, stretch: FloatArray, moduli_Pa: tuple[float, ...], exponents: tuple[float, ...]
 ) -> FloatArray:
-    """The stress of a law, Pa, at these stretches; it keeps their type."""
+    """Return the stress of a law at these stretches, Pa, as the type of `stretch`. Moduli and exponents come in
+    pairs."""
     terms = zip(moduli_Pa, exponents, strict=True)
     return sum((modulus_Pa * shape(stretch, exponent) for modulus_Pa, exponent in terms), 0.0 * stretch)
 
@@ -69,19 +70,20 @@ class Fit(NamedTuple):
 
 
 def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit:
-    """The shear modulus that fits best. Raises `LabError` for a curve no positive modulus fits."""
+    """Fit the shear modulus of the neo-Hookean law. Raises `LabError` and `DomainError` like `fit_ogden`."""
     _check(stretch, stress_Pa, 2)
     return _fitted(ogden_shape, stretch, stress_Pa, (2.0,))
 
 
 def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit:
-    """Ogden's law with up to `terms` terms, 1..3, of positive exponents; one whose best modulus is zero is dropped.
+    """Fit Ogden's law with up to `terms` terms, 1..3, of positive exponents; a term whose best modulus is zero is
+    dropped.
 
-    Negative exponents are left out, because one direction of loading cannot tell them from positive ones: under tension
+    Negative exponents are left out, because one direction of loading cannot tell them from positive ones. Under tension
     alpha = -2 (alpha' - 1) grows like alpha', but the two differ widely under compression.
 
-    Raises `LabError` for a curve of fewer than 2 points a term and one more, for stretches outside 0.05..20, and for
-    one that no positive modulus fits (stress of the wrong sign).
+    Raises `LabError` for fewer than 2 points a term and one more, and for stress of the wrong sign, which no positive
+    modulus fits. Raises `DomainError` for stretches outside 0.05..20.
     """
     if not 1 <= terms <= MAX_TERMS:
         raise LabError(f"terms = {terms}: allowed is 1..{MAX_TERMS}")
@@ -89,12 +91,12 @@ def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit:
 
 
 def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit:
-    """Eq. 3 of the thesis as printed, with alpha > 0. Raises `LabError` like `fit_ogden`."""
+    """Fit Eq. 3 of the thesis as printed, with alpha > 0. Raises like `fit_ogden`."""
     return _searched(thesis_shape, stretch, stress_Pa, 1)
 
 
 def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit:
-    """The best fit, from the best few points of a grid."""
+    """Return the best fit over the exponents, searched from the best few points of a grid."""
     _check(stretch, stress_Pa, 2 * terms + 1)
 
     def norm(exponents: tuple[float, ...]) -> float:
@@ -116,7 +118,7 @@ def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit
 
 
 def _moduli(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> tuple[Array, float]:
-    """Best moduli >= 0 for given exponents, and the norm of the residual over that of the stress."""
+    """Return the best moduli >= 0 for given exponents, and the norm of the residual over that of the stress."""
     columns = np.column_stack([shape(stretch, exponent) for exponent in exponents])
     # columns and stress to unit size: the shapes differ by many orders of magnitude
     sizes, size_Pa = np.linalg.norm(columns, axis=0), float(np.linalg.norm(stress_Pa))
@@ -131,7 +133,7 @@ def _residual(shape: Shape, stretch: Array, measured_Pa: Array, exponents: tuple
 
 
 def _fitted(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> Fit:
-    """The law with these exponents."""
+    """Return the law with these exponents, without terms of modulus 0. Raises LabError where no modulus is positive."""
     moduli, norm = _moduli(shape, stretch, stress_Pa, exponents)
     if not (moduli > 0.0).any():
         raise LabError("the stress does not rise with the stretch: no positive modulus fits")
@@ -142,6 +144,7 @@ def _fitted(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[flo
 
 
 def _check(stretch: Array, stress_Pa: Array, least: int) -> None:
+    """Raise LabError or DomainError unless stretch and stress are `least` pairs or more, in range and not constant."""
     if stretch.ndim != 1 or stretch.shape != stress_Pa.shape or len(stretch) < least:
         raise LabError(f"stretch {stretch.shape}, stress_Pa {stress_Pa.shape}: wanted are {least} pairs or more")
     require("stretch", stretch, MIN_STRETCH, MAX_STRETCH)

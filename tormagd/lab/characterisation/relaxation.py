@@ -1,6 +1,6 @@
 """A relaxation spectrum from a record: the `PronySeries` that turns the driving force into the measured one.
 
-The record may hold steps, ramps or anything else; the driving force is what the elastomer would give without memory, in
+The record may hold steps, ramps or anything else. The driving force is what the elastomer would give without memory, in
 any unit, because its scale is fitted too. With branch responses h_i the model is linear,
 
     F = c_0 F0 + sum c_i h_i          g_i = c_i / (c_0 + sum c_i)
@@ -38,7 +38,7 @@ class RelaxationRecord(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RelaxationFit:
-    """The series; `scale_N`, the force at once per unit of driving force; r2; RMS of what is left, N."""
+    """A fitted series; `scale_N`, the instant force per unit of driving force; r2; RMS of the residual, N."""
 
     series: PronySeries
     scale_N: float
@@ -47,13 +47,14 @@ class RelaxationFit:
 
 
 def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit:
-    """The series of up to `branches` (1..6) time constants that fits best.
+    """Fit a series of up to `branches` (1..6) time constants.
 
-    The element is taken as rested at the first row; between rows the driving force goes straight, so a step is two rows
-    close together. Time constants are sought from a third of the shortest time step to three times the record: what is
-    slower cannot be told from the equilibrium. Branches the record shows nothing of are dropped.
-    Raises `LabError` for a record that is too short, not in order, or without driving force, and if nothing is left
-    at equilibrium (the record is too short to show it).
+    The element counts as rested at the first row. The driving force is linear between rows, so a step is two rows close
+    together. Time constants are sought from a third of the shortest time step to three times the record. A slower one
+    cannot be told from the equilibrium. Branches that the record does not show are dropped.
+
+    Raises `LabError` for a record that is too short, not in order, or without driving force. So it does where no force
+    is left at equilibrium: the record is too short. Raises `DomainError` for values out of range.
     """
     _check(record, branches)
     span = float(record.time_s[-1] - record.time_s[0])
@@ -87,7 +88,7 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
 
 
 def _columns(record: RelaxationRecord, times_s: Array) -> Array:
-    """F0 and each branch's response to it, one column each; the exact update of a force that goes straight."""
+    """Return F0 and each branch's response to it, one column each, by the exact update for a linear force."""
     ratios = np.diff(record.time_s)[:, None] / times_s
     changes = np.diff(record.driving)[:, None] * -np.expm1(-ratios) / ratios
     decays = np.exp(-ratios)
@@ -104,13 +105,14 @@ def _columns(record: RelaxationRecord, times_s: Array) -> Array:
 
 
 def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
-    """The coefficients for these time constants, and what they leave, N."""
+    """Return the coefficients for these time constants, and the residual, N."""
     columns = _columns(record, times_s)
     coefficients, _ = nnls(columns, record.force_N)
     return coefficients, columns @ coefficients - record.force_N
 
 
 def _check(record: RelaxationRecord, branches: int) -> None:
+    """Raise LabError or DomainError unless the record has rows enough, in range and order, and shows a change."""
     if not 1 <= branches <= MAX_BRANCHES:
         raise LabError(f"branches = {branches}: allowed is 1..{MAX_BRANCHES}")
     rows = len(record.time_s)

@@ -26,7 +26,7 @@ from tormagd_client.printable import printable
 
 HEADINGS = ("device", "insert", "files", "enabled", "RMS, worst mN", "trim", "current A", "clock ppm", "held back by")
 LEAST_SHARE, MOST_LIMITS = 0.001, 3
-"A limit that was there for less of the time is not shown to a person, nor more of them."
+"Least share of the time, and most limits, that are shown to a person."
 KINDS = {
     str: pyarrow.string(),
     bool: pyarrow.bool_(),
@@ -35,11 +35,11 @@ KINDS = {
     float | None: pyarrow.float64(),
     dict[str, float]: pyarrow.map_(pyarrow.string(), pyarrow.float64()),
 }
-"By the type of a figure, that of its column."
+"By the type of a figure, the type of its column."
 
 
 def write_parquet(summaries: dict[str, Summary], url: str) -> None:
-    """One row of a recording, `file` and the fields of `Summary`. Raises OSError."""
+    """Write one row for each recording, `file` and the fields of `Summary`, as Parquet to `url`. Raises OSError."""
     fields = msgspec.structs.fields(Summary)
     columns = [("file", pyarrow.string()), *((field.name, KINDS[field.type]) for field in fields)]
     rows = [{"file": name, **msgspec.structs.asdict(each)} for name, each in summaries.items()]
@@ -49,6 +49,7 @@ def write_parquet(summaries: dict[str, Summary], url: str) -> None:
 
 
 def _cells(console: Console) -> tuple[str, ...]:
+    """Return a console's cells under HEADINGS, for a person."""
     errors_N = (console.tracking_rms_N, console.worst_rms_N)
     held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= LEAST_SHARE][:MOST_LIMITS]
     faults = [f"{code} in {count}" for code, count in console.faults.items()]
@@ -66,6 +67,7 @@ def _cells(console: Console) -> tuple[str, ...]:
 
 
 def _shown(drift: Drift | None, form: str) -> str:
+    """Return the first and newest value, with the change per day where it is known; `unknown` for None."""
     if drift is None:
         return "unknown"
     first, newest = f"{drift.first:{form}}", f"{drift.newest:{form}}"
@@ -75,14 +77,18 @@ def _shown(drift: Drift | None, form: str) -> str:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab fleet`."""
+    """Add the options of `tormag-lab fleet`."""
     parser.add_argument("recordings", metavar="FOLDER|URL", help="where they are, in folders of their own or not")
     parser.add_argument("--out", metavar="FILE|URL", help="Parquet: one row of a recording")
     executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[lab], and to reach the recordings")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The consoles; exit code 1 where a file was left out, 2 where --out failed. Raises LabError, OSError."""
+    """Return the consoles of all recordings; exit code 1 where a file was left out, 2 where --out failed.
+
+    Says on stderr what was left out and why. Raises LabError where there are no recordings, OSError where they cannot
+    be reached.
+    """
     try:
         urls = files(options.recordings)
     except (ValueError, ImportError) as error:
@@ -97,7 +103,7 @@ def run(options: argparse.Namespace) -> Found:
     try:
         if options.out is not None:
             write_parquet(summaries, options.out)
-    except OSError as error:  # what was found is told all the same
+    except OSError as error:  # the consoles are told all the same
         write_line(f"tormag-lab fleet: {printable(str(error))}", sys.stderr)
         exit_code = 2
     found = consoles(summaries.values())

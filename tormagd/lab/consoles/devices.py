@@ -10,12 +10,14 @@ from tormagd.lab.consoles.summary import Summary
 
 DAY_S = 86_400.0
 LEAST_DAYS, LEAST_RECORDINGS = 1.0, 3
-"No drift for each day is told of less."
+"Fewest days and recordings of which a drift per day is told."
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """A quantity of a device in the first and the newest recording that has it, and its change by a straight line
-    through all of them; null where they are too few, or of one day."""
+    """A quantity of a device in its first and newest recording, and its change per day by a straight line through all.
+
+    `per_day` is null where the recordings are too few or of one day.
+    """
 
     first: float
     newest: float
@@ -23,7 +25,7 @@ class Drift(msgspec.Struct, frozen=True):
 
 
 class Console(msgspec.Struct, frozen=True, kw_only=True):
-    """All recordings of one device with one insert. Errors are of all the time ENABLED, and of the worst recording."""
+    """All recordings of one device with one insert. Errors are over all time ENABLED, and of the worst recording."""
 
     serial_number: int | None
     insert: str
@@ -41,7 +43,7 @@ class Console(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def consoles(summaries: Iterable[Summary]) -> list[Console]:
-    """One for each device and insert, in the order of both."""
+    """Return one console for each device and insert, sorted by both; unknown devices count as one and come first."""
     groups: dict[tuple[int, str], list[Summary]] = defaultdict(list)
     for each in summaries:
         groups[-1 if each.serial_number is None else each.serial_number, each.insert].append(each)
@@ -49,6 +51,7 @@ def consoles(summaries: Iterable[Summary]) -> list[Console]:
 
 
 def _console(group: list[Summary]) -> Console:
+    """Return the console of a group of recordings in order of time."""
     enabled_s = sum(each.enabled_s for each in group)
     errors = [(each.enabled_s, each.tracking_rms_N) for each in group if each.tracking_rms_N is not None]
     limits_s: Counter[str] = Counter()
@@ -70,7 +73,7 @@ def _console(group: list[Summary]) -> Console:
 
 
 def _pooled(errors: list[tuple[float, float]]) -> float | None:
-    """The RMS over all of the time, from that of each part of it."""
+    """Return the RMS over all parts from (duration, RMS) of each; None without parts."""
     if not errors:
         return None
     weights, rms_N = np.array(errors).T
@@ -78,6 +81,7 @@ def _pooled(errors: list[tuple[float, float]]) -> float | None:
 
 
 def _drift(values: list[tuple[float, float | None]]) -> Drift | None:
+    """Return the drift of (start, value) pairs in order of time, ignoring None; None where no value is known."""
     known = [(start_s, value) for start_s, value in values if value is not None]
     if not known:
         return None

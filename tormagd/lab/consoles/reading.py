@@ -1,4 +1,4 @@
-"""Where recordings are, in a folder or a bucket, and what each of them says: read by workers, wherever those are."""
+"""Finding recordings in a folder or bucket, and reading a summary of each, by workers anywhere."""
 
 from concurrent.futures import Executor
 
@@ -12,10 +12,10 @@ SUFFIX = ".mcap"
 
 
 def files(url: str) -> dict[str, str]:
-    """The full address of every recording in a folder or under a URL, by its name there; or of one file.
+    """Return the full address of every recording in a folder or under a URL, by its name there; or of one file.
 
-    Raises OSError where it cannot be looked into, ValueError for a kind of URL that nobody knows, and ImportError for
-    one that a package is missing for.
+    Raises OSError where the place cannot be read, ValueError for an unknown kind of URL, and ImportError for one whose
+    package is missing.
     """
     system, root = fsspec.core.url_to_fs(url)
     if not system.exists(root):
@@ -26,7 +26,7 @@ def files(url: str) -> dict[str, str]:
 
 
 def read(url: str) -> Summary | str:
-    """One recording's summary, or why there is none."""
+    """Read one recording and return its summary, or the reason why there is none."""
     name = url.rpartition("/")[2]
     try:
         system, path = fsspec.core.url_to_fs(url)
@@ -39,7 +39,10 @@ def read(url: str) -> Summary | str:
 
 
 def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summary], dict[str, str]]:
-    """Every file's summary, in their order, and why a file has none."""
+    """Read all recordings by `executor`; return summaries by name, and reasons by name for files without one.
+
+    The order is that of `urls`. A failed worker makes a reason, not an error.
+    """
     found: dict[str, Summary | str] = {}
     for url, future in finished(executor, read, urls.values(), "recording"):
         error = future.exception()

@@ -24,15 +24,15 @@ FIELDS = (
     "left_current_A",
     "right_current_A",
 )
-"The fields of a recording's messages that a summary takes."
+"Fields of a recording's messages that a summary needs."
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """Of one recording; what was not recorded is null, or an empty text.
+    """Figures of one recording; what was not recorded is null, or an empty text.
 
-    `trim` is the device's force over its model's, `current_A` the RMS of the motor that needed more, `clock_drift_ppm`
-    by how much the device's clock runs fast: each over the time ENABLED, as is `tracking_rms_N`, which has the sensor's
-    noise and the approach in it. Of a trim, a clock and a temperature it is the median.
+    `trim` is the device's force over its model's, `current_A` the RMS of the motor that needed more. `clock_drift_ppm`
+    is how much the device's clock runs fast. These and `tracking_rms_N`, with the sensor's noise and the approach in
+    it, are over the time ENABLED. Trim, clock and temperature are medians.
     """
 
     serial_number: int | None
@@ -40,16 +40,16 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     scene: str
     version: str
     start_s: float
-    "Of its first message, since 1970."
+    "Time of the first message, since 1970."
     duration_s: float
     enabled_s: float
     is_complete: bool
     tracking_rms_N: float | None
     late_p99_us: float | None
     limits_s: dict[str, float]
-    "For how long each limit was there."
+    "How long each limit acted."
     faults_at_s: dict[str, float]
-    "When each fault came, since the start."
+    "When each fault first came, since the start."
     trim: float | None
     clock_drift_ppm: float | None
     temperature_C: float | None
@@ -57,7 +57,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(recording: Recording) -> Summary:
-    """Raises ValueError for a recording without messages."""
+    """Return the summary of a recording. Raises ValueError for one without messages."""
     begin_ns = start_ns(recording)
     scene = recording.described("scene", dict[str, Any]) or {}
     insert = scene.get("insert", {})
@@ -85,7 +85,7 @@ def summarise(recording: Recording) -> Summary:
 
 
 def _enabled(recording: Recording, name: str, figure: Callable[[Floats], Any]) -> float | None:
-    """A figure of what is known of the quantity `name` while ENABLED; None where nothing is."""
+    """Return a figure of all finite values of the quantity `name` while ENABLED; None where there are none."""
     known = series(recording, name)
     if known is None:
         return None

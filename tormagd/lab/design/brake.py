@@ -10,15 +10,15 @@ from tormagd.physics.field import FieldLaw, PowerFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
 
 CLOSED_MM, OPEN_MM = 45.0, 95.0
-"The gaps of the thesis's device."
+"End positions of the thesis's device."
 
 
 @dataclass(frozen=True, slots=True)
 class Brake:
     """An elastomer in a geometry between magnets whose gap goes from `closed_mm` to `open_mm`.
 
-    Raises `DomainError` unless both gaps lie in the field law's range, closed below open, and the elastomer bears the
-    field of the closed gap (lambda1 >= 0.05).
+    Raises `DomainError` unless both gaps lie in the field law's range, closed below open. It also does where the
+    elastomer does not bear the field of the closed gap (lambda1 >= 0.05).
     """
 
     field: FieldLaw
@@ -37,12 +37,12 @@ class Brake:
 
     @classmethod
     def as_built(cls, elastomer: Elastomer, field: FieldLaw | None = None) -> "Brake":
-        """The thesis's device with this elastomer, by the power law of the field or another."""
+        """Return the thesis's device with this elastomer, and the power law of the field unless `field` is given."""
         return cls(field or PowerFieldLaw(), elastomer, TORMAG, CLOSED_MM, OPEN_MM)
 
     @property
     def range_N(self) -> float:
-        """The most less the least force."""
+        """Greatest less least force."""
         return self.most_N - self.least_N
 
     @property
@@ -56,15 +56,17 @@ class Brake:
         return self.force_N(self.closed_mm)
 
     def force_N(self, gap_mm: Real) -> Real:
-        """Brake force at a gap; falls with it."""
+        """Return the brake force at a gap; it falls as the gap opens. Raises `DomainError` outside the field law's
+        range."""
         return brake_force_N(self.field.radial_moment_Tm(gap_mm), self.elastomer, self.geometry)
 
     def slope_N_mm(self, gap_mm: Real) -> Real:
-        """|dF/dgap|, N per mm of gap (the bracket of Eq. 36)."""
+        """Return |dF/dgap|, N per mm of gap (the bracket of Eq. 36)."""
         return abs(d_force_d_gap(gap_mm, self.field, self.elastomer, self.geometry))
 
     def gap_mm(self, force_N: Real) -> Real:
-        """The gap, within the end positions, that gives the force; `DomainError` for a force no gap gives."""
+        """Return the gap, within the end positions, that gives `force_N`. Raises `DomainError` for a force that no gap
+        gives."""
         require("force_N", force_N, self.least_N, self.most_N)
         moment_Tm = radial_moment_for_force_Tm(force_N, self.elastomer, self.geometry)
         # the forces of the end positions must come back as those, not as a rounding beyond them

@@ -18,7 +18,7 @@ from tormagd.lab.main import Found
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab optimise-design`."""
+    """Add the options of `tormag-lab optimise-design`."""
     parser.add_argument(
         "--region",
         required=True,
@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The optima, best first. Raises DomainError, OSError."""
+    """Return the optima of all starts, best first. Raises DomainError, OSError."""
     with executors.chosen(options) as executor:
         outcomes = sweep(_runs(options), executor)
     by_cost = options.measure == "corners"
@@ -52,6 +52,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _runs(options: argparse.Namespace) -> list[Run]:
+    """Return one run from each random start, drawn by the seed."""
     problem = Problem(Region(*options.region), options.measure, options.gap_speed)
     low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
     drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))

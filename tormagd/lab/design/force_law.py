@@ -1,4 +1,4 @@
-"""What design, the thesis and its numbers ask of the force law besides: the stretch, the slopes, and its inverse.
+"""The force law's stretch, slopes and inverse, for design and for the thesis's numbers.
 
 Every function takes a float or an array and raises `DomainError`, as in `tormagd.physics.force`.
 """
@@ -17,14 +17,14 @@ _NEWTON_STEPS = 100
 
 
 def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29)."""
+    """Return the radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29)."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return -law.curve.compression(law.load(radial_moment_Tm))
 
 
 def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Slope of the force over the radial moment, N / (T m), >= 0."""
+    """Return the slope of the force over the radial moment, N / (T m), >= 0."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     load = law.load(radial_moment_Tm)
@@ -33,12 +33,12 @@ def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geo
 
 
 def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
+    """Return the slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
     return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
 
 
 def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Radial moment that gives the force, T m: inverse of `brake_force_N`.
+    """Return the radial moment that gives the force, T m: inverse of `brake_force_N`.
 
     Raises `DomainError` unless 0 <= force_N <= the force at `max_radial_moment_Tm`.
     """
@@ -51,7 +51,7 @@ def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Ge
 
 
 def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
-    """d phi / d y; every term is positive."""
+    """Return d phi / d y, the slope of the reduced force over the load; every term is positive."""
     stretch, w = 1.0 - compression, curve.wall
     # d phi / d eps at constant load, then d phi / d y at constant stretch
     elastic, magnetic = 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + w) * load / stretch**4
@@ -59,10 +59,10 @@ def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
 
 
 def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
-    """eps at which phi(eps) is `force`, for 0 <= force <= phi(0.95): inverse of the curve along eps.
+    """Return the eps at which phi(eps) is `force`, for 0 <= force <= phi(0.95): inverse of the curve along eps.
 
-    Newton's method on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside
-    a shrinking bracket. It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
+    Newton's method on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside a
+    shrinking bracket. It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
     """
     fn = functions(force)
     rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)
@@ -92,5 +92,5 @@ def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
 
 
 def _compression_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
-    """d eps / d y = (B + A eps) / r, with r = p + eps."""
+    """Return d eps / d y = (B + A eps) / r, with r = p + eps."""
     return (curve.b + curve.a * compression) / (1.0 - curve.a * load + compression)

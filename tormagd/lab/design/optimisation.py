@@ -1,9 +1,9 @@
 """Structural optimisation (Eq. 39-42, table 3.2): outer radius, thickness and open gap for the portrait of a task.
 
 Two questions can be asked of a design. The thesis's cost (Eq. 39) adds the squared distances of the portrait's four
-corners from those of the task; it mixes newtons with newtons per second, and a portrait larger than the task costs as
-much as a smaller one. Ours is coverage of the required region, and among designs that cover as much, the least volume
-of elastomer, then the smallest open gap: `SLACK` is the coverage that may be given up for it.
+corners from those of the task. It mixes newtons with newtons per second, and a portrait larger than the task costs as
+much as a smaller one. Ours is coverage of the required region. Among designs that cover as much, it takes the least
+volume of elastomer, then the smallest open gap. `SLACK` is the coverage that may be given up for that.
 
 Two solvers, both scipy's. "local" follows the slopes from the start (SLSQP), as the thesis's fmincon did, and ends in
 whatever minimum that start leads to. "global" is differential evolution, with the start as one member of its first
@@ -36,12 +36,12 @@ Solver: TypeAlias = Literal["local", "global"]
 SLACK = 1e-4
 """Coverage that a smaller elastomer may cost: a hundredth of a percent."""
 _GAP_WEIGHT = 1e-4
-"""Of the open gap beside the volume: decides only between volumes that are as good as equal."""
+"""Weight of the open gap beside the volume: it decides only between volumes that are as good as equal."""
 _GENERATIONS = 50
 
 
 class Design(msgspec.Struct, frozen=True):
-    """What is sought, mm: outer radius R_o, thickness t and open gap s_max."""
+    """A design in mm: outer radius R_o, thickness t and open gap s_max."""
 
     outer_radius_mm: float
     thickness_mm: float
@@ -49,7 +49,7 @@ class Design(msgspec.Struct, frozen=True):
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """A task's region, the measure of success, and all that is given; the defaults are the thesis's (appendix B)."""
+    """A task's region, the measure of success, and everything that is given; defaults are the thesis's (appendix B)."""
 
     region: Region
     measure: Measure
@@ -64,7 +64,7 @@ class Problem(msgspec.Struct, frozen=True):
     friction_coefficient: float = 0.2
 
     def geometry(self, design: Design) -> Geometry:
-        """The design's geometry."""
+        """Return the geometry of a design."""
         return Geometry(
             inner_radius_m=1e-3 * self.inner_radius_mm,
             outer_radius_m=1e-3 * design.outer_radius_mm,
@@ -78,22 +78,24 @@ class Problem(msgspec.Struct, frozen=True):
         return Elastomer(self.shear_modulus_Pa, self.relative_permeability, self.friction_coefficient)
 
     def portrait(self, design: Design) -> PhasePortrait:
-        """The design's phase portrait; `DomainError` for a design that no brake can have."""
+        """Return the phase portrait of a design. Raises `DomainError` for a design that no brake can have."""
         brake = Brake(PowerFieldLaw(), self.elastomer, self.geometry(design), self.closed_mm, design.open_mm)
         return PhasePortrait(brake, self.gap_speed_mm_s)
 
     def load_margin(self, design: Design) -> float:
-        """1 - field of the closed gap over the largest the elastomer bears; admissible where not negative."""
+        """Return 1 - field of the closed gap over the largest that the elastomer bears; admissible where not
+        negative."""
         moment_Tm = PowerFieldLaw().radial_moment_Tm(self.closed_mm)
         return 1.0 - moment_Tm / max_radial_moment_Tm(self.elastomer, self.geometry(design))
 
     def volume_mm3(self, design: Design) -> float:
-        """Elastomer in the design."""
+        """Return the volume of elastomer in a design."""
         return math.pi * (design.outer_radius_mm**2 - self.inner_radius_mm**2) * design.thickness_mm
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a solver found. `coverage` is by the true boundary where that was the measure, else by the trapezoid."""
+    """Design that a solver found. `coverage` is by the true boundary where that was the measure, else by the
+    trapezoid."""
 
     design: Design
     coverage: float
@@ -105,7 +107,8 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class Run(msgspec.Struct, frozen=True):
-    """One start of one solver on one problem: all that its outcome depends on."""
+    """One start of one solver on one problem: all that its outcome depends on. `DomainError` for a seed outside
+    0..2^31."""
 
     problem: Problem
     start: Design
@@ -117,7 +120,8 @@ class Run(msgspec.Struct, frozen=True):
 
 
 def coverage(problem: Problem, design: Design) -> float:
-    """Share of the problem's region that the design covers, 0..1; `DomainError` for an impossible design."""
+    """Return the share of the problem's region that the design covers, 0..1. Raises `DomainError` for an impossible
+    design."""
     portrait = problem.portrait(design)
     if problem.measure == "true":
         return portrait.true_coverage(problem.region)
@@ -125,8 +129,10 @@ def coverage(problem: Problem, design: Design) -> float:
 
 
 def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
-    """The least coverage where every dimension may be off by `share`, down, not at all, or up; 0 where one of these
-    designs does not bear its field."""
+    """Return the least coverage where each dimension may be off by `share`, down, not at all, or up.
+
+    0 where one of these designs does not bear its field.
+    """
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
     made = [
         Design(*(value * factor for value, factor in zip(msgspec.structs.astuple(design), each, strict=True)))
@@ -136,7 +142,7 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
 
 
 def corner_cost(problem: Problem, design: Design) -> float:
-    """The thesis's cost, Eq. 39: sum of the squared corner distances, N and N/s taken as equal."""
+    """Return the thesis's cost, Eq. 39: sum of the squared corner distances, N and N/s taken as equal."""
     offered, wanted = problem.portrait(design).trapezoid(), problem.region
     # the lower corners mirror the upper ones
     return 2.0 * (
@@ -148,7 +154,7 @@ def corner_cost(problem: Problem, design: Design) -> float:
 
 
 def solve(run: Run) -> Outcome:
-    """The design that the run's solver finds from its start; the same run gives the same design anywhere.
+    """Return the design that the run's solver finds from its start; the same run gives the same design anywhere.
 
     Raises `DomainError` where the solver finds no design whose elastomer bears the field.
     """
@@ -173,7 +179,7 @@ def solve(run: Run) -> Outcome:
 
 
 class _Search:
-    """A problem in coordinates that run from 0 to 1 between the bounds, as the solvers want it."""
+    """A problem in coordinates from 0 to 1 between the bounds, as the solvers need; counts its evaluations."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -191,20 +197,21 @@ class _Search:
         return Design(*(float(value) for value in self._low + self._span * np.clip(x, 0.0, 1.0)))
 
     def miss(self, x: Array) -> float:
-        """Share of the region not covered; all of it where the elastomer would not bear the field."""
+        """Return the share of the region that is not covered; 1 where the elastomer would not bear the field."""
         return 1.0 - self._at(coverage, x, 0.0)
 
     def corner_cost(self, x: Array) -> float:
         return self._at(corner_cost, x, math.inf)
 
     def size(self, x: Array) -> float:
-        """Elastomer over the most that the bounds allow, and a trace of the open gap."""
+        """Return the volume of elastomer over that of the upper bounds, and a trace of the open gap."""
         volume = self.problem.volume_mm3(self.design(x)) / self.problem.volume_mm3(self.problem.upper)
         return volume + _GAP_WEIGHT * float(x[2])
 
     def global_minimum(
         self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
     ) -> Array:
+        """Return the minimum by differential evolution from `start`, refined; `also` are further constraints."""
         limits = [*also, self._margin]
         result = differential_evolution(
             cost,
@@ -221,23 +228,26 @@ class _Search:
         return self._refine(cost, np.asarray(result.x), limits)
 
     def local_minimum(self, cost: Callable[[Array], float], start: Array) -> Array:
+        """Return the minimum that SLSQP reaches from `start`, or `start` where that is as good."""
         margin = {"type": "ineq", "fun": self._margin.fun}
         result = minimize(cost, start, method="SLSQP", bounds=self._bounds, constraints=[margin])
         return _better(cost, start, result)
 
     def smallest(self, best: Array, seed: int) -> Array:
-        """The smallest among the designs that cover as much as `best`, less the slack."""
+        """Return the smallest design that covers as much as `best`, less SLACK; `best` where none is found."""
         allowed = self.miss(best) + SLACK
         found = self.global_minimum(self.size, best, seed, NonlinearConstraint(self.miss, -np.inf, allowed))
         return found if self.miss(found) <= allowed else best
 
     def _refine(self, cost: Callable[[Array], float], start: Array, limits: list[Any]) -> Array:
+        """Return the result of COBYQA from `start`, or `start` where it is no better or breaks a limit."""
         options = {"initial_tr_radius": 0.05, "final_tr_radius": 1e-5, "maxfev": 100}
         result = minimize(cost, start, method="COBYQA", bounds=self._bounds, constraints=limits, options=options)
         is_kept = all(limit.lb <= limit.fun(result.x) <= limit.ub for limit in limits)
         return _better(cost, start, result) if is_kept else start
 
     def _at(self, function: Callable[[Problem, Design], float], x: Array, impossible: float) -> float:
+        """Return and count a function of the design; `impossible` where the elastomer would not bear the field."""
         self.evaluations += 1
         design = self.design(x)
         return function(self.problem, design) if self.problem.load_margin(design) >= 0.0 else impossible

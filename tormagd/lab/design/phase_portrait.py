@@ -1,8 +1,8 @@
 """The phase portrait: which (force, force rate) points a brake renders at a gap speed, and how much of a task that is.
 
 At the gap g the brake gives F(g) and |dF/dt| <= |dF/dg| * gap speed (Eq. 36). That is the *true* boundary. The thesis
-joins the two end points by straight lines, a *trapezoid*; F falls about as gap^-2.6, so the true boundary lies below
-that line in between. Both are kept: the trapezoid to compare with the thesis, the true one to decide with.
+joins the two end points by straight lines, a *trapezoid*. F falls about as gap^-2.6, so the true boundary lies below
+the straight line in between. Both are kept: the trapezoid to compare with the thesis, the true one to decide with.
 
 Coverage of a region is a ratio of areas, exact for the trapezoid and a one-dimensional integral over the gap for the
 true boundary. Coverage of a point cloud is a share of its points.
@@ -22,11 +22,11 @@ MAX_FORCE_N = 1e6
 MAX_RATE_N_S = 1e9
 MAX_GAP_SPEED_MM_S = 1e4
 _PANELS = 256
-"""Of the integral: the area of a region's coverage is then good to 1e-5 (see the tests)."""
+"""Panels of the integral: a region's coverage is then good to 1e-5 (see the tests)."""
 
 
 class Region(msgspec.Struct, frozen=True):
-    """What a task requires: |dF/dt| up to a rate that rises or falls linearly from the least to the most force.
+    """Task's requirement: |dF/dt| up to a rate that is linear in the force, from the least to the greatest force.
 
     Raises `DomainError` unless 0 <= least_N < most_N, both rates are finite and not negative, and not both are zero.
     """
@@ -50,7 +50,7 @@ class Region(msgspec.Struct, frozen=True):
         return 0.5 * (self.least_rate_N_s + self.most_rate_N_s) * (self.most_N - self.least_N)
 
     def rate_N_s(self, force_N: FloatArray) -> FloatArray:
-        """The rate required at a force inside the region."""
+        """Return the rate that is required at a force inside the region."""
         share = (force_N - self.least_N) / (self.most_N - self.least_N)
         return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
 
@@ -72,7 +72,10 @@ class CloudCoverage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PhasePortrait:
-    """A brake whose gap moves at up to `gap_speed_mm_s`; `DomainError` unless that is above 0 and up to 10 m/s."""
+    """Phase portrait of a brake whose gap moves at up to `gap_speed_mm_s`.
+
+    Raises `DomainError` unless the speed is above 0 and up to 10 m/s.
+    """
 
     brake: Brake
     gap_speed_mm_s: float
@@ -81,14 +84,14 @@ class PhasePortrait:
         require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
 
     def outline(self, points: int = 201) -> tuple[FloatArray, FloatArray]:
-        """The true boundary's upper half: (force_N, rate_N_s), both of `points` elements, force falling."""
+        """Return the true boundary's upper half: (force_N, rate_N_s), both of `points` elements, force falling."""
         gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, points)
         # a geometric series may end a rounding beyond its ends
         gap_mm = np.clip(gap_mm, self.brake.closed_mm, self.brake.open_mm)
         return self.brake.force_N(gap_mm), self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)
 
     def trapezoid(self) -> Region:
-        """The thesis's portrait: the end points of the true boundary, joined by a straight line."""
+        """Return the thesis's portrait: the end points of the true boundary, joined by a straight line."""
         speed, brake = self.gap_speed_mm_s, self.brake
         return Region(
             brake.least_N,
@@ -98,7 +101,7 @@ class PhasePortrait:
         )
 
     def true_coverage(self, region: Region) -> float:
-        """Share of the region's area inside the true boundary, 0..1."""
+        """Return the share of the region's area inside the true boundary, 0..1, by an integral over the gap."""
         brake = self.brake
         least, most = brake.least_N, brake.most_N
         low, high = max(region.least_N, least), min(region.most_N, most)
@@ -117,7 +120,7 @@ class PhasePortrait:
         return min(area / region.half_area, 1.0)
 
     def trapezoid_coverage(self, region: Region) -> float:
-        """Share of the region's area inside the thesis's trapezoid, 0..1; exact."""
+        """Return the share of the region's area inside the thesis's trapezoid, 0..1; exact."""
         offered = self.trapezoid()
         low, high = max(region.least_N, offered.least_N), min(region.most_N, offered.most_N)
         if low >= high:
@@ -130,17 +133,18 @@ class PhasePortrait:
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """The points of a task against the true boundary."""
+        """Judge points of a task, force and force rate (n), by the true boundary."""
         inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
         limit = np.zeros_like(force_N)
         limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
         return self._judge(force_N, rate_N_s, limit)
 
     def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """The points of a task against the thesis's trapezoid."""
+        """Judge points of a task, force and force rate (n), by the thesis's trapezoid."""
         return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
 
     def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:
+        """Judge points by the brake's forces, and by the greatest rate at each point's force."""
         below, above = force_N < self.brake.least_N, force_N > self.brake.most_N
         fast = ~below & ~above & (np.abs(rate_N_s) > limit_N_s)
         return CloudCoverage(~(below | above | fast), below, above, fast)

@@ -1,8 +1,8 @@
 """Table 2.4: friction fitted to the measured force ranges of the inserts, and how far the force law then errs.
 
 Compared are *ranges*, F(45 mm) - F(95 mm): the table gives no single forces. The law's range is proportional to the
-friction coefficient, so the coefficient of a matrix that gives the least mean relative error over its inserts is a
-weighted median, found exactly; a least-squares fit answers another question.
+friction coefficient. So the coefficient of a matrix with the least mean relative error over its inserts is a weighted
+median, found exactly. A least-squares fit answers another question.
 
 The one further parameter is the exponent n of the field's growth with permeability, b ~ (mu_r / 4)^n, 1 in the thesis.
 """
@@ -22,23 +22,23 @@ _GRID = 61
 
 
 class RangeFit(NamedTuple):
-    """Friction coefficient by the matrix's Shore 00 hardness, and the permeability exponent it goes with."""
+    """Fitted friction coefficient by the matrix's Shore 00 hardness, with its permeability exponent."""
 
     field: FieldLaw
     friction: Mapping[int, float]
     exponent: float
 
     def range_N(self, insert: Insert) -> float:
-        """The force range this fit gives an insert, N."""
+        """Return the force range of an insert by this fit, N. Raises KeyError for a matrix that was not fitted."""
         return self.friction[insert.shore_hardness] * frictionless_range_N(insert, self.field, self.exponent)
 
     def relative_error(self, insert: Insert) -> float:
-        """|range / measured range - 1|."""
+        """Return |range / measured range - 1| of an insert."""
         return abs(self.range_N(insert) / insert.force_range.measured_N - 1.0)
 
 
 def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0) -> float:
-    """F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N."""
+    """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N."""
     mu_r = relative_permeability(insert.cip_fraction)
     elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
     # the force law takes b ~ (mu_r / 4) a: another exponent is another moment
@@ -48,7 +48,7 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
 
 
 def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
-    """The friction per matrix with the least mean relative error."""
+    """Fit the friction of each matrix for the least mean relative error of range."""
     ratios: dict[int, list[float]] = {}
     for item in inserts:
         ratio = frictionless_range_N(item, field, exponent) / item.force_range.measured_N
@@ -57,7 +57,7 @@ def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1
 
 
 def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
-    """As `fit_friction`, with the exponent free, to 1e-4 in the exponent.
+    """Fit the friction of each matrix and the permeability exponent, the latter to 1e-4.
 
     The mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point.
     """
@@ -73,12 +73,12 @@ def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
 
 
 def mean_relative_error(fit: RangeFit, inserts: Sequence[Insert]) -> float:
-    """Mean over the inserts of `RangeFit.relative_error`."""
+    """Return the mean over the inserts of `RangeFit.relative_error`."""
     return float(np.mean([fit.relative_error(item) for item in inserts]))
 
 
 def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
-    """Relative error of each insert under the fit to all the others, by name."""
+    """Return each insert's relative error under the fit to all the others, by name."""
     fit = fit_exponent if free_exponent else fit_friction
     return {
         left_out.name: fit([item for item in inserts if item is not left_out], field).relative_error(left_out)
@@ -87,6 +87,8 @@ def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: 
 
 
 def _friction(ratios: list[float]) -> float:
+    """Return the coefficient with the least mean relative error, from each insert's frictionless over measured
+    range."""
     # the minimum of sum |mu r - 1| = sum r |mu - 1/r| is the median of 1/r, weighted by r
     ordered = sorted(ratios, reverse=True)
     reached = np.cumsum(ordered)

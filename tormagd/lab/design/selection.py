@@ -14,7 +14,7 @@ _POINTS = 201
 
 @dataclass(frozen=True, slots=True)
 class ForceTask:
-    """What a task asks of a brake: forces from `least_N` to `most_N`, in steps of `resolution_N`."""
+    """Task's demand on a brake: forces from `least_N` to `most_N`, in steps of `resolution_N`."""
 
     name: str
     least_N: float
@@ -24,7 +24,7 @@ class ForceTask:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One insert before one task. `reasons` says why it is out; empty means that it serves."""
+    """Whether one insert serves one task. `reasons` says why it does not; empty means that it does."""
 
     insert: str
     least_N: float
@@ -34,15 +34,15 @@ class Verdict:
     served_share: float
     """Share of the task's force range between the insert's least and most force."""
     sufficient_gap_mm: float
-    """Gap at which the least force is low enough; NaN where the field law says nothing of such a gap."""
+    """Gap at which the force is as low as the task's least; NaN beyond the field law's range."""
     reasons: tuple[str, ...]
 
 
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
-    """One insert before a task, where the gap is placed in steps of `gap_resolution_mm`.
+    """Judge one insert for a task, where the gap is placed in steps of `gap_resolution_mm`.
 
-    A passive brake never reaches 0 N. It serves a least force that it misses by no more than the task's resolution:
-    the task could not tell the difference.
+    A passive brake never reaches 0 N. A least force that is missed by no more than the task's resolution counts as
+    reached: the task could not tell the difference.
     """
     least, most = brake.least_N, brake.most_N
     low, high = max(least, task.least_N), min(most, task.most_N)
@@ -65,12 +65,15 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
 
 
 def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
-    """All inserts, best first: those that serve by the finest resolution, then the others by the share they serve."""
+    """Judge all inserts and return them best first: those that serve by resolution, the others by the share they
+    serve."""
     verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
     return sorted(verdicts, key=lambda v: (bool(v.reasons), -v.served_share if v.reasons else 0.0, v.resolution_N))
 
 
 def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:
+    """Return the open gap, or where that is too strong, the wider gap that is weak enough; NaN beyond the field law's
+    range."""
     tolerated_N = task.least_N + task.resolution_N
     if tolerated_N >= brake.least_N:
         return brake.open_mm

@@ -11,9 +11,9 @@ from tormagd.lab.executors import finished
 
 
 def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
-    """The outcome of every run, in the order of the runs; a run that stands twice is solved once.
+    """Solve every run and return the outcomes in the order of the runs; equal runs are solved once.
 
-    Raises whatever a run raised; those that have not begun are then given up.
+    Raises whatever a run raised; runs that have not begun are then cancelled.
     """
     wanted = list(dict.fromkeys(runs))
     outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}

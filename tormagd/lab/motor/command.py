@@ -28,7 +28,7 @@ VAGUE_SHARE = 0.5
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab identify-motor`."""
+    """Add the options of `tormag-lab identify-motor`."""
     parser.add_argument("log", type=Path, help="motor log CSV, or DATA_EMPS.mat")
     parser.add_argument("--gain-N-V", type=float, dest="gain", help="force per volt, N/V; replaces a current")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="measured against simulated voltage")
@@ -37,7 +37,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The parameters. Raises LabError and ConfigError where the log or the configuration cannot be used."""
+    """Identify the motor and return its parameters; write the configuration and the plot where asked.
+
+    Raises LabError and ConfigError where the log or the configuration cannot be used.
+    """
     log = read_log(options.log)
     result = identify(log, options.gain if options.gain is not None else log.gain_N_V)
     if options.write_config:
@@ -48,9 +51,9 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
-    """A configuration file with the identified motor, for the gear ratio and lead of `config`.
+    """Write a new configuration file with the identified motor; gear ratio and lead are those of `config`.
 
-    Raises LabError where the log cannot fill it, the file exists, or a value is one that `tormagd` would refuse.
+    Raises LabError where the log cannot fill it, the file exists, or `tormagd` would refuse a value.
     """
     found = result["motor"]
     if found is None:
@@ -81,7 +84,7 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
 
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
-    """Measured against simulated voltage on the half that was not fitted."""
+    """Draw measured against predicted voltage on the half of the log that was not fitted, as a picture at `path`."""
     half = len(log.t_s) // 2
     fitted = fit_volts(log.part(slice(None, half)))
     time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))

@@ -1,4 +1,4 @@
-"""What a motor log says of motor and screw, with 95% intervals that own up to what the model leaves out.
+"""What a motor log says of motor and screw, with 95% intervals that include what the model leaves out.
 
 Three models, each linear, in the units of the carriage (m, N):
 
@@ -6,17 +6,17 @@ Three models, each linear, in the units of the carriage (m, N):
     windings   V(t - delay) = R i + L di/dt + K v
     gearbox    K i = mass a + viscous v + p(x) + sign(v) (q(x) + (1 - efficiency) |K i|)
 
-`volts` needs nothing but voltage and position. A current in the log gives the other two, and with them the gain, K / R,
-because the force for each ampere and the voltage for each m/s are one number. p and q are polynomials of the position:
-the magnets pull, and load what rubs, more where the gap is small. The gears lose a share of what they transmit.
+`volts` needs nothing but voltage and position. A current in the log gives the other two models, and with them the gain,
+K / R: the force for each ampere and the voltage for each m/s are one number. Polynomials p and q of the position say
+that the magnets pull, and load what rubs, more at a small gap. The gears lose a share of what they transmit.
 
-Position is low-passed without lag and differentiated centrally; both sides of an equation are filtered alike.
-Where the carriage stands, friction is whatever it has to be, so such rows are left out.
+Position is low-passed without lag and differentiated centrally; both sides of an equation are filtered alike. Where the
+carriage stands, friction is whatever it has to be, so such rows are left out.
 
 Intervals. The covariance is the sandwich over blocks of a second (Liang and Zeger 1986): residuals inside a block may
-hang together as they like. That covers noise, not a wrong model. So each model is fitted again in ways that should make
-no difference: with terms that it leaves out, with the rows about turns, with the current taken half a period earlier or
-later, with every second current only, in a wider band. Every parameter's interval grows by how far these move it, and
+be correlated in any way. That covers noise, not a wrong model. So each model is fitted again in ways that should make
+no difference: with terms that it leaves out, with the rows about turns, in a wider band. The current is taken half a
+period earlier or later, or only every second one. Every parameter's interval grows by how far these fits move it, and
 by how much new terms let it vary within the log.
 """
 
@@ -36,17 +36,17 @@ THINNED_HZ = 40.0
 SLOW_M_S = 1e-3
 "Slower than this the sign of the speed is noise, and friction may be static."
 MOSTLY, THROUGHOUT = 0.5, 0.98
-"Turns tell friction from drag where there is no current to tell them apart; where there is, they only blur it."
+"Shares of moving rows. Without a current, turns tell friction from drag; with one they only blur it."
 BLOCK_S = 1.0
 LEAST_BLOCKS = 8
 EDGE = 4
 "Rows at both ends that carry the filters' guesses."
 SPREAD = 2.0
-"Of a parameter over the log, in standard deviations: 95%."
+"Spread of a parameter over the log, in standard deviations of the position: 95%."
 LONGEST_DELAY_S = 0.02
 DELAY_TURNS = 4
 WIDER_HZ = 100.0
-"The other band of the comparison; 40 Hz is the first."
+"Rate of the wider band; THINNED_HZ is the usual one."
 SETTLING_TURNS = 60
 
 
@@ -57,12 +57,15 @@ class Estimate(NamedTuple):
     ci95: float
 
     def scaled(self, factor: float) -> "Estimate":
-        """Both in another unit."""
+        """Return value and half width times `factor`, as in another unit."""
         return Estimate(self.value * factor, self.ci95 * abs(factor))
 
 
 class Motion(NamedTuple):
-    """A log's motion at its own rate: position from its mean, m; speed; acceleration; sign of the speed, 0 at rest."""
+    """Motion of a log at its own rate: position from its mean, m; speed; acceleration; sign of the speed, 0 at rest.
+
+    `factor` is the number of rows for one thinned row.
+    """
 
     x: Array
     v: Array
@@ -71,7 +74,7 @@ class Motion(NamedTuple):
     factor: int
 
     def thin(self, column: Array) -> Array:
-        """The column as the equations see it: low-passed, thinned, without the ends."""
+        """Return a column as the equations use it: low-passed, thinned, without the ends."""
         thinned = decimate(column, self.factor, ftype="fir", zero_phase=True) if self.factor > 1 else column
         return np.asarray(thinned[EDGE:-EDGE])
 
@@ -86,11 +89,11 @@ class Fit(NamedTuple):
 
     @property
     def half_widths(self) -> Array:
-        """Of the values' 95% intervals."""
+        """Half widths of the values' 95% intervals."""
         return np.asarray(self.deviations * np.sqrt(np.diag(self.covariance)))
 
     def half_widths_of(self, function: Callable[[Array], Array]) -> Array:
-        """Of the 95% intervals of functions of the values, by their slopes."""
+        """Return the half widths of the 95% intervals of functions of the values, linearised."""
         steps = np.maximum(1e-3 * np.sqrt(np.diag(self.covariance)), np.finfo(np.float64).tiny)
         rises = [function(self.values + shift) - function(self.values - shift) for shift in np.diag(steps)]
         slopes = np.array(rises) / (2.0 * steps[:, None])
@@ -98,7 +101,7 @@ class Fit(NamedTuple):
 
 
 def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
-    """Speed and acceleration of the log. Raises LabError where it moves too little to show anything."""
+    """Return position, speed and acceleration of a log. Raises LabError where it moves too little to show anything."""
     smooth = _low_pass(log)
     position = smooth(log.position_m)
     speed = np.gradient(position, log.period_s)
@@ -111,23 +114,27 @@ def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
 
 
 def moving(seen: Motion, share: float) -> Array:
-    """Of the thinned rows, those that stand for motion by more than `share`."""
+    """Return a mask of the thinned rows during which the carriage moved for more than `share` of the time."""
     return np.asarray(seen.thin(np.abs(seen.sign)) > share)
 
 
 def _low_pass(log: Log) -> Callable[[Array], Array]:
+    """Return a filter of a log's columns at CUTOFF_HZ, without lag."""
     sections = butter(4, CUTOFF_HZ, fs=1.0 / log.period_s, output="sos")
     return lambda column: np.asarray(sosfiltfilt(sections, column))
 
 
 def block_numbers(seen: Motion, period_s: float) -> Array:
-    """The block of each thinned row."""
+    """Return the block of BLOCK_S that each thinned row is in."""
     rows = len(seen.thin(seen.v))
     return (np.arange(rows) * seen.factor * period_s / BLOCK_S).astype(np.int64)
 
 
 def linear(rows: Array, target: Array, blocks: Array) -> Fit:
-    """Least squares; `blocks` (n) numbers rows that may hang together. Raises LabError on too few, or a rank lost."""
+    """Fit `target` (n) by `rows` (n, k) in least squares; rows of one number in `blocks` (n) may be correlated.
+
+    Raises LabError for under LEAST_BLOCKS blocks or columns that depend on each other.
+    """
     scale = np.linalg.norm(rows, axis=0)
     if (
         len(np.unique(blocks)) < LEAST_BLOCKS
@@ -144,6 +151,7 @@ def linear(rows: Array, target: Array, blocks: Array) -> Fit:
 
 
 def _sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
+    """Return the covariance of the coefficients by the sandwich over blocks (Liang and Zeger 1986)."""
     labels, index = np.unique(blocks, return_inverse=True)
     scores = np.zeros((len(labels), jacobian.shape[1]))
     np.add.at(scores, index, jacobian * residual[:, None])
@@ -153,7 +161,7 @@ def _sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
 
 
 class Volts(NamedTuple):
-    """The model `volts`: coefficients in V for m/s2, m/s and as they are, delay in s, and the relative residual."""
+    """The fitted model `volts`: coefficients in V for m/s2, for m/s and for 1; delay in s; the relative residual."""
 
     mass: Estimate
     viscous: Estimate
@@ -163,13 +171,14 @@ class Volts(NamedTuple):
     relative_residual: float
 
     def voltage(self, log: Log) -> tuple[Array, Array]:
-        """The voltage that was applied and the one this model says the log's motion took; rows in motion only."""
+        """Return the applied voltage and the one that the model predicts for the log's motion, for rows in motion
+        only."""
         _, measured, predicted = self.over_time(log)
         known = np.isfinite(measured)
         return measured[known], predicted[known]
 
     def over_time(self, log: Log) -> tuple[Array, Array, Array]:
-        """Thinned times, s, measured and predicted voltage; NaN where the carriage stands."""
+        """Return thinned times, s, applied and predicted voltage; NaN where the carriage stands."""
         seen = motion(log)
         values = np.array([self.mass.value, self.viscous.value, self.coulomb.value, self.offset.value])
         measured, _ = _voltage(log, seen, self.delay.value)
@@ -179,17 +188,18 @@ class Volts(NamedTuple):
 
 
 def _volts_rows(seen: Motion) -> Array:
+    """Return the thinned columns of the model `volts`: acceleration, speed, sign, 1."""
     return np.column_stack([seen.thin(column) for column in (seen.a, seen.v, seen.sign, np.ones_like(seen.v))])
 
 
 def _voltage(log: Log, seen: Motion, delay_s: float) -> tuple[Array, Array]:
-    """The delayed voltage and its slope, thinned."""
+    """Return the delayed voltage and its slope, thinned."""
     volts = _low_pass(log)(np.interp(log.t_s - delay_s, log.t_s, log.input_V))
     return seen.thin(volts), seen.thin(np.gradient(volts, log.period_s))
 
 
 def fit_volts(log: Log) -> Volts:
-    """Gain, friction and delay from voltage and position alone. Raises LabError."""
+    """Fit mass, friction, offset and delay in volts from voltage and position alone. Raises LabError."""
     seen = motion(log)
     kept = moving(seen, MOSTLY)
     blocks = block_numbers(seen, log.period_s)[kept]
@@ -213,9 +223,10 @@ def fit_volts(log: Log) -> Volts:
 
 
 def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array) -> tuple[Fit, float]:
-    """A linear fit to the delayed voltage, and the delay: the slope's coefficient is what it is off (Gauss-Newton).
+    """Fit `rows` to the delayed voltage, and return the fit and the delay, which Gauss-Newton steps find.
 
-    The slope stays in the rows, as the last column, so that the others' intervals know of the delay's.
+    The voltage's slope is the last column of the fit, so that the others' intervals include the delay's. Raises
+    LabError for a delay over LONGEST_DELAY_S.
     """
     delay_s = 0.0
     for _ in range(DELAY_TURNS):
@@ -228,7 +239,7 @@ def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array)
 
 
 class Way(NamedTuple):
-    """One way to fit: with terms usually left out, with other rows, other currents, in another band."""
+    """One way to fit a model: with terms usually left out, with other rows, other currents, in another band."""
 
     is_full: bool = False
     moving_share: float = THROUGHOUT
@@ -244,11 +255,12 @@ OTHER_WAYS = (
     (Way(currents=slice(0, None, 2)), Way(currents=slice(1, None, 2))),
     (Way(thinned_Hz=WIDER_HZ),),
 )
-"Groups of ways; of each group the one that differs most counts."
+"Groups of ways; of each group the way that differs most counts."
 
 
 def _estimates(fit_in: Callable[[Way], tuple[Array, Array]]) -> list[Estimate]:
-    """`fit_in` gives values and half widths. The values of the plain way, and intervals that cover the other ways."""
+    """Return the values of the plain way, with intervals that cover the other ways; `fit_in` gives values and half
+    widths."""
     values, widths = fit_in(Way())
     widths = widths.copy()
     for group in OTHER_WAYS:
@@ -257,7 +269,7 @@ def _estimates(fit_in: Callable[[Way], tuple[Array, Array]]) -> list[Estimate]:
 
 
 class Windings(NamedTuple):
-    """The model `windings`: ohm, henry, V s/m, s."""
+    """The fitted model `windings`: ohm, henry, V s/m, s."""
 
     resistance: Estimate
     inductance: Estimate
@@ -266,7 +278,7 @@ class Windings(NamedTuple):
 
 
 def fit_windings(log: Log) -> Windings:
-    """Resistance, inductance, back-EMF and delay from voltage, current and position. Raises LabError."""
+    """Fit resistance, inductance, back-EMF and delay from voltage, current and position. Raises LabError."""
 
     def fit_in(way: Way) -> tuple[Array, Array]:
         seen = motion(log, way.thinned_Hz)
@@ -283,8 +295,11 @@ def fit_windings(log: Log) -> Windings:
 
 
 class Gearbox(NamedTuple):
-    """The model `gearbox`: kg, N s/m, the gears' efficiency, and in N, as means over where the log moved, half the
-    difference and half the sum of what slow opening and slow closing take."""
+    """The fitted model `gearbox`: kg, N s/m, the gears' efficiency, and two forces in N.
+
+    `coulomb` is half the difference, `offset` half the sum of the forces for slow opening and slow closing, as means
+    over where the log moved.
+    """
 
     mass: Estimate
     viscous: Estimate
@@ -294,7 +309,7 @@ class Gearbox(NamedTuple):
 
 
 def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
-    """Inertia, friction and gear losses from current and position. Raises LabError."""
+    """Fit inertia, friction and gear losses from current and position. Raises LabError, also without a current."""
 
     def fit_in(way: Way) -> tuple[Array, Array]:
         seen = motion(log, way.thinned_Hz)
@@ -324,6 +339,7 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
 
 
 def _current(log: Log, way: Way) -> Array:
+    """Return the log's current at its times, shifted and thinned as `way` says. Raises LabError without a current."""
     if log.current_A is None:
         raise LabError("current_A: needed to tell the motor's windings from its load")
     times = log.t_s + way.current_shift * log.period_s
@@ -331,7 +347,7 @@ def _current(log: Log, way: Way) -> Array:
 
 
 def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
-    """The motor's force that moves the carriage slowly in `direction` at positions `x`."""
+    """Return the motor's force that moves the carriage slowly in `direction`, 1 or -1, at positions `x`."""
     lost = float(values[2])
     idling = float(values[8]) if len(values) > 8 else 0.0
     load: Array = values[3] + values[4] * x + values[5] * x**2 + direction * (values[6] + values[7] * x)

@@ -1,4 +1,4 @@
-"""What a motor log says about its motor: the contract's object of `identify_motor`."""
+"""Identification of a motor from its log: the object that `tormag-lab identify-motor` prints."""
 
 import math
 from typing import Any
@@ -15,7 +15,11 @@ BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 
 
 def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
-    """The contract's object. Raises LabError where the log does not move enough to show anything."""
+    """Identify a motor and return parameters, ratios, residuals and notes as plain data.
+
+    With `gain_N_V` the parameters are scaled from volts; with None they come from the log's current, or are None
+    without one. Raises LabError for a gain that is not allowed, or a log that does not move enough to show anything.
+    """
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
     half = len(log.t_s) // 2
@@ -55,14 +59,14 @@ def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
 
 
 def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
-    """The contract's four parameters: the back-EMF brakes the carriage as drag of K^2 / R does."""
+    """Return mass, viscous friction, Coulomb friction and offset; viscous includes the back-EMF's drag, K^2 / R."""
     braking = _product((windings.back_emf, 2), (windings.resistance, -1))
     viscous = Estimate(braking.value + gearbox.viscous.value, braking.ci95 + gearbox.viscous.ci95)
     return gearbox.mass, viscous, gearbox.coulomb, gearbox.offset
 
 
 def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
-    """What a current shows besides: the motor as the carriage feels it, gain in N/V."""
+    """Return what only a current shows: the motor as the carriage feels it, gain in N/V."""
     return {
         "gain_N_V": _product((windings.back_emf, 1), (windings.resistance, -1)),
         "resistance_ohm": windings.resistance,
@@ -76,14 +80,14 @@ def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate
 
 
 def _time_constant(volts: Volts, motor: dict[str, Estimate] | None) -> Estimate:
-    """Of the speed after a voltage step: mass R / K^2, or mass over drag where only ratios are known."""
+    """Return the time constant of the speed after a voltage step: mass R / K^2, or mass over drag without a current."""
     if motor is None:
         return _product((volts.mass, 1), (volts.viscous, -1))
     return _product((motor["mass_kg"], 1), (motor["resistance_ohm"], 1), (motor["back_emf_V_s_m"], -2))
 
 
 def _product(*factors: tuple[Estimate, int]) -> Estimate:
-    """Of powers of estimates, whose errors have nothing to do with each other."""
+    """Return the product of powers of estimates with independent errors."""
     value = math.prod(estimate.value**power for estimate, power in factors)
     width = math.hypot(*(power * estimate.ci95 / estimate.value for estimate, power in factors))
     return Estimate(value, abs(value) * width)

@@ -1,4 +1,4 @@
-"""Reading a motor log: the CSV of the contract, or the EMPS benchmark's .mat file."""
+"""Reading a motor log: a CSV file of `tormagctl calibrate --motors`, or the EMPS benchmark's .mat file."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -19,8 +19,7 @@ LEAST_RATE_HZ = 400.0
 
 
 class Log(NamedTuple):
-    """A motor log: evenly spaced times, s; voltage, V; position, m; the gain where the file states one, N/V; and the
-    motor's current, A, where it was logged."""
+    """A motor log in even time steps: s, V, m. `gain_N_V` and `current_A` are None where the file has none."""
 
     t_s: Array
     input_V: Array
@@ -30,17 +29,20 @@ class Log(NamedTuple):
 
     @property
     def period_s(self) -> float:
-        """Time from row to row."""
+        """Time from row to row, the median, s."""
         return float(np.median(np.diff(self.t_s)))
 
     def part(self, rows: slice) -> "Log":
-        """Some of the rows."""
+        """Return the log of some rows."""
         current = None if self.current_A is None else self.current_A[rows]
         return Log(self.t_s[rows], self.input_V[rows], self.position_m[rows], self.gain_N_V, current)
 
 
 def read_log(path: Path) -> Log:
-    """The log in a CSV or EMPS .mat file. Raises LabError."""
+    """Read the log in a CSV or EMPS .mat file.
+
+    Raises LabError for an unreadable file, too few rows, values that are not finite, uneven times, or under 400 Hz.
+    """
     log = _read_mat(path) if path.suffix == ".mat" else _read_csv(path)
     if len(log.t_s) < LEAST_ROWS:
         raise LabError(f"{path}: {len(log.t_s)} rows: allowed are at least {LEAST_ROWS}")
@@ -60,6 +62,7 @@ def read_log(path: Path) -> Log:
 
 
 def _read_mat(path: Path) -> Log:
+    """Read an EMPS .mat file, with its gain. Raises LabError."""
     try:
         require_regular(path, MOST_TABLE_BYTES)
         data = loadmat(path)
@@ -76,6 +79,7 @@ def _read_mat(path: Path) -> Log:
 
 
 def _read_csv(path: Path) -> Log:
+    """Read a CSV file, with its current if it has one. Raises LabError."""
     named = read_columns(path, COLUMNS, (CURRENT_COLUMN,))
     t_s, input_V, position_mm = (named[name] for name in COLUMNS)
     return Log(t_s, input_V, position_mm * 1e-3, None, named.get(CURRENT_COLUMN))
