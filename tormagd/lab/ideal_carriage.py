@@ -376,10 +376,10 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
 def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
     """Return the gap over the steps with the least RMS error of force that the drive allows.
 
-    Each round linearises three things about the last round's gap: the force over the gap, the field's lag, and how the
-    speeds that a step reaches depend on the speed before. It then solves a quadratic programme in the gaps and lags.
-    Convexity is not proven, so the optimum is tested against an exhaustive search (`tests/lab/test_bound.py`). Raises
-    RuntimeError where the rounds do not settle, or Clarabel finds no solution.
+    Each round linearises about the last round's gap: force over gap, the field's lag, a step's largest speed over the
+    speed before. It then solves a quadratic programme in the gaps and lags. Convexity is not proven, so the optimum is
+    tested against an exhaustive search (`tests/lab/test_bound.py`). Raises RuntimeError where the rounds do not settle,
+    or Clarabel finds no solution.
     """
     steps = len(asked.force_N)
     slope_Tm_mm = np.gradient(brake.moment_Tm, brake.gap_mm)

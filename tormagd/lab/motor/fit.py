@@ -6,18 +6,18 @@ Three models, each linear, in the units of the carriage (m, N):
     windings   V(t - delay) = R i + L di/dt + K v
     gearbox    K i = mass a + viscous v + p(x) + sign(v) (q(x) + (1 - efficiency) |K i|)
 
-`volts` needs nothing but voltage and position. A current in the log gives the other two models, and with them the gain,
-K / R: the force for each ampere and the voltage for each m/s are one number. Polynomials p and q of the position say
-that the magnets pull, and load what rubs, more at a small gap. The gears lose a share of what they transmit.
+`volts` needs nothing but voltage and position. A current in the log gives the other two models, and the gain, K / R. K
+is one number: the force for each ampere and the voltage for each m/s. Polynomials p and q of the position say that the
+magnets pull, and load what rubs, more at a small gap. The gears lose a share of what they transmit.
 
 Position is low-passed without lag and differentiated centrally; both sides of an equation are filtered alike. Where the
 carriage stands, friction is whatever it has to be, so such rows are left out.
 
 Intervals. The covariance is the sandwich over blocks of a second (Liang and Zeger 1986): residuals inside a block may
 be correlated in any way. That covers noise, not a wrong model. So each model is fitted again in ways that should make
-no difference: with terms that it leaves out, with the rows about turns, in a wider band. The current is taken half a
-period earlier or later, or only every second one. Every parameter's interval grows by how far these fits move it, and
-by how much new terms let it vary within the log.
+no difference: with left-out terms, with the rows about turns, in a wider band. The current is taken half a period
+earlier or later, or only every second one. Every parameter's interval grows by how far these fits move it, and by how
+much new terms let it vary within the log.
 """
 
 from collections.abc import Callable

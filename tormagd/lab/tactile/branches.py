@@ -1,9 +1,10 @@
-"""What the neighbours of the k-nearest search decide: on the tactile pad, whose force falls somewhere, and the brake.
+"""What the neighbours of the k-nearest search decide: on the tactile pad, whose force falls somewhere, and on the
+brake.
 
-Contacts are drawn from the model's box, of the pad those at which its force falls with the field somewhere. At each the
-field goes smoothly up and down again, and the search is asked for the model's force there, answer by answer. A *jump*
-is an answer further than JUMP_MT from the last; *travel* is the answers' way over the field's own. Where the force
-rises everywhere there are none, however few neighbours.
+Contacts are drawn from the model's box; of the pad only those at which its force falls with the field somewhere. At
+each the field goes smoothly up and down again, and the search is asked for the model's force there, answer by answer. A
+*jump* is an answer further than JUMP_MT from the last. *Travel* is the answers' way over the field's own. Where the
+force rises everywhere there are no jumps, however few neighbours.
 """
 
 from typing import Any
@@ -18,14 +19,18 @@ from tormagd.scenes.scene import scene_path
 
 NEIGHBOURS = (1, 2, 4, 8, 16, 64)
 SHALLOW_MM = 1.0
-"Deeper the pad's force rises but for fractions of a millinewton."
+"Depth beyond which the pad's force rises, but for fractions of a millinewton."
 CONTACTS, STEPS, SEED = 60, 400, 3
 JUMP_MT = 20.0
 MODELS = {"pad": ("tactile_mre_c", "tactile", (0.0, 365.0)), "brake": ("torque_mre_50_40", "torque", (330.0, 740.0))}
 
 
 def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float | None) -> list[tuple[float, float]]:
-    """Displacements, mm, and rates, mm/s; with `shallow_mm` those up to there at which the force falls somewhere."""
+    """Draw CONTACTS contacts from the model's box: displacement, mm, and rate, mm/s.
+
+    With `shallow_mm` displacements end there, and only contacts at which the force falls with the field somewhere are
+    kept.
+    """
     draw, fields = np.random.default_rng(SEED), np.linspace(*range_mT, 366)
     (low_mm, high_mm), rates, _, (cip_percent, _) = model.feature_ranges
     found: list[tuple[float, float]] = []
@@ -40,7 +45,7 @@ def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float
 def followed(
     search: NearestFieldSearch, model: ForceModel, at: list[tuple[float, float]], path_mT: list[float]
 ) -> dict[str, Any]:
-    """How a search follows the path at all contacts."""
+    """Let a search follow the field path at every contact; return jumps, travel, worst force error and all answers."""
     cip_percent = model.feature_ranges[3][0]
     travels_mT, worst_N, answers = [], 0.0, []
     for contact in at:
@@ -62,12 +67,15 @@ def followed(
 
 
 def measured() -> dict[str, Any]:
-    """Every number of neighbours on two shipped models."""
+    """Return what every number of neighbours decides on two shipped models."""
     return {"synthetic": True, "jump_mT": JUMP_MT} | {name: measured_on(*MODELS[name]) for name in MODELS}
 
 
 def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) -> dict[str, Any]:
-    """Every number of neighbours on one shipped model."""
+    """Return what every number of neighbours decides on one shipped model.
+
+    `other_answers` is the share of answers that differ from those of the most neighbours.
+    """
     model = load_model(model_path(model_name, scene_path("pulse").parent), element=element)
     low_mT, high_mT = range_mT
     middle_mT, swing_mT = (low_mT + high_mT) / 2.0, 0.48 * (high_mT - low_mT)

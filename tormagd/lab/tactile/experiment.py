@@ -20,14 +20,14 @@ from tormagd.lab.tactile.pulse import hold, pulse
 from tormagd.lab.tactile.report import sections, write_report
 
 NOISES_N = (0.05, 0.5)
-"Table 4.1 is of the last."
+"Sensor noise of each training; table 4.1 is made with the last."
 
 
 def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]:
-    """`table_4_1` and `pulse` of the contract, with keys added, and what relaxes; what they were made with; the pulse's
-    traces.
+    """Run the experiment; return its figures as plain data, what table 4.1 was trained on, and the pulse's traces.
 
-    A quick effort takes fewer rows and epochs and holds for a minute: it shows that all runs, not how well.
+    A quick effort takes fewer rows and epochs and holds for a minute: it shows that all runs, not how well. Limits
+    torch to one thread. Raises ModuleNotFoundError where heartpy is not installed.
     """
     torch.set_num_threads(1)
     trained = [train(noise_N, effort) for noise_N in tqdm(NOISES_N, desc="training", disable=None, leave=False)]
@@ -47,14 +47,15 @@ def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab tactile-experiment`."""
+    """Add the options of `tormag-lab tactile-experiment`."""
     parser.add_argument("--quick", action="store_true", help="few rows and epochs: shows that it runs, not how well")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write learned_inverse.md and images/ there")
     parser.add_argument("--branches", action="store_true", help="what neighbours decide, on the shipped models")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The figures, for a person as the page; with --out it is written. Raises LabError where that has no folder."""
+    """Return the figures, for a person as the page; `--out` also writes it. Raises LabError where `--out` is no
+    directory."""
     if options.branches:
         return Found(branches.measured())
     if options.out is not None and not options.out.is_dir():

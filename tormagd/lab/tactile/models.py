@@ -19,16 +19,16 @@ from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, RATES_MM_S, TOUCHING_MM, worked_pad
 
 SCORED_SLOPE_N_MT = 0.03
-"""Where the force depends less on the field than this, a field says nothing: the force error counts there."""
+"""Least slope at which a field error is scored: where the force depends less on the field, the force error counts."""
 SPLIT_SEED = 1
 CYCLE_FOLDS = 4
 PAD_IN_USE = "MRE-C"
-"""The class of the pulse experiment."""
+"""Class of the pad in the pulse experiment."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much of everything. `thin`: every how many rows the grouped splits use."""
+    """Size of an experiment: rows, epochs and durations. Grouped splits use every `thin`-th row."""
 
     samples_per_cycle: int
     hold_samples: int
@@ -47,10 +47,10 @@ QUICK = Effort(24, 280, 15, 12, 4, 4, 5, 60.0, 24)
 
 @dataclass(frozen=True)
 class Trained:
-    """What was trained on cycles with sensor noise `noise_N`: the thesis's network, and a model of the pad in use.
+    """Models trained on cycles with sensor noise `noise_N`: the thesis's network, and a model of the pad in use.
 
-    `model` learned from the three classes. `grey`, the relaxation-aware model,
-    learned from the cycles of one class and from relaxation tests of it, as a laboratory would do with its pad.
+    `model` learned from the three classes. `grey`, the relaxation-aware model, learned from the cycles of one class and
+    from its relaxation tests, as a laboratory would do with its pad.
     """
 
     noise_N: float
@@ -78,7 +78,10 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
 
 
 def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
-    """Table 4.1 per class on the random split, the noise floor, and what whole groups left out do to it."""
+    """Return table 4.1 per class on the random split, with the noise floor, whole groups left out, and monotonicity.
+
+    Trains one network for each group left out.
+    """
     data = trained.cycles.data
     held = random_split(len(data), SPLIT_SEED)
     predicted = trained.model.predict(data.features)
@@ -118,7 +121,7 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
 
 
 def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) -> dict[str, Any]:
-    """Fit without each fold and judge on it: errors over all folds together, and each fold's own."""
+    """Fit a network without each fold and judge it on the fold; return errors over all folds, and each fold's own."""
     predicted = np.empty(len(data))
     judged = np.zeros(len(data), dtype=np.bool_)
     each = []
@@ -132,10 +135,10 @@ def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) ->
 
 
 def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, float]:
-    """Where dF/dB <= 0: share of the model's training box, and of the places where the pads' own slope counts.
+    """Return two shares where dF/dB <= 0: of the model's training box, and of places where the pads' own slope counts.
 
-    The box spans from class to class, where there are no data; the second share is over a grid of displacement, rate
-    and field at the classes themselves, as far as the pad rises by `SCORED_SLOPE_N_MT` or more.
+    The box spans from class to class, where there are no data. The second share is over a grid at the classes
+    themselves, of displacement, rate and field. Only places count where the pad rises by `SCORED_SLOPE_N_MT` or more.
     """
     places = np.meshgrid(
         np.linspace(TOUCHING_MM, FULL_INDENTATION_MM, 18),
@@ -154,7 +157,7 @@ def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, 
 
 
 def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
-    """dF/dB (n) of a worked pad at (displacement, rate, field) (n x 3), without what it remembers."""
+    """Return dF/dB (n) of a worked pad at (displacement, rate, field) (n x 3), without relaxation."""
     pad = worked_pad(parameters)
     displacement, rate, field = places.T
     low, high = np.maximum(field - 0.5, 0.0), field + 0.5
@@ -164,5 +167,5 @@ def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
 
 
 def plant_force_N(pad: Any, places: Array) -> Array:
-    """Force (n) of a `TactilePad` without what it remembers at (displacement, rate, field) (n x 3)."""
+    """Return the force (n) of a `TactilePad` at (displacement, rate, field) (n x 3), without relaxation."""
     return np.array([sum(pad.elastic_parts_N(*place)) for place in places.tolist()])

@@ -27,7 +27,7 @@ from tormagd.simulation.tactile_pad import (
 
 FIELDS_MT = tuple(float(value) for value in np.linspace(0.0, FULL_FIELD_MT, 11))
 RISE_SAMPLES = 46
-"""Of a relaxation test: until the depth is reached."""
+"""Samples of a relaxation test until the depth is reached."""
 PASSES_BEFORE = 3
 """Unrecorded passes of the same program before each record: 5 minutes, after which the peaks repeat."""
 HOLD_S = 3600.0
@@ -45,7 +45,10 @@ scales that table 4.1 implies."""
 
 
 def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
-    """Another pad of the same recipe: moduli, saturation, relaxation, rate gain drawn about `parameters` (3..15%)."""
+    """Draw another pad of the same recipe: moduli, saturation, relaxation and rate gain 3..15% about `parameters`.
+
+    The same seed gives the same pad.
+    """
     draw = np.random.default_rng(seed)
 
     def about(value: float, spread: float) -> float:
@@ -75,21 +78,21 @@ class Program(NamedTuple):
     field_mT: Array
 
     def features(self, cip_percent: float) -> Array:
-        """The network's features (n x 4)."""
+        """Return the network's features (n x 4): displacement, rate, field, iron."""
         cip = np.full_like(self.field_mT, cip_percent)
         return np.column_stack((self.displacement_mm, self.rate_mm_s, self.field_mT, cip))
 
 
 class PadRecord(NamedTuple):
-    """What was measured, record after record; `cycle` counts through all of them. And the force without the sensor's
-    noise, which no laboratory has."""
+    """Measured rows, record after record, and the force without the sensor's noise; `cycle` counts through all
+    records."""
 
     data: Dataset
     true_force_N: Array
 
 
 Pass = tuple[PadParameters, Program, Array]
-"What a pad was given in one record, and its force, N."
+"One recorded pass: the pad, its program, and its force, N."
 
 
 def cyclic_records(
@@ -99,7 +102,8 @@ def cyclic_records(
     samples_per_cycle: int = SAMPLES_PER_CYCLE,
     pads: Iterable[PadParameters] = tuple(PADS.values()),
 ) -> PadRecord:
-    """The data of figure 4.3: three pads, eleven fields, twelve cycles of 175 samples, 69,300 rows. No holds, as there.
+    """Return the data of figure 4.3: three pads, eleven fields, twelve cycles of 175 samples, 69,300 rows. No holds, as
+    there.
 
     Each field is a record of its own after a rest, preceded by three unrecorded passes of the same cycles.
     """
@@ -125,7 +129,10 @@ def holding_records(
     fields_mT: tuple[float, ...] = (0.0, 91.25, 182.5, 273.75, 365.0),
     samples: int = 500,
 ) -> PadRecord:
-    """Relaxation tests, which the thesis did not have: to 4.5 mm at 1 mm/s, then held; sampled ever more rarely."""
+    """Return relaxation tests, one at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely.
+
+    The thesis did not have these.
+    """
     rise_s = FULL_INDENTATION_MM
     held_s = np.geomspace(0.05, HOLD_S, samples - RISE_SAMPLES)
     time_s = np.concatenate((np.linspace(0.0, rise_s, RISE_SAMPLES), rise_s + held_s))
@@ -136,7 +143,7 @@ def holding_records(
 
 
 def _recorded(passes: list[Pass], cycle: NDArray[np.int64], noise_N: float, seed: int) -> PadRecord:
-    """The passes one after the other, each with these numbers of its cycles, as a sensor with that noise shows them."""
+    """Return the passes one after the other as a record with sensor noise; each pass has its own cycle numbers."""
     features = np.concatenate([program.features(pad.cip_percent) for pad, program, _ in passes])
     true_N = np.concatenate([force_N for *_, force_N in passes])
     noisy_N = true_N + np.random.default_rng(seed).normal(0.0, noise_N, len(true_N))

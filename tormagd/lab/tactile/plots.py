@@ -15,12 +15,12 @@ SHOWN_RATE_MM_S = 1.0
 
 
 def pictures(trained: Trained, traces: dict[str, Array]) -> dict[str, Figure]:
-    """Every picture by the name of its file: the data of table 4.1 with what the network says, and the pulse."""
+    """Draw the pictures of the page by file name: the data of table 4.1 with the network's force, and the pulse."""
     return {"tactile_fit": _fit(trained), "tactile_pulse": _pulse(traces)}
 
 
 def _last_cycle(cycles: Dataset, cip_percent: float, field_mT: float) -> Dataset:
-    """The last one at 1 mm/s of that class and field."""
+    """Return the rows of the last cycle at 1 mm/s of this class and field."""
     _, rate_mm_s, fields_mT, classes = cycles.features.T
     is_slow = np.isclose(np.abs(rate_mm_s), SHOWN_RATE_MM_S)
     rows = cycles.subset((classes == cip_percent) & (fields_mT == field_mT) & is_slow)

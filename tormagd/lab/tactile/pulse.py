@@ -19,7 +19,7 @@ from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, w
 
 SAMPLES = 4322
 RATE_HZ = 160
-"""As many samples as the thesis, so dense that the 25 s of measured pulse suffice."""
+"""As many samples as the thesis has, so dense that the 25 s of measured pulse suffice."""
 REFERENCE_FIELDS_MT = (100.0, 200.0)
 FIELDS_MT = (0.0, FULL_FIELD_MT)
 THESIS_EPSILON_N = 1.26
@@ -30,18 +30,18 @@ SHAPE = "measured photoplethysmogram (heartpy)"
 
 HOLD_RATE_HZ = 10
 HOLD_FORCES_N = (148.0, 154.0)
-"""Within reach of the field at the beginning and after an hour of relaxation."""
+"""Forces that the field reaches at the beginning and after an hour of relaxation."""
 HELD_PULSE_S = 20.0
 TEN_MINUTES_S = 600.0
 
 
 def pulse_shape(duration_s: float, rate_hz: int) -> Array:
-    """A measured pulse between 0 and 1. Raises ModuleNotFoundError where heartpy is not installed."""
+    """Return a measured pulse between 0 and 1. Raises ModuleNotFoundError where heartpy is not installed."""
     return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1]
 
 
 def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
-    """Measured arterial pulses between 0 and 1, by their file's name; none unless TORMAG_DATA names their folder."""
+    """Return measured arterial pulses between 0 and 1, by file name; none unless TORMAG_DATA names their folder."""
     shapes = {}
     for path in recorded("aac_nibp_pulse"):
         time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
@@ -52,7 +52,10 @@ def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
 
 
 def program(shape: Array) -> Program:
-    """Indentation to 4.5 mm at 1 mm/s, then held while the field follows `shape`, which fills the other samples."""
+    """Return the experiment's program: indentation to 4.5 mm at 1 mm/s, then a hold while the field follows `shape`.
+
+    `shape` fills the last of the SAMPLES samples; before it the field is that of its first.
+    """
     time_s = np.arange(1, SAMPLES + 1) / RATE_HZ
     displacement_mm = np.minimum(time_s, FULL_INDENTATION_MM)
     rate_mm_s = np.diff(displacement_mm, prepend=0.0) * RATE_HZ
@@ -69,7 +72,10 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 def solve_all(
     solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
 ) -> list[FieldSolution]:
-    """The answer for each row in turn. With `memory` each force is freed of what the pad remembers first."""
+    """Solve each row in turn, from the last answer on; return the answers.
+
+    With `memory` each force is freed of the pad's relaxation first, and the memory advances with the fields found.
+    """
     answers: list[FieldSolution] = []
     for row, wanted_N in zip(features.tolist(), force_N.tolist(), strict=True):
         displacement_mm, rate_mm_s, _, cip_percent = row
@@ -84,12 +90,12 @@ def solve_all(
 
 
 def fields_of(answers: list[FieldSolution]) -> Array:
-    """The fields found, mT."""
+    """Return the fields of the answers, mT."""
     return np.array([answer.field_mT for answer in answers])
 
 
 class Course(NamedTuple):
-    """The pulse experiment on one pad: the rows that are solved, and which of them a field error is scored on."""
+    """The pulse experiment on one pad: the rows to solve, and the pad's slope at each."""
 
     pad: PadParameters
     time_s: Array
@@ -100,11 +106,12 @@ class Course(NamedTuple):
 
     @property
     def scored(self) -> Mask:
-        """Rows (n, bool) where the force says something about the field."""
+        """Rows (n, bool) where the force depends enough on the field to score a field error."""
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 
     def scores(self, fields_mT: Array) -> dict[str, float]:
-        """Field error where it is scored, and elsewhere the force that the wrong field would cost."""
+        """Return the field error over the scored rows, and over the others the force that the wrong field would
+        cost."""
         absolute = np.abs(fields_mT - self.features[:, 2])[self.scored]
         pad, places = worked_pad(self.pad), self.features[~self.scored, :3].copy()
         right_N = plant_force_N(pad, places)
@@ -118,7 +125,7 @@ class Course(NamedTuple):
 
 
 def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
-    """Do the experiment on that pad; every how many samples are solved is `every`."""
+    """Do the experiment on one pad; every `every`-th sample is kept to be solved."""
     done = program(shape)
     force_N = worked_pad(pad).run(*done)
     features = done.features(pad.cip_percent)[::every]
@@ -128,19 +135,19 @@ def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
 
 
 def nearest() -> NearestFieldSearch:
-    """The search of the experiment."""
+    """Return the experiment's search, with its default number of neighbours."""
     return NearestFieldSearch(field_grid(FIELDS_MT, 2.0))
 
 
 def aware_fields(trained: Trained, along: Course, noise_N: float = 0.0) -> Array:
-    """The fields that the relaxation-aware model finds for the forces, as a sensor with that noise shows them."""
+    """Return the fields that the relaxation-aware model finds for the forces, with sensor noise of `noise_N`."""
     noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
     memory = GreyBoxMemory(trained.grey, along.dt_s)
     return fields_of(solve_all(nearest(), trained.grey.model, along.features, noisy_N, memory))
 
 
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Scores of each way to the field, and the traces."""
+    """Return the scores of each way from force to field, and the traces."""
     linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
         "mlp": fields_of(solve_all(nearest(), trained.model, along.features, along.force_N, None)),
@@ -157,7 +164,10 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 
 
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The contract's `pulse`: the quieter sensor on top, each sensor below; other pads and other pulses beside."""
+    """Return the pulse experiment's figures and the traces of its first training.
+
+    The first training's scores stand on top, each training's by its sensor noise, with other pads and pulses beside.
+    """
     shape = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
@@ -174,14 +184,15 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
 
 
 def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
-    """Pulses rendered on a held pad, feed-forward alone, for `duration_s` of virtual time: with and without memory."""
+    """Render pulses on a held pad by feed-forward for `duration_s` of virtual time; return force errors with and
+    without memory."""
     dt_s = 1.0 / HOLD_RATE_HZ
     rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)
     count = rising + round(duration_s * HOLD_RATE_HZ)
     time_s, rate_mm_s = np.arange(1.0, count + 1.0) * dt_s, np.where(np.arange(count) < rising, 1.0, 0.0)
     pressed = Program(time_s, np.minimum(time_s, FULL_INDENTATION_MM), rate_mm_s, np.zeros(count))
     beats_N = scaled(pulse_shape(HELD_PULSE_S, HOLD_RATE_HZ), *HOLD_FORCES_N)
-    # there and back again, so that the repetition has no jump
+    # forwards and backwards, so that the repetition has no jump
     asked_N = np.resize(np.concatenate((beats_N, beats_N[::-1])), count - rising)
     pad = PADS[PAD_IN_USE]
     features = pressed.features(pad.cip_percent)

@@ -28,7 +28,10 @@ UNSEEN_FIELDS_MT = (130.0, 230.0)
 
 
 def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceModel:
-    """The model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen. PlantError."""
+    """Train the model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen.
+
+    Raises PlantError for a plant that cannot be loaded or has no pad.
+    """
     plant = load_plant(plant_name)
     if plant.pad is None:
         raise PlantError(f"plant {plant_name}: allowed is one with a [pad]")
@@ -61,14 +64,14 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab tactile-model`."""
+    """Add the options of `tormag-lab tactile-model`."""
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
     parser.add_argument("--plant", default="pad_1", help="whose pad is on the bench (default: pad_1)")
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Trains and writes; the metrics."""
+    """Train the model, write it to `--out` and return its metrics."""
     torch.set_num_threads(1)
     model = trained(options.plant, FULL, options.created or datetime.date.today())
     save_model(options.out, model)

@@ -24,17 +24,18 @@ APPENDIX_MU_R = 3.8
 
 
 KEYS = ("place", "printed", "found", "used")
-"Where it is, what is printed, what was found, and the reading used here."
+"Place in the thesis, what is printed, what was found, and the reading used here."
 
 
 def errata() -> list[dict[str, str]]:
-    """All of them by KEYS, in the order of the thesis."""
+    """Return all errata by KEYS, in the order of the thesis."""
     found = (*_chapter_2(), _eq_25(), *_chapter_3(), *_appendices(), *_chapter_4())
     return [dict(zip(KEYS, row, strict=True)) for row in found]
 
 
 def table_2_4_errors() -> list[dict[str, object]]:
-    """The lines of table 2.4 whose printed error does not follow from the printed ranges, within their rounding."""
+    """Return the lines of table 2.4 whose printed error does not follow from the printed ranges, within their
+    rounding."""
     wrong = []
     for name, (printed_N, printed_percent) in TABLE_2_4_ERRORS.items():
         ranges = INSERTS[name].force_range
@@ -59,6 +60,7 @@ Row = tuple[str, str, str, str]
 
 
 def _chapter_2() -> list[Row]:
+    """Return the errata of chapter 2 but for Eq. 25, with figures computed from what is printed."""
     eq7, power = ThesisFieldLaw(), PowerFieldLaw()
     closed_Tm, open_Tm = eq7.radial_moment_Tm(CLOSED_MM), eq7.radial_moment_Tm(OPEN_MM)
     stretched = (1.206 * (200.0 - CLOSED_MM) ** 1.867 + 1256.0) * 1e-6
@@ -160,7 +162,7 @@ def _chapter_2() -> list[Row]:
 
 
 def _eq_25() -> Row:
-    """Eq. 9..27 with the kinematics of Eq. 33: at the closed gap, the circumference kept, the ends free."""
+    """Return the erratum of Eq. 25: Eq. 9..27 with the kinematics of Eq. 33, at the closed gap, with free ends."""
     moment_Tm = ThesisFieldLaw().radial_moment_Tm(CLOSED_MM)
     radial = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     stretch = constitutive.stretches(radial, 1.0)
@@ -179,6 +181,7 @@ def _eq_25() -> Row:
 
 
 def _chapter_3() -> list[Row]:
+    """Return the errata of chapter 3."""
     low, high = APPENDIX_B_BOUNDS
     lines = [line for case in USE_CASES.values() for line in case.starts]
     outside = [f"R_o {line.start.outer_radius_mm:g}" for line in lines if not _inside(line.start, low, high)]
@@ -208,6 +211,7 @@ def _chapter_3() -> list[Row]:
 
 
 def _appendices() -> list[Row]:
+    """Return the errata of the appendices."""
     exponent_T = 0.44 * CLOSED_MM ** (-1.3 / 6.0 * APPENDIX_MU_R) / 0.004
     sixth_T = 0.44 * CLOSED_MM**-1.3 / 6.0 * APPENDIX_MU_R / 0.004
     used_T = 0.44 * CLOSED_MM**-1.3 / 4.0 * APPENDIX_MU_R / 0.004
@@ -251,6 +255,7 @@ def _appendices() -> list[Row]:
 
 
 def _chapter_4() -> list[Row]:
+    """Return the errata of chapter 4."""
     return [
         (
             "Abstract and section 4.3",
@@ -268,6 +273,7 @@ def _chapter_4() -> list[Row]:
 
 
 def _eq_28(moment_Tm: float) -> float:
+    """Return the force by Eq. 28 as printed, N."""
     stretch = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     magnetic = MU0_H_M * SAMPLE.relative_permeability * (moment_Tm / TORMAG.inner_radius_m) ** 2 / stretch**2
     area = 2.0 * math.pi * TORMAG.thickness_m * TORMAG.inner_radius_m**2 * SAMPLE.friction_coefficient
@@ -275,7 +281,8 @@ def _eq_28(moment_Tm: float) -> float:
 
 
 def _literal_stretch(moment_Tm: float, *, appendix: bool = False) -> float:
-    """lambda1 by Eq. 29 as printed, or with Gamma_1 and Gamma_2 of the appendix; NaN where the root is not real."""
+    """Return lambda1 by Eq. 29 as printed, or with Gamma_1 and Gamma_2 of the appendix; NaN where the root is not
+    real."""
     inner, outer, t = TORMAG.inner_radius_m, TORMAG.outer_radius_m, TORMAG.thickness_m
     mu_r, g0 = SAMPLE.relative_permeability, SAMPLE.shear_modulus_Pa
     over = moment_Tm**2 / (MU0_H_M * mu_r)

@@ -47,7 +47,7 @@ PULSE_S, PULSE_HZ = 20.0, 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab reproduce-thesis`."""
+    """Add the options of `tormag-lab reproduce-thesis`."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="write reproduction.md and its pictures there")
     parser.add_argument("--gap-speed", type=float, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
@@ -57,7 +57,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The contract's object, for a person as the page; with --out it is written."""
+    """Return all tables and figures, for a person as the page; `--out` also writes it. `--table-2-5` returns that
+    alone."""
     if options.table_2_5:
         found = table_2_5()
         return Found(found, table(dict(zip(COLUMNS, row, strict=True)) for row in readings(found)))
@@ -89,7 +90,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def chapter_4(is_quick: bool) -> Json:
-    """Its table and pulse. What was trained for them stays in the process that did it: none of it is pickled."""
+    """Return table 4.1 and the pulse. What was trained stays in this process: none of it is pickled."""
     from tormagd.lab.tactile.experiment import contract
     from tormagd.lab.tactile.models import FULL, QUICK
 
@@ -98,7 +99,7 @@ def chapter_4(is_quick: bool) -> Json:
 
 
 def table_2_3() -> Json:
-    """Masses from volume fractions and densities."""
+    """Return masses from volume fractions and densities, beside the printed ones."""
     rows: list[Json] = []
     for item in INSERTS.values():
         printed = TABLE_2_3_MASSES_G[round(100 * item.cip_fraction)]
@@ -119,7 +120,7 @@ def table_2_3() -> Json:
 
 
 def table_2_4() -> Json:
-    """Friction per matrix fitted to the measured ranges; with Eq. 7, and with the power law beside it."""
+    """Return friction per matrix fitted to the measured ranges, with Eq. 7 and, beside it, with the power law."""
     ours, beside = _range_fit(ThesisFieldLaw()), _range_fit(PowerFieldLaw())
     return {
         **ours,
@@ -133,6 +134,7 @@ def table_2_4() -> Json:
 
 
 def _range_fit(law: FieldLaw) -> Json:
+    """Return the fits with a fixed and a free exponent under one field law, with left-out errors."""
     known = list(INSERTS.values())
     fixed, free = fit_friction(known, law), fit_exponent(known, law)
     left_out = leave_one_out(known, law, free_exponent=False)
@@ -152,7 +154,10 @@ def _range_fit(law: FieldLaw) -> Json:
 
 
 def _registry_errors() -> Json:
-    """The same of the friction that inserts and simulated device have: the least squares of the relative errors."""
+    """Return the errors with the registry's friction, which inserts and simulated device have.
+
+    It is the least-squares fit of the relative errors.
+    """
     known = list(INSERTS.values())
     friction = {item.shore_hardness: item.elastomer.friction_coefficient for item in known}
     used = RangeFit(ThesisFieldLaw(), friction, exponent=1.0)
@@ -164,6 +169,7 @@ def _registry_errors() -> Json:
 
 
 def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -> Json:
+    """Return one insert's measured and fitted ranges, N, and their relative errors."""
     ranges = item.force_range
     return {
         "insert": item.name,
@@ -180,7 +186,7 @@ def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -
 
 
 def figure_2_5() -> Json:
-    """Least and most force over permeability and shear modulus, mu_d = 0.2."""
+    """Return the least and greatest force over permeability and shear modulus, with mu_d = 0.2."""
     permeabilities = np.linspace(2.0, 4.0, 9)
     moduli_kPa = np.linspace(80.0, 280.0, 11)
     result: Json = {}
@@ -210,7 +216,7 @@ def figure_2_5() -> Json:
 
 
 def figure_2_7(tests: list[StepTest]) -> Json:
-    """Settled force at each gap on the simulated device, against the force law."""
+    """Return the settled force at each gap on the simulated device, beside the force law, and all inserts' ranges."""
     rows = []
     for test in tests:
         brake = Brake.as_built(insert(test.insert).elastomer)
@@ -250,7 +256,8 @@ def figure_2_7(tests: list[StepTest]) -> Json:
 
 
 def phase_portrait(*gap_speeds_mm_s: float) -> Json:
-    """The device as built at these gap speeds: both use cases, and a measured pulse as a point cloud."""
+    """Return the coverage of both use cases by the device as built at these gap speeds, and of a measured pulse's
+    points."""
     rows = []
     for number, case in USE_CASES.items():
         for speed in gap_speeds_mm_s:
@@ -274,6 +281,7 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
 
 
 def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
+    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed, and the worst that it misses."""
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
     rates_N_s = np.gradient(forces_N, times_s)
     brake = Brake.as_built(insert("MRE-50-40").elastomer)
@@ -311,7 +319,8 @@ RunKey = tuple[int, int, str, str]
 
 
 def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
-    """Every start of both use cases (or the first `starts`), by every measure and solver."""
+    """Return the runs of table 3.2: every start of both use cases (or the first `starts`), by every measure and
+    solver."""
     runs = {}
     for number, case in USE_CASES.items():
         for objective, problem in _problems(number, gap_speed_mm_s).items():
@@ -322,6 +331,7 @@ def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = Non
 
 
 def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
+    """Return the problem of each objective for a use case; `gap_speed_mm_s` is the controller's."""
     region = USE_CASES[use_case].region
     return {
         "trapezoid": Problem(region, "trapezoid", GAP_SPEED_MM_S),
@@ -332,7 +342,8 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
 
 
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
-    """Optima by the global solver, by the local one, by the thesis's cost; the thesis's designs beside them."""
+    """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's
+    designs."""
     starts: list[Json] = []
     local: list[Json] = []
     corners: list[Json] = []

@@ -29,7 +29,7 @@ EVERY = 10
 
 
 class StepTest(NamedTuple):
-    """The record of one insert, and the settled gap and force of each step."""
+    """Step test of one insert: its record, thinned, and the settled gap and force of each step."""
 
     insert: str
     time_s: Array
@@ -37,16 +37,16 @@ class StepTest(NamedTuple):
     level_gap_mm: Array
     level_force_N: Array
     rise_s: float
-    "From 10 to 90% of a step of the gap: the median."
+    "Median time from 10 to 90% of a step of the gap."
 
     @property
     def gap_speed_mm_s(self) -> float:
-        """Of the gap in that rise."""
+        """Speed of the gap in that rise."""
         return 0.8 * float(np.median(-np.diff(self.level_gap_mm))) / self.rise_s
 
 
 def step_test(fitted: Insert, seed: int) -> StepTest:
-    """One insert through all gaps. Raises RuntimeError where the device faults."""
+    """Run one insert through all gaps in virtual time. Raises RuntimeError where the device faults."""
     config, scene = load_config(None), load_scene("coronary")
     scene = msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N))
     plant = load_plant("sample_1")

@@ -13,7 +13,7 @@ from tormagd.lab.thesis.values import TABLE_2_5
 from tormagd.physics.inserts import INSERTS
 
 GAP_RESOLUTION_MM = 0.1
-"Where a plain position loop stands against the screws' backlash; table 2.5 of the thesis implies a little less."
+"What a plain position loop reaches against the screws' backlash; table 2.5 of the thesis implies a little less."
 COLUMNS = (
     "task",
     "insert the thesis names",
@@ -27,7 +27,7 @@ COLUMNS = (
 
 
 def table_2_5() -> Json:
-    """Every insert before every task, best first by the strict reading."""
+    """Judge every insert for every task; return the verdicts, best first by the strict reading."""
     # the open gap is that of the device, but the law must hold beyond it where a task asks for less force
     brakes = {item.name: Brake.as_built(item.elastomer) for item in INSERTS.values()}
     steps = [
@@ -56,6 +56,7 @@ def table_2_5() -> Json:
 
 
 def _row(verdict: Verdict, task: ForceTask) -> Json:
+    """Return one insert's verdict as plain data, in both readings; a gap that the field law does not know is None."""
     measured_N = INSERTS[verdict.insert].force_range.measured_N
     return {
         "insert": verdict.insert,
@@ -71,7 +72,7 @@ def _row(verdict: Verdict, task: ForceTask) -> Json:
 
 
 def readings(table: Json) -> list[tuple[str, ...]]:
-    """The inserts that the thesis names, in `COLUMNS`."""
+    """Return one row for each insert that the thesis names, in `COLUMNS`."""
     return [
         (
             f"{task['task']}, {task['range_N'][0]:g}..{task['range_N'][1]:g} N",
@@ -90,6 +91,7 @@ def readings(table: Json) -> list[tuple[str, ...]]:
 
 
 def _missed(row: Json, task: Json) -> str:
+    """Return the forces and the width that the insert misses, in words; `nothing` where it misses none."""
     (least_N, most_N), given_N = task["range_N"], row["force_N"][0]
     missed = [f"{least_N:g}..{given_N:.2f} N"] if given_N > least_N else []
     if row["matched_share"] < 1.0:
@@ -98,6 +100,7 @@ def _missed(row: Json, task: Json) -> str:
 
 
 def _narrowest(task: Json) -> str:
-    """The insert with the least range among those that match: whose force changes least in a gap step."""
+    """Return the insert with the least range among those that match, whose force changes least in a gap step; else
+    `none`."""
     matching = [row for row in task["ranked"] if row["matched_share"] == 1.0]
     return min(matching, key=lambda row: row["measured_range_N"], default={"insert": "none"})["insert"]

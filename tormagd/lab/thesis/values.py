@@ -1,4 +1,4 @@
-"""What the thesis prints, as it prints it: the tables that `reproduce_thesis.py` holds its own figures against."""
+"""What the thesis prints, as it prints it: the tables that `reproduction.py` compares its own figures with."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ TABLE_2_3_MASSES_G = {
     30: {"matrix": 62.4, "cip": 236.1, "slacker": 4.9, "thinner": 4.9},
     40: {"matrix": 52.0, "cip": 314.8, "slacker": 4.9, "thinner": 4.9},
 }
-"Grams in 100 cc by the percentage of iron."
+"Grams in 100 cc, by the percentage of iron."
 
 TABLE_2_4_ERRORS = {
     "MRE-10-10": (0.05, 4.7),
@@ -61,7 +61,7 @@ class Start(NamedTuple):
 
 
 class UseCase(NamedTuple):
-    """A required region, the thesis's coverage of it by the device as built, and its five starts."""
+    """A required region, the thesis's coverage of it by the device as built, in percent, and its five starts."""
 
     region: Region
     initial_percent: float
@@ -99,7 +99,7 @@ APPENDIX_B_BOUNDS = (Design(8.0, 10.0, 50.0), Design(15.0, 50.0, 200.0))
 
 
 class FitScore(NamedTuple):
-    """A half row of table 4.1: mean absolute error with its deviation, N; the same in percent; R2."""
+    """Half a row of table 4.1: mean absolute error with its deviation, N; the error in percent; R2."""
 
     mae_N: float
     sd_N: float

@@ -41,39 +41,39 @@ from tormagd.simulation.parameters import PlantParameters, load_plant, with_inse
 
 SWEEPS = 4
 BEYOND_MM = 2.0
-"The sweeps go so far beyond the scene's gaps."
+"How far the sweeps go beyond the scene's gaps."
 STOPS_MM = 2.5
-"The bench's switches stand so far beyond the scene's gaps."
+"How far the bench's switches stand beyond the scene's gaps."
 BENCH_MOST_N = 20.0
-"On a bench no force that the closed gap gives is a fault."
+"Greatest force of the bench's scene: none that the closed gap gives is a fault."
 GAP_STEP_MM = 3.0
 HOLD_GAP_MM, HOLD_STROKES = 46.0, 100
 BEGIN_S = 8.0
-"Connecting, homing and enabling are over by then, and the handle begins to move."
+"Connecting, homing and enabling are over by then; the handle begins to move."
 CREEP_MM_S, FASTEST_MM_S = 0.5, 310.0
 EVEN_S, EVEN_MM = 0.3, 4.0
-"The handle keeps a speed for so long, and for so much travel: at a creep friction takes millimetres to settle."
+"Least time and travel at one speed: at a creep friction takes millimetres to settle."
 SPEEDS = 3
-"Of each stroke, there and back, beside the first."
+"Speeds of each way of a stroke after its first."
 STOP_S = 0.3
-"The gap arrives within the last of a stroke."
+"Rest after each way; in the last of a stroke the gap arrives."
 RATE_TICKS = 50
-"On either side, over which a rate is taken: one count of the handle's encoder is 8 um."
+"Ticks on either side over which a rate is taken: one count of the handle's encoder is 8 um."
 STEADY_SHARE, STEADY_MM_S = 0.02, 0.2
 SETTLED_MM, MOBILISED_AFTER_MM = 3.0, 6.0
-"Travel after the speed or the gap has changed; and after the handle has turned, which bends every bristle over."
+"Travel needed after a change of speed or gap, and after the handle has turned, which bends every bristle over."
 LOADING_MM = 3.0
-"Of a stroke's first speed: the way back to no force, and on through mobilisation."
+"Travel at a stroke's first speed: the way back to no force, and on through mobilisation."
 LOADED_MM, LOADED_STEP_MM = 1.5, 0.15
-"Rows before mobilisation end here, and stand so far apart: on to 2 mm the greatest forces still rise by a tenth."
+"End and spacing of the rows before mobilisation: on to 2 mm the greatest forces still rise by a tenth."
 RESTING_GAP_MM_S = 0.5
 EVERY, LOADED_EVERY = 90, 7
-"Of the ticks of steady sliding, whose neighbours say nearly the same; of the rows before, which weigh little."
+"Every how many ticks of steady sliding, and rows before mobilisation, are kept: neighbours are nearly equal."
 
 
 class Course(NamedTuple):
-    """One record: the insert, the gaps, mm, one for each stroke of the handle, there and back, and the seed of hand
-    and noise."""
+    """One record to make: the insert, the gap of each stroke of the handle there and back, mm, and the seed of hand and
+    noise."""
 
     insert: str
     gaps_mm: tuple[float, ...]
@@ -81,7 +81,7 @@ class Course(NamedTuple):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab bench-sweep`."""
+    """Add the options of `tormag-lab bench-sweep`."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
     parser.add_argument("--scene", default="coronary", help="whose insert and gap range are swept")
     parser.add_argument("--insert", nargs="+", metavar="NAME", help="other inserts, one after the other")
@@ -90,7 +90,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Writes the training CSV."""
+    """Record all sweeps, write the training CSV, and return the number of rows.
+
+    Raises PlantError, ConfigError, DomainError, OSError, and RuntimeError where the device faults.
+    """
     data = record(options.plant, options.scene, options.insert, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_csv(options.out, data)
@@ -98,8 +101,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int) -> Dataset:
-    """A hold of the last insert and SWEEPS sweeps of each; `cycle` is the number of the record, `time_s` counts from
-    its rest."""
+    """Record a hold of the last insert and SWEEPS sweeps of each, by processes, and return their rows.
+
+    `cycle` is the number of the record, `time_s` counts from its rest. Without `inserts` the scene's is swept.
+    """
     scene = load_scene(scene_name)
     names = inserts or [scene.insert.name]
     courses = [Course(names[-1], (HOLD_GAP_MM,) * HOLD_STROKES, seed + SWEEPS)]  # the longest first
@@ -113,7 +118,7 @@ def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int
 
 
 def sweep_course(scene: Scene, name: str, seed: int) -> Course:
-    """Down and up, the steps of each sweep at gaps of its own; both ends are reached."""
+    """Return the course of a sweep down and up again, with steps at gaps drawn by the seed; both ends are reached."""
     closed_mm, open_mm = scene.insert.gap_closed_mm - BEYOND_MM, scene.insert.gap_open_mm + BEYOND_MM
     offset_mm = np.random.default_rng(seed).uniform(0.0, GAP_STEP_MM)
     between = np.arange(open_mm - offset_mm, closed_mm, -GAP_STEP_MM)
@@ -122,7 +127,10 @@ def sweep_course(scene: Scene, name: str, seed: int) -> Course:
 
 
 def swept(plant: str, scene_name: str, course: Course) -> Array:
-    """The rows of one record (n x 6): time_s, the features, force_N along the motion."""
+    """Record one course in virtual time and return its rows (n x 6): time_s, the features, force_N along the motion.
+
+    Raises RuntimeError where the device faults.
+    """
     scene = bench_scene(load_scene(scene_name), course.insert)
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
     device = VirtualDevice(bench(with_insert(load_plant(plant), course.insert), scene), hand, seed=course.seed)
@@ -144,7 +152,7 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
 
 
 def rows_of(ticks: Array, scene: Scene) -> Array:
-    """The rows that are kept (n x 6) of all ticks (m x 4): time_s, handle_mm, gap_mm, and the force with its sign."""
+    """Return the rows that are kept (n x 6) of all ticks (m x 4): time_s, handle_mm, gap_mm, and the signed force."""
     _, handle_mm, gap_mm, signed_N = ticks.T
     sliding_mm_s, slides = sliding(handle_mm, gap_mm)
     loading_mm_s, loading_mm = loading(handle_mm, gap_mm, signed_N)
@@ -161,8 +169,11 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
 
 
 def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Array]:
-    """The handle's rate, mm/s, at each tick, and how far it has gone since the elastomer bore no force, where that is
-    after a turn, at one speed, at a resting gap, and a row is due: NaN elsewhere."""
+    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick.
+
+    The way is NaN but where a row is due: after a turn, at one speed, at a resting gap, every LOADED_STEP_MM to
+    LOADED_MM.
+    """
     gap_mm_s, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     is_resting &= np.abs(gap_mm_s) <= RESTING_GAP_MM_S
     gone = (handle_mm[RATE_TICKS:] - handle_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
@@ -189,7 +200,8 @@ def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Ar
 
 
 def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
-    """The handle's rate, mm/s, at each tick, and where it has slid steadily, at a steady gap, for long enough."""
+    """Return the handle's rate, mm/s, at each tick, and a mask: it has slid steadily, at a steady gap, for long
+    enough."""
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     slides = np.zeros(len(handle_mm), dtype=np.bool_)
@@ -208,7 +220,8 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
 
 
 def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
-    """Rate over a window around each tick, mm/s, and whether it is the same in both halves of the window."""
+    """Return the rate over a window around each tick, mm/s, and whether both halves of the window agree to
+    `changes_mm_s`."""
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)
     before, after = np.concatenate((edge, gone)), np.concatenate((gone, edge))
@@ -217,21 +230,22 @@ def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array,
 
 
 def bench_scene(scene: Scene, name: str) -> Scene:
-    """The scene with another insert, and the gaps that the bench's switches allow."""
+    """Return the scene with another insert, the gaps that the bench's switches allow, and no force limit to fault
+    on."""
     stroke = msgspec.structs.replace(
         scene.insert,
         name=name,
         gap_closed_mm=scene.insert.gap_closed_mm - BEYOND_MM,
         gap_open_mm=scene.insert.gap_open_mm + STOPS_MM,
     )
-    # and no force that they give is a fault there
+    # no force that these gaps give is a fault on the bench
     return msgspec.structs.replace(
         scene, insert=stroke, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N)
     )
 
 
 def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
-    """The device on the bench: switches further apart, and at rest at the open gap for long."""
+    """Return the device on the bench: switches further apart, and carriages that start at the open gap."""
     home_mm = scene.insert.gap_open_mm / 2.0
     stops = msgspec.structs.replace(
         plant.assumed,
@@ -244,13 +258,16 @@ def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
 
 
 def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
-    """A plan that asks for a gap and nothing else."""
+    """Return a plan that asks for a gap and nothing else."""
     return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
 
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:
-    """The hand from BEGIN_S on, and when each of its `count` strokes ends. A stroke goes there and back at speeds drawn
-    evenly over their logarithm; the second of either way is fast enough to mobilise friction before a creep."""
+    """Return the hand's motion from BEGIN_S on, and when each of its `count` strokes ends.
+
+    A stroke goes there and back at speeds drawn evenly over their logarithm. The second speed of either way is fast
+    enough to mobilise friction before a creep.
+    """
     random = np.random.default_rng(seed)
     times, positions, ends_s = [BEGIN_S], [0.0], []
     for _ in range(count):

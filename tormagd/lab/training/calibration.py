@@ -34,35 +34,35 @@ from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.inserts import Insert, insert
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
-"""Of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the roller,
-its rate and the measured force, both positive in the direction of motion."""
+"""Columns of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the
+roller, its rate and the measured force, both positive in the direction of motion."""
 
 LEAST_MOVING_SHARE = 0.3
-"Of every sweep. Turning to and fro with rests keeps over half of it."
+"Least share of every sweep in motion. Turning to and fro with rests keeps over half of it."
 LEAST_FIELD_SPAN = 0.2
-"Of the greatest field."
+"Least span of the field, as a share of the greatest."
 LEAST_SWEEPS = 3
 JUDGING = (3, 1)
-"Every third sweep, from the second on, is kept from the fit to judge it."
+"Every third sweep, from the second on, is kept from the fit to judge the model."
 VALIDATION_SHARE = 0.3
 STEADY_MM_S = 10.0
 "A handle whose rate stays within this (5th to 95th percentile) teaches nothing about the rate."
 RARE_SHARE = 0.01
 
 NEEDED = ("torch", "tqdm")
-"What a fit takes that not every installation has: asked for before anybody turns a handle."
+"Packages that a fit needs and not every installation has: checked before anybody turns a handle."
 
 LEAST_R2 = 0.97
-"The thesis's own network, table 4.1."
+"R2 of the thesis's own network, table 4.1."
 MOST_MAE_SHARE = 0.02
-"Of the greatest force: relaxation and temperature, which the model does not have, take one to two percent."
+"As a share of the greatest force: relaxation and temperature, which the model has not, take one to two percent."
 MOST_MAE_OVER_NOISE = 3.0
 MEAN_OVER_SIGMA = math.sqrt(2.0 / math.pi)
 "Mean absolute value of Gaussian noise over its standard deviation."
 
 
 class CalibrationError(ValueError):
-    """A sweep that gives no model: a stable code, what was found beside what is needed, and what to do."""
+    """Sweep that gives no model: a stable code, what was found beside what is needed, and what to do."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(message)
@@ -70,10 +70,11 @@ class CalibrationError(ValueError):
 
 
 def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
-    """The rows of sweeps (n x 6, order of COLUMNS, sweep by sweep) with the handle in motion; `cycle` is the sweep.
+    """Return the training rows of sweeps (n x 6, order of COLUMNS, sweep by sweep) in which the handle moves.
 
-    `field_mT` is the field law's at the measured gap, in this insert. A rate or a displacement that hardly varied is
-    made constant, so that the network cannot learn from its noise. Raises CalibrationError, LabError.
+    `cycle` is the sweep. `field_mT` is the field law's at the measured gap, in this insert. A rate or a displacement
+    that hardly varied is made constant, so that the network cannot learn from its noise. Raises CalibrationError where
+    the handle hardly moved in a sweep, LabError for too few rows, DomainError for a gap outside the field law.
     """
     _, sweep, _, handle_mm, rate_mm_s, _ = table.T
     rate_mm_s = np.abs(rate_mm_s)
@@ -104,8 +105,9 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
 
 
 def displacement(handle_mm: Array) -> Array:
-    """The displacement at each of these positions (n, mm, in the order of time). NaN until a turn, or so much travel
-    that the last turn no longer matters.
+    """Return the displacement since the last turn at each position (n, mm, in order of time).
+
+    NaN until a turn, or until so much travel that an earlier turn no longer matters.
     """
     found = np.full_like(handle_mm, np.nan)
     start_mm = float(handle_mm[0])
@@ -150,7 +152,10 @@ def require_usable(data: Dataset) -> None:
 
 
 def noise_sd_N(data: Dataset) -> float:
-    """The force sensor's noise: the third differences of neighbouring rows, which hold hardly anything else."""
+    """Return the standard deviation of the force sensor's noise, N, from third differences of neighbouring rows.
+
+    These hold hardly anything but noise; 0 where no rows are neighbours.
+    """
     assert data.time_s is not None  # training_rows sets it
     steps = np.diff(data.time_s)
     third = np.diff(data.force_N, 3)
@@ -160,8 +165,10 @@ def noise_sd_N(data: Dataset) -> float:
 
 
 def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int = 50, epochs: int = 200) -> ForceModel:
-    """A model from all sweeps but the judging ones, with the judgement in its metrics. Raises CalibrationError
-    (poor_fit, not_rising) where it is not good enough to be used."""
+    """Train a model on all sweeps but the judging ones, and return it with the judgement in its metrics.
+
+    Raises CalibrationError (poor_fit, not_rising) where it is not good enough to be used.
+    """
     from tormagd.lab.training.fitting import (
         fit_model,  # with torch, two seconds: whatever is refused is told without it
     )
@@ -205,8 +212,10 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
 
 
 def require_rising(model: ForceModel, points: int = 64) -> None:
-    """Raise CalibrationError (not_rising) where the fully mobilised force does not rise with the field: there a force
-    has no one field."""
+    """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1% of its span.
+
+    There a force has no one field.
+    """
     ranges = dict(zip(FEATURES, model.feature_ranges, strict=True))
     rate_mm_s = sum(ranges["rate_mm_s"]) / 2.0
     rows = np.array(
@@ -229,7 +238,10 @@ def require_rising(model: ForceModel, points: int = 64) -> None:
 def calibrate(
     sweep: Path, insert_name: str, inner_radius_mm: float, out: Path, training_csv: Path | None, created: datetime.date
 ) -> dict[str, Any]:
-    """The whole of it; returns what was saved. Raises CalibrationError, LabError, DomainError, OSError."""
+    """Make a model file from a sweep file, and the training CSV if asked; return what was saved.
+
+    Raises CalibrationError, LabError, DomainError, OSError. No model is written then.
+    """
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     if training_csv is not None:
         write_csv(training_csv, data)
@@ -248,12 +260,12 @@ def calibrate(
 
 
 def read_sweep(path: Path) -> Array:
-    """The table of a sweep file (n x 6). Raises LabError naming the file and what is wrong."""
+    """Read a sweep file (n x 6). Raises LabError naming the file and what is wrong."""
     return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED, is_exact=True).values()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Prints the JSON object; 1 where there is no model."""
+    """Calibrate, or check an insert, print the JSON object and return 0, or 1 where there is no model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(
         "sweep", type=Path, nargs="?", metavar="SWEEP.csv", help=f"columns {','.join(COLUMNS)}; none: check the insert"

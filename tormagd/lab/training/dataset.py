@@ -78,9 +78,9 @@ class Dataset:
     def split(self, validation_share: float, seed: int) -> tuple["Dataset", "Dataset"]:
         """Split at random into (training, validation), the same way for the same seed.
 
-        With cycle labels whole cycles go to one side, because neighbours in a time series are nearly copies of each
-        other and a validation that holds copies of the training rows proves nothing.
-        Raises `LabError` when the share leaves fewer than two rows on a side.
+        With cycle labels whole cycles go to one side. Neighbours in a time series are nearly copies of each other, and
+        a validation that holds copies of the training rows proves nothing. Raises `LabError` for a share outside 0..1,
+        or one that leaves fewer than two rows on a side.
         """
         if not 0 < validation_share < 1:
             raise LabError(f"validation_share = {validation_share} is not allowed, only between 0 and 1")

@@ -1,4 +1,4 @@
-"""Training one force model: network, scaling, Levenberg-Marquardt, and what is written down about it."""
+"""Training of one force model: network, scaling, Levenberg-Marquardt, and the metadata of the result."""
 
 import datetime
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.inserts import insert
 
 VALIDATION_SHARE = 0.1
-"""Of the training rows, to say when the training stops; the test rows have no part in that."""
+"""Share of the training rows that says when the training stops; the test rows have no part in that."""
 
 
 def fit_model(
@@ -38,12 +38,13 @@ def fit_model(
     start: ForceModel | None = None,
     rising: bool = False,
 ) -> tuple[ForceModel, Training]:
-    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went. The
-    data are of the `inserts`, told apart by their iron. What was taken out of the data before is their `memory`.
+    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went.
 
-    The network is scaled by the ranges of `scaled_by`, of `training` by default, and begins with the weights of
-    `start`, if given. Deterministic for given data and seed. Raises `DomainError` on a name or a count that a model
-    file may not have.
+    The data are of the `inserts`, told apart by their iron. `memory` is what was taken out of the data before. The
+    network is scaled by the ranges of `scaled_by`, of `training` by default, and begins with the weights of `start`, if
+    given. With `rising` its force rises with the field everywhere. Deterministic for given data and seed. Raises
+    `DomainError` for a name or count that a model file may not have, an insert without rows, or a force that does not
+    vary.
     """
     ranging = scaled_by or training
     scaling = scaling_of(ranging)
@@ -79,7 +80,11 @@ def fit_model(
 def fit_network(
     data: Dataset, known: Mask, hidden: int = 50, epochs: int = 162, start: ForceModel | None = None
 ) -> tuple[ForceModel, Training]:
-    """The thesis's network (section 4.2.5) for the tactile element, from the rows of `data` (n) in `known` (n)."""
+    """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` (n) in `known` (n,
+    mask).
+
+    A tenth of the rows, chosen at random, decides when it stops. Returns and raises as `fit_model`.
+    """
     rows = data.subset(known)
     stop = random_split(len(rows), 0, VALIDATION_SHARE)
     return fit_model(
@@ -97,6 +102,7 @@ def fit_network(
 
 
 def _box(data: Dataset, name: str) -> Ranges:
+    """Return the ranges of an insert's own rows. Raises DomainError for an insert with fewer than two."""
     is_own = data.features[:, CIP] == 100.0 * insert(name).cip_fraction
     if is_own.sum() < 2:
         raise DomainError("insert", name, "one that there are rows of, by cip_percent")
@@ -105,7 +111,7 @@ def _box(data: Dataset, name: str) -> Ranges:
 
 @torch.no_grad()
 def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> None:
-    """Give the network the weights of `start`, folded into the scaling of these data."""
+    """Give the network the weights of `start`, folded into this scaling."""
     weight, bias, output, constant = start.physical
     gain = np.array(scaling.input_gain)
     network.hidden_weight.copy_(torch.tensor(np.divide(weight, gain, out=np.zeros_like(weight), where=gain != 0)))
@@ -115,7 +121,10 @@ def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> N
 
 
 def scaling_of(data: Dataset) -> Scaling:
-    """Maps the range of each feature, and of the force, onto -1..1."""
+    """Return the scaling that maps each feature's range, and the force's, onto -1..1; a constant feature gets gain 0.
+
+    Raises DomainError where the force does not vary.
+    """
     low, high = data.features.min(axis=0), data.features.max(axis=0)
     span = high - low
     gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)

@@ -1,9 +1,9 @@
-"""The relaxation-aware model: a network for the force without memory, and Prony series for what the stress remembers.
+"""The relaxation-aware model: a network for the force without memory, and Prony series for the stress's relaxation.
 
-F0 = NN(displacement, rate, field, CIP) is the force without memory. What of it is there without field, NN(.., 0, ..),
-and what the field adds relax each by fractions of their own, with the same times (see `tormagd.physics.relaxation`).
-The memory enters an inverse as a shift: `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now, and
-any search through the network finds the field for that F0.
+F0 = NN(displacement, rate, field, CIP) is the force without memory. Its part without field, NN(.., 0, ..), and what the
+field adds relax each by fractions of their own, with the same times (see `tormagd.physics.relaxation`). The memory
+enters an inverse as a shift: `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now. Any search
+through the network finds the field for that F0.
 """
 
 import functools
@@ -22,26 +22,26 @@ from tormagd.physics.relaxation import PronySeries
 START_TIMES_S = (1.0, 10.0, 100.0, 1000.0)
 START_FRACTION = 0.03
 TIME_SPREAD = 3.0
-"""The fitted times stay within this factor of the ones they start from, so that they cannot change places."""
+"""Fitted times stay within this factor of their starts, so that they cannot change places."""
 ROUNDS = 4
-"""The network is fitted to forces freed of memory, which the network itself predicts: that has to settle."""
+"""Rounds of fitting: the network learns from forces freed of memory, which it predicts itself, and has to settle."""
 
 
 @dataclass(frozen=True)
 class GreyBox:
-    """A network for the force without memory; relaxation of its field-free part, and of what the field adds."""
+    """A network for the force without memory, and relaxation of its field-free part and of what the field adds."""
 
     model: ForceModel
     series: PronySeries
     field_series: PronySeries
 
     def predict(self, data: Dataset) -> Array:
-        """Force (n), N, along the records of `data`. Raises `DomainError` without `time_s`."""
+        """Return the force (n), N, along the records of `data`. Raises `DomainError` without `time_s`."""
         return _with_memory((self.series, self.field_series), elastic_parts_N(self.model, data), data)
 
 
 class GreyBoxMemory:
-    """What a pad remembers while it is driven, in steps of `dt_s`, beginning at rest."""
+    """Relaxation state of a pad while it is driven, in steps of `dt_s`, beginning at rest."""
 
     def __init__(self, grey: GreyBox, dt_s: float) -> None:
         self._model = grey.model
@@ -49,7 +49,8 @@ class GreyBoxMemory:
         self._state, self._field_state = grey.series.relaxed(0.0), grey.field_series.relaxed(0.0)
 
     def elastic_N(self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float) -> float:
-        """The network's force, N, with which the pad gives `force_N` at the end of the step that begins now."""
+        """Return the network's force, N, with which the pad gives `force_N` at the end of the next step; the state
+        stays."""
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         rest_N, _ = self._step.advance(self._state, free_N)
         # the force is affine in the driving one: its value at 0 and its slope
@@ -59,7 +60,7 @@ class GreyBoxMemory:
         return free_N + (force_N - rest_N - past_N) / gain
 
     def advance(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Take the step at that field; returns the force, N, that the model expects at its end."""
+        """Take the step at this field; return the force, N, that the model expects at its end."""
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         whole_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
         rest_N, self._state = self._step.advance(self._state, free_N)
@@ -68,7 +69,7 @@ class GreyBoxMemory:
 
 
 def elastic_parts_N(model: ForceModel, data: Dataset) -> tuple[Array, Array]:
-    """Force without memory (n), N: without field, and what the field adds."""
+    """Return two forces without memory (n), N: without field, and what the field adds."""
     fieldless = data.features.copy()
     fieldless[:, FIELD] = 0.0
     free_N = model.predict(fieldless)
@@ -80,11 +81,12 @@ def _with_memory(series: tuple[PronySeries, PronySeries], parts: tuple[Array, Ar
 
 
 def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries, PronySeries]:
-    """The two series that best make the forces of `holds` from the elastic `parts` (n each), each record scaled to fit.
+    """Fit the two series that best make the forces of `holds` from the elastic `parts` (n each), each record scaled to
+    fit.
 
     The scales are free because a network that has never seen a hold is off by some percent there, which must not pass
-    for relaxation. For the same reason only rows at rest count; the others make the state that they begin in.
-    Raises `DomainError` without `time_s`.
+    for relaxation. For this reason only rows at rest count; the others make the state that they begin in. Raises
+    `DomainError` without `time_s`.
     """
     at_rest = holds.features[:, RATE] == 0.0
     still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(holds)]
@@ -123,9 +125,10 @@ def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries,
 def fit_grey_box(
     data: Dataset, known: Mask, holds: Dataset, *, hidden: int = 30, epochs: int = 100, settling_epochs: int = 30
 ) -> GreyBox:
-    """The model from the rows of cycles (n) in `known` (n), and from relaxation tests, `holds`.
+    """Fit the model to the rows of cycles (n) in `known` (n, mask), and to relaxation tests, `holds`.
 
     The network learns for `epochs` as if there were no memory, then for `settling_epochs` in each of `ROUNDS` rounds.
+    Raises `DomainError` without `time_s`.
     """
     from tormagd.lab.training.fitting import fit_network  # with torch, which a fitted model does without
 

@@ -1,9 +1,9 @@
 """Levenberg-Marquardt training of the force network (the thesis used it too, section 4.2.5).
 
-Written here and not taken from the package torch-levenberg-marquardt: that differentiates the network for each row
-(vmap over jacrev), which takes 3.5 times as long as the closed form that one hidden layer has (4096 rows, 50 units),
-and the damping schedule, the early stop and the determinism are part of the published result, so they should be
-readable in one place. Without them and the Jacobian nothing would remain of the package but a Cholesky solve.
+Written here and not taken from the package torch-levenberg-marquardt. That differentiates the network for each row
+(vmap over jacrev), in 3.5 times the time of one hidden layer's closed form (4096 rows, 50 units). The damping schedule,
+the early stop and the determinism are part of the published result, so they should be readable in one place. Without
+them and the Jacobian nothing would remain of the package but a Cholesky solve.
 """
 
 import math
@@ -26,7 +26,7 @@ INITIAL_DAMPING = 1e-3
 DAMPING_DOWN = 0.1
 DAMPING_UP = 10.0
 LEAST_POSITIVE = 1e-3
-"Where a weight begins that has to stay positive."
+"Least start of a weight that has to stay positive."
 LEAST_DAMPING = 1e-15
 GREATEST_DAMPING = 1e10
 """Marquardt's schedule with the factors that trainlm made usual; errors are means, so they fit any number of rows."""
@@ -73,14 +73,14 @@ def train(
     least_improvement: float = 1e-4,
     rising: bool = False,
 ) -> Training:
-    """Fit `network` to `training` in place and leave it with the weights that did best on `validation`. It is of
-    float64, because the normal equations square the rounding.
+    """Fit `network`, of float64, to `training` in place, and leave it with the weights that did best on `validation`.
 
-    Stops after `epochs` accepted steps; when `patience` steps in a row have not lowered the validation error by the
-    share `least_improvement`; or when no damping lowers the training error any more (`stopped_by`: "epochs",
-    "validation", "damping"). Deterministic for a given network and data.
-    With `rising` the force rises with the field everywhere, whatever the data: each unit's weight of the field and its
-    output stay positive, because a step changes their logarithms. Raises `DomainError` on a count below 1.
+    It stops (`stopped_by`) after `epochs` accepted steps ("epochs"), or when no damping lowers the training error any
+    more ("damping"). It also stops when `patience` steps in a row have not lowered the validation error by the share
+    `least_improvement` ("validation"). Deterministic for a given network and data.
+
+    With `rising` the force rises with the field everywhere, whatever the data. Each unit's weight of the field and its
+    output stay positive, because a step changes their logarithms. Raises `DomainError` for a count below 1.
     """
     for name, count in (("epochs", epochs), ("patience", patience)):
         if count < 1:
@@ -135,7 +135,7 @@ def train(
 
 
 def _made_rising(network: ForceNetwork) -> Tensor:
-    """Turn each unit so that it rises with the field; which of the network's parameters have to stay positive."""
+    """Turn each unit so that it rises with the field, and return a mask of the parameters that must stay positive."""
     weight, output = network.hidden_weight, network.output_weight
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
     weight.mul_(side[:, None])
@@ -171,7 +171,7 @@ def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) ->
 
 
 def _step(normal: Tensor, gradient: Tensor, damping: float) -> Tensor | None:
-    """Return the step -(J'J + damping I)^-1 J'r, or None when rounding has cost that matrix its definiteness."""
+    """Return the step -(J'J + damping I)^-1 J'r, or None where rounding has cost the matrix its definiteness."""
     damped = normal + damping * torch.eye(len(gradient), dtype=normal.dtype)
     factor, failed = torch.linalg.cholesky_ex(damped)
     if int(failed):

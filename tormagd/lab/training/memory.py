@@ -11,23 +11,25 @@ from tormagd.physics.relaxation import PronySeries
 
 
 def records(data: Dataset) -> list[slice]:
-    """The rows of each record: a new one begins wherever time goes back. Raises `DomainError` without `time_s`."""
+    """Return the rows of each record: a new one begins wherever time goes back. Raises `DomainError` without
+    `time_s`."""
     starts = [0, *(np.flatnonzero(np.diff(times_of(data)) < 0) + 1).tolist(), len(data)]
     return [slice(first, last) for first, last in itertools.pairwise(starts)]
 
 
 def times_of(data: Dataset) -> Array:
-    """`time_s` of the data; raises `DomainError` when they have none."""
+    """Return `time_s` of the data. Raises `DomainError` where they have none."""
     if data.time_s is None:
         raise DomainError("time_s", None, "a column of the data: a model with memory needs it")
     return data.time_s
 
 
 def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
-    """Force with memory (n), N, from the force without (n), along the records of `data`.
+    """Return the force with memory (n), N, from the force without (n), along the records of `data`.
 
-    `time_s` counts from the last rest. A record that begins later than that is taken to have been run before, from
-    the rest on, as often as the time allows: laboratories cycle a specimen until it repeats and then record.
+    `time_s` counts from the last rest. A record that begins later counts as having been run before, from the rest on,
+    as often as the time allows. Laboratories cycle a specimen until it repeats and then record. Raises `DomainError`
+    without `time_s`.
     """
     times = times_of(data)
     # records with the same times run side by side: a laboratory repeats one program, and rows are slow one by one
@@ -43,7 +45,7 @@ def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
 
 
 def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
-    """Force (n x r) of r records with the same times (n), from the force without memory (n x r)."""
+    """Return the force (n x r) of r records with the same times (n), from the force without memory (n x r)."""
     first_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 and time_s[0] > 0 else 0.0
     # rounded, so that steps that are equal but for the rounding of the time share one update
     steps_s = np.round(np.diff(time_s, prepend=time_s[0] - first_s), 9).tolist()

@@ -1,5 +1,4 @@
-"""Which rows a model may learn from and which judge it: at random as in the thesis, and by whole groups. Its error on
-them."""
+"""Splits into rows that a model learns from and rows that judge it, at random or by whole groups; and its errors."""
 
 from collections.abc import Iterator
 
@@ -12,7 +11,7 @@ from tormagd.model.model_file import ForceModel
 
 
 def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
-    """Mask (rows) of the rows held out: `share` of them, scattered; as the thesis's, 70 : 30.
+    """Return a mask (rows) of the rows held out: `share` of them, scattered; as the thesis's, 70 : 30.
 
     Rows of a time series are nearly copies of their neighbours: this split flatters, and is for comparison only.
     """
@@ -22,14 +21,15 @@ def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
 
 
 def leave_one_out(dataset: Dataset, feature: str) -> Iterator[tuple[float, Mask]]:
-    """Each value of `feature` (whole fields, whole classes) in turn, with the mask of the rows that have it."""
+    """Yield each value of `feature` (whole fields, whole classes) with the mask of the rows that have it."""
     column = dataset.features[:, FEATURES.index(feature)]
     for value in np.unique(column):
         yield float(value), column == value
 
 
 def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[int, Mask]]:
-    """Each fold's number and the mask of its rows: whole cycles, every cycle in one fold; the data have cycles."""
+    """Yield each fold's number and the mask of its rows: whole cycles, every cycle in one fold; the data have
+    cycles."""
     assert dataset.cycle is not None
     parts = np.array_split(np.random.default_rng(seed).permutation(np.unique(dataset.cycle)), folds)
     for fold, part in enumerate(parts):
@@ -37,12 +37,15 @@ def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[
 
 
 def fit_metrics(model: ForceModel, dataset: Dataset) -> dict[str, float]:
-    """Return r2, mae_N, rmse_N, max_N, and mae_percent: the mean error in percent of the training force span."""
+    """Return a model's errors on a data set as `force_metrics` does; percents are of the training force span."""
     return force_metrics(model.predict(dataset.features), dataset.force_N, model.force_span_N)
 
 
 def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str, float]:
-    """Return r2, mae_N, rmse_N, max_N and mae_percent (of `span_N`) of forces (n) predicted by any model."""
+    """Return mae_N, rmse_N, max_N, mae_percent (of `span_N`) and r2 of forces (n) predicted by any model.
+
+    There is no r2 where all measured forces are equal.
+    """
     error_N = predicted_N - force_N
     variance = float(np.var(force_N))
     mae_N = float(np.abs(error_N).mean())
@@ -61,7 +64,7 @@ def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str
 def not_rising_share(model: ForceModel, points: int = 17) -> float:
     """Return the share of a grid over the training box (`points` per feature that varies) where dF/dB <= 0.
 
-    There the field for a force is not unique, or the force does not depend on the field. Of several inserts it is the
+    There the field for a force is not unique, or the force does not depend on the field. For several inserts it is the
     greatest share of one.
     """
     if model.metadata.boxes:

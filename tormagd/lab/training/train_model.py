@@ -21,7 +21,7 @@ from tormagd.output import write_line
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab train-model`."""
+    """Add the options of `tormag-lab train-model`."""
     parser.add_argument(
         "data", type=Path, metavar="DATA.csv", help="training CSV; a `cycle` column keeps cycles together"
     )
@@ -44,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Trains and writes; the metrics. Raises LabError, DomainError, OSError."""
+    """Train a model, write it to `--out` and return its metrics. Raises LabError, DomainError, OSError."""
     if not options.out.parent.is_dir():
         raise LabError(f"cannot write {options.out}: {options.out.parent} is not a directory")
     model, training = fit(options, read_csv(options.data))

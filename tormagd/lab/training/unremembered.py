@@ -1,13 +1,13 @@
 """Bench records freed of memory: what relaxation and the field's hysteresis did to each row is found and taken out.
 
-A force model of displacement, rate and field has no memory, the elastomer and the magnets' circuit have. Fitted to the
-records as they are, a model learns the memory of the bench's own program; so the memory is identified with them:
+A force model of displacement, rate and field has no memory; the elastomer and the magnets' circuit have. Fitted to the
+records as they are, a model learns the memory of the bench's own program. So the memory is identified with them:
 
     G = D(B - h) m S(v)       m = 1 - sum g_i q_i / D(B)       q_i: D(B) behind a low-pass of time constant tau_i
     F = G (1 - exp(-k x / G)) before mobilisation, then G
 
-D is the force of the field at rest, a smooth curve of each insert; S = 1 + s exp(-(v / v_s)^2) + c v, friction over its
-kinetic level; k x is what the elastomer bears at first, over the displacement; h follows the field's changes towards
+D is the force of the field at rest, a smooth curve of each insert. S = 1 + s exp(-(v / v_s)^2) + c v is friction over
+its kinetic level, k x what the elastomer bears at first, over the displacement. h follows the field's changes towards
 +-h_max. A record begins after a long rest at its first row's field. Inserts of one matrix relax alike, and their fields
 lag alike, each to the scale of its greatest.
 """
@@ -23,22 +23,23 @@ from tormagd.model.features import CIP, FIELD
 from tormagd.model.memory import Memory
 
 START_TIMES_S = (10.0, 100.0, 1000.0)
-"Those of field-step tests."
+"Time constants of field-step tests."
 TIME_SPREADS = (3.0, 3.0, 1.01)
-"""A fitted time stays within this factor of its start, so that they cannot change places; the last is hardly fitted,
-for records of ten minutes do not tell a term that is slow from one that is slower and greater."""
+"""A fitted time stays within this factor of its start, so that times cannot change places. The last is hardly fitted:
+records of ten minutes do not tell a slow term from one that is slower and greater."""
 START_FRACTION = 0.03
 DEGREE = 4
-"Of the logarithm of D over the logarithm of the field."
+"Degree of the polynomial for the logarithm of D over that of the field."
 FITTED_ROWS = 3000
 LEAST_N = 1e-6
-"No insert brakes less, whatever is tried."
+"Least force that the fit tries for an insert."
 ROBUST_N = 0.05
 "Errors beyond this count less: rows near a reversal of the field."
 
 
 def identify(data: Dataset) -> tuple[Memory, Dataset]:
-    """The memory in the records of `data`, and the same rows with the forces that they would have had without it.
+    """Identify the memory in the records of `data`; return it, and the same rows with the forces of a device without
+    memory.
 
     Every record begins after a long rest. Deterministic. Raises `DomainError` without `time_s`.
     """
@@ -107,7 +108,8 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
 
 
 def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
-    """How far the field lies behind: rate-independent, it moves along |dB| towards the side that dB leads to."""
+    """Return how far the field lags at each row: rate-independent, towards the side that each change of the field leads
+    to."""
     lag_mT = np.zeros_like(field_mT)
     for record in records(rows):
         now, found = 0.0, []
@@ -121,7 +123,7 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
 
 
 def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:
-    """What the elastomer has relaxed of `driving_N` (n) since the rest before each record."""
+    """Return how much of `driving_N` (n) the elastomer has relaxed since the rest before each record."""
     times, away_N = times_of(rows), np.zeros_like(driving_N)
     fractions = np.array(memory.fractions)
     for record in records(rows):
