@@ -270,7 +270,10 @@ class ClosedLoop:
         return self.planner.planned
 
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """Plan where a setpoint is new or the inference period is over; hand over a search's answer before."""
+        """Plan where a setpoint is new or the inference period is over; before it hand over a search's answer.
+
+        Nothing happens without a planner.
+        """
         planner = self.planner
         if planner is None:
             return

@@ -40,8 +40,8 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
     """Run `core` for `seconds` of virtual time on a pulse; return its calls of `step` and `plan`, one each a tick, to
     repeat.
 
-    The repeated calls act on a second core, which was armed in the same way. Raises RuntimeError if a device does not
-    arm.
+    The repeated calls act on the stages of a second loop, armed in the same way. Raises RuntimeError if a device does
+    not arm.
     """
     period_s = 1.0 / config.rates.control_hz
     # stages change in place, so the calls are repeated on those of another loop, which has come as far

@@ -338,8 +338,8 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
 
 
 def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """Return the gap that follows a force without delay or foresight, one for each step; it begins on the force at
-    rest."""
+    """Return the gap at each step of carriages that follow a force without delay or foresight; they begin on the force
+    at rest."""
     gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
     moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.branch_Tm
 

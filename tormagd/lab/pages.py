@@ -35,7 +35,10 @@ def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Fi
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
-    """Write a page, and its pictures as PNG into `folder`, stamped with the rows of the page's tables."""
+    """Write a page to `path`, and its pictures as PNG into `folder`, which is made where missing.
+
+    Pictures are stamped with the rows of the page's tables.
+    """
     page = "\n".join(section.rstrip() + "\n" for section in sections)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():

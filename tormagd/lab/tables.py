@@ -82,7 +82,7 @@ def _columns(
 
 
 def _number(where: str, text: str, bounds: tuple[float, float] | None) -> float:
-    """Return `text` as a finite number within `bounds`, None for any. Raises LabError, also for digits with
+    """Return `text` as a finite number within `bounds` (None: any). Raises LabError, also for digits with
     underscores."""
     try:
         # digits grouped as 1_000 are Python's idea, not CSV's

@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def corner_margins(config: Config) -> dict[str, float]:
-    """Return the smallest gain and phase margin over every corner, and the number of corners.
+    """Return the smallest gain margin, dB, and phase margin, degrees, over every corner, and the number of corners.
 
     Corners are +-30% in each of CORNER_PARAMETERS and +-20% in the loop period.
     """

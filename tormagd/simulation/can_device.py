@@ -134,7 +134,8 @@ class CanDevice:
         self._flight = _Flight(time_s + duration_s, delivery)
 
     def _end_frame(self, flight: _Flight) -> None:
-        """Free the bus and deliver its frame, to the device too where a host addresses its node."""
+        """Free the bus and put its frame among the delivered; the device gets it too where a host addresses its
+        node."""
         self._flight = None
         self._free_s = flight.end_s
         sender, frame = flight.delivery

@@ -150,8 +150,10 @@ class MessageDevice:
         return self.plant.truth
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
-        """Queue a payload that arrives at `time_s`. Raises ValueError for one before those already queued, or in the
-        past."""
+        """Queue a payload that arrives at `time_s`.
+
+        Raises ValueError for a time before those already queued or the last `advance`, or one that is not finite.
+        """
         waiting = self._arrival_s < math.inf
         latest_s = self._inbox[-1].time_s if waiting else self._time_s
         if not latest_s <= time_s < math.inf:
@@ -161,8 +163,10 @@ class MessageDevice:
             self._arrival_s = time_s
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`: messages arrive, the firmware ticks and answers. Raises ValueError for a time in
-        the past."""
+        """Let time pass until `now_s`: messages arrive, faults strike, the firmware ticks and answers into `outbox`.
+
+        Raises ValueError for a time before the last one, or not finite.
+        """
         if not self._time_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._time_s} on")
         while (event_s := self.next_event_s) <= now_s:

@@ -262,7 +262,7 @@ class ForceSensor:
             self.reading_N = self._in_flight.popleft()[1]
 
     def _normal(self) -> float:
-        """Return the next standard normal number, of two at a time (Box and Muller, 1958).
+        """Return the next standard normal number; two are made at a time and the second is kept (Box and Muller, 1958).
 
         `random.Random.gauss` may give other numbers in another Python; only those of `random` are promised to stay.
         """

@@ -103,6 +103,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         return self._heard(VERDICT_TOPIC, Verdict)
 
     async def _heard(self, topic: bytes, kind: type[Told]) -> AsyncIterator[Told]:
+        """Subscribe to `topic` and yield its messages without an end. Raises MessageError."""
         socket = self._listening(topic)
         while True:
             yield decode((await socket.recv_multipart())[-1], kind)
@@ -116,6 +117,8 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         self.close()
 
     async def _result(self, command: str, args: dict[str, Any], wait_s: float) -> dict[str, Any]:
+        """Send a command and return its result, one command at a time. Raises UnreachableError after `wait_s`, and as
+        `answered`."""
         async with self._turn:
             control, pending = self._socket(zmq.DEALER, self._endpoints.control), self._pending(command)
             try:

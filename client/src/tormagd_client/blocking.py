@@ -139,6 +139,8 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return self._arrived(VERDICT_TOPIC, Verdict, wait_s)
 
     def _arrived(self, topic: bytes, kind: type[Told], wait_s: float) -> list[Told]:
+        """Return all messages of `topic` that have arrived, waiting up to `wait_s` for the first. Raises
+        MessageError."""
         socket = self._listening(topic)
         arrived: list[Told] = []
         while socket.poll(0 if arrived else round(wait_s * 1e3)):
@@ -154,6 +156,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
         self.close()
 
     def _result(self, pending: Pending, wait_s: float) -> dict[str, Any]:
+        """Return the answer to `pending`. Raises UnreachableError where none comes within `wait_s`."""
         result = self.answer(pending, wait_s)
         if result is None:
             raise self._unanswered(wait_s)

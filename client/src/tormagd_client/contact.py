@@ -73,7 +73,11 @@ class ContactEstimator:
         "Weighted means, and sums of squares around these means."
 
     def _take(self, place_mm: float, force_N: float) -> None:
-        """Learn from one mean point: friction before the wall, the line behind it. A point off the line is dropped."""
+        """Learn from one mean point: friction from the first LEAST and all before the wall, the line from those behind
+        it.
+
+        A point off the line is dropped.
+        """
         if self._is_off(place_mm, force_N):
             return
         if self._free < LEAST or force_N - self.friction_N < TOUCHES_N:

@@ -68,7 +68,10 @@ class Endpoints(Strict, frozen=True):
 
 
 def require_usable(endpoints: Endpoints) -> None:
-    """Raise ValueError naming an address that cannot be used, is used twice, or needs keys that are not given."""
+    """Raise ValueError for an address that cannot be used, is used twice, or needs keys that are not given.
+
+    `also_local` without keys is refused too. The text names the key and what is allowed.
+    """
     taken: dict[str, str] = {}
     curve = endpoints.curve
     has_keys = curve is not None and bool(curve.server_secret or curve.client_secret)

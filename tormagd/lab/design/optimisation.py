@@ -120,8 +120,11 @@ class Run(msgspec.Struct, frozen=True):
 
 
 def coverage(problem: Problem, design: Design) -> float:
-    """Return the share of the problem's region that the design covers, 0..1. Raises `DomainError` for an impossible
-    design."""
+    """Return the share of the problem's region that the design covers, 0..1: by the true boundary or else the
+    trapezoid.
+
+    `problem.measure` says which. Raises `DomainError` for an impossible design.
+    """
     portrait = problem.portrait(design)
     if problem.measure == "true":
         return portrait.true_coverage(problem.region)
@@ -156,7 +159,8 @@ def corner_cost(problem: Problem, design: Design) -> float:
 def solve(run: Run) -> Outcome:
     """Return the design that the run's solver finds from its start; the same run gives the same design anywhere.
 
-    Raises `DomainError` where the solver finds no design whose elastomer bears the field.
+    Where "global" maximises coverage, a second search takes the smallest design within SLACK of the best. Raises
+    `DomainError` where the solver finds no design whose elastomer bears the field.
     """
     began_s = time.thread_time()
     search = _Search(run.problem)

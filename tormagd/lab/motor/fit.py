@@ -151,7 +151,10 @@ def linear(rows: Array, target: Array, blocks: Array) -> Fit:
 
 
 def _sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
-    """Return the covariance of the coefficients by the sandwich over blocks (Liang and Zeger 1986)."""
+    """Return the covariance (p x p) of least-squares coefficients by the sandwich over blocks (Liang and Zeger 1986).
+
+    Rows (n x p) and residuals (n) of one number in `blocks` (n) may be correlated; corrected for few blocks.
+    """
     labels, index = np.unique(blocks, return_inverse=True)
     scores = np.zeros((len(labels), jacobian.shape[1]))
     np.add.at(scores, index, jacobian * residual[:, None])
@@ -278,7 +281,10 @@ class Windings(NamedTuple):
 
 
 def fit_windings(log: Log) -> Windings:
-    """Fit resistance, inductance, back-EMF and delay from voltage, current and position. Raises LabError."""
+    """Fit resistance, inductance, back-EMF and delay from voltage, current and position.
+
+    Raises LabError, also for a log without a current.
+    """
 
     def fit_in(way: Way) -> tuple[Array, Array]:
         seen = motion(log, way.thinned_Hz)

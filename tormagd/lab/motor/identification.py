@@ -66,7 +66,10 @@ def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
 
 
 def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
-    """Return what only a current shows: the motor as the carriage feels it, gain in N/V."""
+    """Return by name what only a log with a current shows: windings, gain (N/V), mass, friction and gear efficiency.
+
+    All are referred to the carriage.
+    """
     return {
         "gain_N_V": _product((windings.back_emf, 1), (windings.resistance, -1)),
         "resistance_ohm": windings.resistance,

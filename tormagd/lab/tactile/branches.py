@@ -45,7 +45,10 @@ def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float
 def followed(
     search: NearestFieldSearch, model: ForceModel, at: list[tuple[float, float]], path_mT: list[float]
 ) -> dict[str, Any]:
-    """Let a search follow the field path at every contact; return jumps, travel, worst force error and all answers."""
+    """Let a search follow the field path at every contact, each answer from the last.
+
+    Returns the share of jumps, the travel over the path's own, the worst force error, N, and all answers, mT.
+    """
     cip_percent = model.feature_ranges[3][0]
     travels_mT, worst_N, answers = [], 0.0, []
     for contact in at:

@@ -29,6 +29,7 @@ def _last_cycle(cycles: Dataset, cip_percent: float, field_mT: float) -> Dataset
 
 
 def _fit(trained: Trained) -> Figure:
+    """Draw data and network at 1 mm/s for each class and some fields."""
     figure, axes = subplots((11.0, 3.8), 1, 3)
     axes[0].set_ylabel("force, N")
     figure.suptitle("Data and network at 1 mm/s (synthetic; like figures 4.3 and 4.4)")
@@ -48,6 +49,7 @@ def _fit(trained: Trained) -> Figure:
 
 
 def _pulse(traces: dict[str, Array]) -> Figure:
+    """Draw the pulse experiment over time: force and displacement, the fields found, their errors."""
     time_s = traces["time_s"]
     figure, (inputs, fields, errors) = subplots((11.0, 9.0), 3, 1, sharex=True)
     inputs.plot(time_s, traces["force_N"], color="C3", lw=1, label="force, N")

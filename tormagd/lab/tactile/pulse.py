@@ -41,7 +41,10 @@ def pulse_shape(duration_s: float, rate_hz: int) -> Array:
 
 
 def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
-    """Return measured arterial pulses between 0 and 1, by file name; none unless TORMAG_DATA names their folder."""
+    """Return measured arterial pulses between 0 and 1 by file name, repeated to `duration_s` at `rate_hz`.
+
+    None unless TORMAG_DATA names a folder with `aac_nibp_pulse`.
+    """
     shapes = {}
     for path in recorded("aac_nibp_pulse"):
         time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
@@ -184,8 +187,11 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
 
 
 def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
-    """Render pulses on a held pad by feed-forward for `duration_s` of virtual time; return force errors with and
-    without memory."""
+    """Render pulses by feed-forward on a pad held at 4.5 mm for `duration_s` of virtual time.
+
+    Returns relative force errors of the network alone ("without") and with memory ("with"), over ten minutes and in
+    all.
+    """
     dt_s = 1.0 / HOLD_RATE_HZ
     rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)
     count = rising + round(duration_s * HOLD_RATE_HZ)

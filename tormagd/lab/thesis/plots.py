@@ -83,8 +83,10 @@ def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
 
 
 def _force_ranges(axes: Axes, rows: list[Json]) -> None:
-    """Draw least and greatest force over the share of iron, a colour a matrix; the thesis's ranges stand on our
-    least."""
+    """Draw each insert's least and greatest force over its share of iron, one colour a matrix.
+
+    The ranges that the thesis measured stand on our least forces.
+    """
     for place, (matrix, colour) in enumerate(
         zip(dict.fromkeys(row["matrix"] for row in rows), (OURS, FREE, THESIS), strict=True)
     ):
