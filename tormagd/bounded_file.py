@@ -21,7 +21,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
         data = file.read(most_bytes + 1)
-    if len(data) > most_bytes:  # it grows, or, as some of the kernel's, does not know its size
+    if len(data) > most_bytes:  # a file that grows, or one of the kernel's that does not know its size
         raise OSError(errno.EFBIG, f"allowed is a regular file of at most {most_bytes} bytes; this has more", str(path))
     return data
 

@@ -28,7 +28,7 @@ def chosen(options: argparse.Namespace) -> Iterator[Executor]:
     Raises OSError where no scheduler answers at the address, ValueError for no worker at all.
     """
     if options.dask is None:
-        # no forks of this one: of threads that libraries have begun they would have the locks and not the threads
+        # a fork of this process would inherit the locks of libraries' threads, but not the threads
         with ProcessPoolExecutor(options.workers, get_context("forkserver")) as here:
             yield here
         return

@@ -98,10 +98,10 @@ class Drive(NamedTuple):
             braking = self._acceleration(load_mm_s2, speed_mm_s, -1.0)
             if speed_mm_s + braking * dt_s <= 0.0:
                 return speed_mm_s + braking * dt_s
-            # it turns within the step, and what is left of that speeds it up
+            # the gap turns round within the step, and the rest of the step speeds it up
             dt_s += speed_mm_s / braking
             speed_mm_s = 0.0
-        # it stands where nothing is left over to start with: friction holds it
+        # where no force is left over to start with, friction holds the gap
         return max(speed_mm_s + self._acceleration(load_mm_s2, speed_mm_s, 1.0) * dt_s, 0.0)
 
     def _acceleration(self, load_mm_s2: float, speed_mm_s: float, direction: float) -> float:
@@ -166,7 +166,7 @@ class Brake(NamedTuple):
         for _ in range(NEWTON_STEPS):
             change_Tm = wanted_Tm - moment_Tm
             short_Tm = strength_Tm - wanted_Tm - self.lag_after_Tm(lag_Tm, change_Tm)
-            # where it stands still, the branch is the one that leads there
+            # at a standstill the branch is the one that leads to the wanted strength
             branch_Tm = math.copysign(self.branch_Tm, -(change_Tm or short_Tm))
             fading = abs(lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm) / self.turn_Tm
             wanted_Tm += short_Tm / max(1.0 - fading, LEAST_GAIN)
@@ -355,7 +355,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
             lowest = drive.lowest_mm_s(gap_mm, speed_mm_s, step_s)
             target_mm = wanted_mm(before_Tm)
             moves_mm_s, behind_mm = (wanted_mm(now_Tm) - target_mm) / step_s, target_mm - gap_mm
-            # the largest speed of approach from which the way that is left suffices to fall back to the target's own
+            # the largest speed of approach that the remaining way still brakes down to the target's own speed
             towards = math.copysign(1.0, behind_mm)
             faster_mm_s = min(max(moves_mm_s, lowest), highest) + towards * SECANT_MM_S
             slowed = drive.lowest_mm_s if behind_mm > 0.0 else drive.highest_mm_s

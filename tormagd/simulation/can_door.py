@@ -90,7 +90,7 @@ class CanDoor:
         try:
             self._hosts[descriptor].send(packet)
         except BlockingIOError:
-            return  # it does not read: its controller overruns
+            return  # a host that does not read: its controller overruns
         except OSError:
             self._dismiss(descriptor)
 

@@ -36,7 +36,7 @@ class SlcanAdapter:
         An incomplete command waits for the next call. Without an open channel a frame is refused.
         """
         *commands, rest = (self._pending + data).split(END)
-        # a command that does not end is refused when its end comes; no more than that of it is kept
+        # too long a command is refused when its end comes: no more of it is kept than shows its length
         self._pending = rest[: LONGEST_COMMAND + 1]
         answers, frames = b"", []
         for command in commands:

@@ -80,7 +80,7 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
     try:
         for folder in (secret_in, public_in):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # written where nobody else looks, and given its name only when it is whole; a link overwrites nothing
+        # a key is written in a hidden folder and named once it is whole; a hard link overwrites nothing
         with tempfile.TemporaryDirectory(dir=secret_in, prefix=".") as making:
             public_made, secret_made = zmq.auth.create_certificates(making, name)
             for made in (public_made, secret_made):

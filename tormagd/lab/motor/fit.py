@@ -254,7 +254,7 @@ class Way(NamedTuple):
 OTHER_WAYS = (
     (Way(is_full=True), Way(is_full=True, moving_share=MOSTLY)),
     (Way(current_shift=-0.5), Way(current_shift=0.5)),
-    # a current known once a millisecond is not its mean, and half as many show by how much that matters
+    # a sample a millisecond is not the current's mean; every second sample shows by how much that matters
     (Way(currents=slice(0, None, 2)), Way(currents=slice(1, None, 2))),
     (Way(thinned_Hz=WIDER_HZ),),
 )
@@ -328,7 +328,7 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
         fitted = linear(np.column_stack([seen.thin(term)[kept] for term in terms]), target, blocks)
         idle_N = 0.0
         if way.is_full:
-            # what the gears take idling is not transmitted, and no share of it is lost; and see `fit_volts` on mass
+            # the force that the gears take idling is not transmitted, so no share of it is lost; `fit_volts` on mass
             idle_N = abs(float(fitted.values[6]))
             terms += [seen.sign * np.minimum(np.abs(force), idle_N), seen.a * np.sign(seen.a * seen.v)]
             fitted = linear(np.column_stack([seen.thin(term)[kept] for term in terms]), target, blocks)

@@ -96,7 +96,7 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
         ([0.1, 5.0, 3e-4, 5.0], [0.0, 0.5, -0.01, 1.0], [1.0, 50.0, 0.01, 50.0], [0.1, 1.0, 1e-3, 1.0]),
         (np.full(terms, START_FRACTION), np.zeros(terms), np.full(terms, 0.3), np.full(terms, 0.03)),
         (times, times - spread, times + spread, np.full(terms, 0.5)),
-        # the lag as a share of what turns it, which a memory bounds; and that as a share of the greatest field
+        # the lag over the field change that turns it, which `Memory` bounds; that change over the greatest field
         ([0.1, 0.1], [0.0, 0.01], [0.25, 0.5], [0.1, 0.1]),
     )
     start, low, high, scale = (np.concatenate(column) for column in zip(*parts, strict=True))
