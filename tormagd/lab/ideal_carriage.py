@@ -295,8 +295,8 @@ def bound(
 ) -> Bound:
     """Return the bound for forces at rising times, linear in between, or held until the next.
 
-    `step_s` is the step of the result. Raises `DomainError` for under 2 or over MAX_STEPS steps, and RuntimeError as
-    `foresight_mm`.
+    `step_s` is the step of the result. Raises `DomainError` for under 2 or over MOST_STEPS steps and as `brake_of`, and
+    RuntimeError as `foresight_mm`.
     """
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MOST_STEPS:

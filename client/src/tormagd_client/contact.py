@@ -114,7 +114,8 @@ class ContactEstimator:
     def _line(self) -> tuple[float, float, float, float, float]:
         """Return slope and wall's place, the standard deviations of both, and a point's deviation from the line, N.
 
-        Slope and place are 0 and the deviations infinite while there are too few points.
+        Slope and place are 0 and the deviations infinite while points are too few, or the force does not rise with the
+        place.
         """
         if self._weight < LEAST * KEPT**LEAST or self._mm_N <= 0.0:
             return 0.0, 0.0, math.inf, math.inf, math.inf
