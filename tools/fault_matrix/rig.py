@@ -9,14 +9,13 @@ import msgpack
 
 from fault_matrix.bad_lines import BadBus, BadSerialLine
 from fault_matrix.cases import NOTHING, SERIAL, Injection
-from tormagd.assembly.build import Core, at_rates_of, build_core
+from tormagd.assembly.build import Core, build_core
 from tormagd.assembly.conditions import is_homed
 from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
-from tormagd.config import load_config
+from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.safety.operating_state import SafetyState
-from tormagd.scenes.scene import load_scene
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
@@ -76,13 +75,12 @@ class Rig:
         return self.loop.simulated.truth.force_N - asked_N(self.loop.now_s)
 
     def tick(self) -> Sample | None:
-        """One control period; None where the daemon does nothing in it."""
-        period_ms = 1_000 // self.config.rates.control_hz
+        """One control period; None where the daemon does nothing in it. Periods are 1 ms."""
         is_away = self.is_dead or self._stalled_ms > 0
-        self._stalled_ms -= period_ms
+        self._stalled_ms -= 1
         if self._hogged_ms is not None:
             is_away = is_away or self._hogged_ms % HOGGED_EVERY_MS < HOGGED_MS
-            self._hogged_ms += period_ms
+            self._hogged_ms += 1
         if is_away:
             self.loop.skip()
             return None
@@ -124,8 +122,7 @@ class Rig:
 @cache
 def _coronary() -> Core:
     """A core keeps nothing of what it is stepped through: one does for every rig."""
-    scene = load_scene("coronary")
-    return build_core(at_rates_of(scene, load_config(None)), scene)
+    return build_core(Config(scene="coronary"))
 
 
 def asked_N(now_s: float) -> float:
