@@ -10,7 +10,7 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
     """Return what is believed of the device at `now_s`, by name; docs/messages.md says what each value is.
 
     The device's force is `scale` times the model's plus `offset`, at a creep times `low_speed_factor`. `terms` are the
-    scene's: a belief about a term that is left out does not act.
+    scene's: a belief about a term that is left out does not act. `sd` is None where no deviation is known.
     """
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)

@@ -53,7 +53,10 @@ class CanStream:
         """The newest outgoing frame."""
 
     def pack(self, message: Message) -> tuple[int, bytes]:
-        """Return a message's CAN identifier and data. Raises EncodeError for a value that does not fit the wire."""
+        """Return a message's CAN identifier and data, and keep both in `sent`; a Drive's data also, to know its echo.
+
+        Raises EncodeError for a value that does not fit the wire.
+        """
         data = encode(message)
         if isinstance(message, Drive):
             self._drives.append(data)

@@ -302,7 +302,10 @@ class Connection:
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
 
     def _notice(self) -> None:
-        """Log a change of state, if there was one. When RUNNING has ended, count the loss and call `on_loss`."""
+        """Act on a change of state since the last call, if there was one, and log it.
+
+        When RUNNING begins, the back-off begins anew. When RUNNING has ended, the loss is counted and `on_loss` called.
+        """
         before, state = self._seen, self.state
         if state is before:
             return

@@ -26,14 +26,20 @@ class FrameStream:
         return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
-        """Return a message's frame, with the next sequence number. Raises EncodeError for a value that does not fit."""
+        """Return a message's frame, with the next sequence number, and keep it in `sent`.
+
+        Raises EncodeError for a value that does not fit the wire.
+        """
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         self.sent = frame
         return frame
 
     def unpack(self, data: bytes) -> list[Message]:
-        """Return the valid messages that `data` completes; a frame that does not decode is counted as corrupt."""
+        """Return the valid messages that `data` completes, and keep `data` in `received`.
+
+        A frame that does not decode is counted as corrupt; `statistics.refused` says why.
+        """
         self.received = data
         messages: list[Message] = []
         for frame in self._decoder.feed(data):

@@ -214,7 +214,10 @@ class DeviceClock:
         return self._fit
 
     def _turn(self, host_s: float) -> None:
-        """End the window, keep its least delayed State, and renew `drift` unless the clock stands."""
+        """End the window and begin the next: keep the least delayed State, if one came, and renew `drift` with it.
+
+        The drift of a clock that stands stays at -1.
+        """
         if self._least[0] < math.inf:
             self._windows.append(self._least)
             self._is_fitted = False
