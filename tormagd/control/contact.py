@@ -1,4 +1,4 @@
-"""What the hand does to the element, in the model's terms: it slides a handle, or presses a finger."""
+"""Contact of hand and element, in the model's terms: the hand slides a handle, or presses a finger."""
 
 from typing import Final, final
 
@@ -8,18 +8,20 @@ from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
 ROLLER_RATE_MM_S: Final = 42.0
 "Surface speed of the roller at the thesis's 20 rpm: the portrait is drawn for a handle in motion."
 CREEP_MM_S: Final = 0.5
-"A slower handle is planned for as if it crept: its friction is static."
+"A slower handle is planned for at this rate: its friction is static."
 GONE_BACK_MM: Final = 0.01
-"A handle that has gone back by more, just over a count of its encoder, may be turning."
+"A handle that has gone back by more may be turning: just over a count of its encoder."
 PRESSED: Final = 0.9
-"A finger that is less deep than this share of the scene's depth is on its way there, or gone."
+"A finger less deep than this share of the scene's depth is on its way in or out."
 
 
 class Contact:
-    """How a scene's element is touched. The methods raise NotImplementedError; each kind of contact gives its own.
+    """Kind of contact between hand and element, which states the motion that the model is asked for.
 
-    displacement_mm, rate_mm_s   those of the portrait, for a model that knows no others
-    slides                       friction makes the force
+    The methods raise NotImplementedError; each kind of contact gives its own.
+
+    displacement_mm, rate_mm_s   the motion that the portrait is drawn for
+    slides                       True where a handle slides and friction makes the force, False where a finger presses
     """
 
     def __init__(self, displacement_mm: float, rate_mm_s: float, slides: bool) -> None:
@@ -35,37 +37,37 @@ class Contact:
         raise NotImplementedError
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, to ask the model for now's force."""
+        """Return the displacement, mm, and the rate, mm/s, to ask the model with for the present force."""
         raise NotImplementedError
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether the model can give the force of now."""
+        """Tell whether the model can give the present force."""
         raise NotImplementedError
 
 
 @final
 class Sliding(Contact):
-    """The handle of a brake, planned for with friction mobilised and in motion: there the field decides the force.
+    """The sliding handle of a brake, which plans take as moving and with its friction mobilised.
 
-    Before break-away the hand chooses the force, and the inverse is ill-posed.
+    There the field decides the force. Before break-away the hand chooses the force, and the inverse is ill-posed.
     """
 
     def __init__(self) -> None:
         super().__init__(MOBILISED_MM, ROLLER_RATE_MM_S, slides=True)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the displacement and the rate that the force is planned for, as `Contact.planned`.
+        """Return the displacement, mm, and the rate, mm/s, that the force is planned for, as `Contact.planned`.
 
-        The displacement is the setpoint's, or MOBILISED_MM where it states none. Until friction is mobilised the rate
-        is the setpoint's, without its sign. Otherwise it is the measured `sliding_mm_s`, or MOVING_MM_S before a
-        measurement. The rate is CREEP_MM_S at least.
+        The displacement is the setpoint's, or MOBILISED_MM where it states none. Until friction is measured to be
+        mobilised (`is_known`), the rate is the one that the setpoint states, without its sign. Otherwise the rate is
+        the measured `sliding_mm_s`, or MOVING_MM_S before a measurement. A rate below CREEP_MM_S becomes CREEP_MM_S.
         """
         displacement_mm = MOBILISED_MM
         rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
         if setpoint is not None:
             if setpoint.displacement_mm is not None:
                 displacement_mm = setpoint.displacement_mm
-            # learned of the measured rate, a device would be taken for another at the stated one
+            # the device's fit is learned at the measured rate: at the stated one it would be another device's
             if setpoint.rate_mm_s is not None and (measured is None or not self.is_known(measured)):
                 rate_mm_s = abs(setpoint.rate_mm_s)
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
@@ -84,16 +86,16 @@ class Sliding(Contact):
 
 @final
 class Pressing(Contact):
-    """A finger in a pad. Until `is_known`, the force is planned for the scene's depth, at rest."""
+    """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest."""
 
     def __init__(self, depth_mm: float) -> None:
         super().__init__(depth_mm, 0.0, slides=False)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the depth and the rate that the force is planned for, as `Contact.planned`.
+        """Return the depth, mm, and the rate, mm/s, that the force is planned for, as `Contact.planned`.
 
-        Each is the setpoint's where it states one. Otherwise both are measured once the finger `is_known`; before, they
-        are the scene's depth and 0.
+        A depth or rate that the setpoint states is taken. The others are measured once the finger `is_known`. Before,
+        they are the scene's depth and 0.
         """
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
@@ -106,9 +108,9 @@ class Pressing(Contact):
         return depth_mm, rate_mm_s
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the measured depth and its rate, as `Contact.motion_now`."""
+        """Return the measured depth, mm, and its rate, mm/s, as `Contact.motion_now`."""
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether the finger is at least the share PRESSED of the scene's depth deep."""
+        """Tell whether the finger is deep enough: at least the share PRESSED of the scene's depth."""
         return measured.handle.displacement_mm >= PRESSED * self.displacement_mm

@@ -39,10 +39,10 @@ _PAUSED: Final = OperatingState.PAUSED
 
 @final
 class Planner:
-    """The planning half of the core: from setpoints to gaps, for one device."""
+    """Planning half of the core, for one device: turns the newest setpoint and measurement into a plan of the gap."""
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
-        """Begin at `now_s` with the gap open and an unseen device."""
+        """Begin at `now_s` with the gap open and nothing known of the device."""
         terms, insert = scene.terms, scene.insert
         gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
@@ -52,13 +52,14 @@ class Planner:
         self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
         self.aim = Aim(config, scene, element)
         self.planned = self.aim.begin(now_s, 0, 0.0)
-        "The newest."
+        "The newest plan."
 
     def plan(self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None) -> Plan:
-        """Return the next plan, and keep it in `planned`.
+        """Make the next plan, keep it in `planned`, and return it. All planning stages take one update.
 
         `setpoint` is None without a publisher. `measured` is None while the device is silent: nothing is learned of it.
-        Raises DomainError for a number that is not finite, or for a field that no gap gives: call `afresh` then.
+        Raises DomainError for a number that is not finite, a field that no gap gives, or a search's answer that is too
+        old. The stages are then half updated: call `afresh`.
         """
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
@@ -72,32 +73,35 @@ class Planner:
         return plan
 
     def foresee(self) -> bool:
-        """Prepare the forecast for the next plans, and return whether there was something to do.
+        """Forecast the force for the next plans, and return whether a forecast was due.
 
-        Call it after each plan, when nothing waits.
+        Call it after each plan, when nothing waits: a forecast takes longer than a plan.
         """
         return self.governor.foresee()
 
     @property
     def question(self) -> Question | None:
-        """What the search beside the plans is to be asked, as of the newest plan; None where there is none."""
+        """The newest plan's question to a search that runs beside the plans; None where plans search themselves."""
         return self.aim.question
 
     def answered(self, answer: Answer) -> None:
-        """Take the answer of the search beside the plans, for all plans until the next answer."""
+        """Take the `answer` of the search that runs beside the plans. All plans use it until the next answer."""
         self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
-        """Take `learned` for what is known of the device. The element's memory stays."""
+        """Replace what is known of the device by `learned`. The element's memory stays."""
         self.believe.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
+        """Take the operator's word in a dispute of device and sensor, as `Believe.confirm`; without a dispute do
+        nothing."""
         self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
-        """Begin anew at `now_s` after a plan that failed: nothing of the device is known. Plan numbers go on; the
-        memory stays."""
+        """Begin anew at `now_s` after a plan that failed, with nothing known of the device.
+
+        The newest plan is then one that opens the gap. Plan numbers go on, and the element's memory stays.
+        """
         self.believe.forget()
         self.governor.begin(now_s)
         self.planned = self.aim.begin(now_s, self.planned.number + 1, self.believe.memory.lag_mT)
@@ -105,13 +109,13 @@ class Planner:
 
 @final
 class Stepper:
-    """The driving half of the core: from measurements and plans to duties, for one device."""
+    """Driving half of the core, for one device: turns measurements and plans into duties, and latches faults."""
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
-        """Begin disabled at `now_s`. `move` is the actuator of the gap; without one, the carriages."""
+        """Begin disabled at `now_s`. `move` is the actuator of the gap; None: the carriages."""
         position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s = now_s
-        "Of the newest step."
+        "When the newest step was."
         self.safety = SafetyState()
         slides = scene.element == "torque"
         home_mm, full_mm_s = scene.insert.gap_open_mm / 2.0, full_speed_mm_s(config.motor)
@@ -129,11 +133,13 @@ class Stepper:
         return self.measure.measured
 
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
-        """Return the duties of one control period, for the newest `plan`; both 0 while the device is not driven or not
-        seen.
+        """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties.
 
-        `measurement` is None when the link is lost: the device is told OFF, and a driven device gives the fault
-        LINK_LOST. A number that is not finite is the fault NOT_FINITE. Raises DomainError where `now_s` is not finite.
+        A device that is not driven gets duties of 0 in mode OFF. While the loop is blind, or after a leap of the
+        encoders, a driven one gets 0 in mode RUN: friction holds the gap. `measurement` is None when the link is lost:
+        mode OFF, and a driven device gives the fault LINK_LOST. A measurement with a number that is not finite gives
+        the fault NOT_FINITE, and measuring and driving begin anew. Raises DomainError where `now_s` is not finite;
+        nothing has changed then.
         """
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:
@@ -162,10 +168,10 @@ class Stepper:
         return self._drive(now_s, dt_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
-        """Take an operator's command, one of `operating_state.COMMANDS`. Enabling also begins the motion from the
-        measured gap.
+        """Take an operator's command `name`, one of `operating_state.COMMANDS`.
 
-        Raises RefusedError, and nothing has changed then.
+        Enabling a disabled device also begins the motion at the measured gap. Raises RefusedError, and nothing has
+        changed then.
         """
         measured, before = self.measured, self.safety
         self.safety = command(before, name, now_s, self.watch.command_conditions(conditions, measured))
@@ -180,7 +186,10 @@ class Stepper:
         self.safety = latch(self.safety, (fault,))
 
     def lose_link(self) -> None:
-        """Forget the device, as the link broke. A device that was driven gives the fault LINK_LOST."""
+        """Forget the device after its link broke: its newest measurement, and how fast its motors gain speed.
+
+        A device that was driven gives the fault LINK_LOST. The gap's opening is no longer watched.
+        """
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
         self.opening.rest(self.safety.request_number)
@@ -188,7 +197,11 @@ class Stepper:
         self.move.lose_device()
 
     def _judge(self, now_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Measured:
-        """Latches the faults that show. What is measured of a device that has lost its position is not homed."""
+        """Latch the faults that show, and return `measured`.
+
+        While the device is not driven, its homing and opening are watched too. A device that has lost its position
+        counts as not homed, until it begins to home or is reset.
+        """
         measure = self.measure
         shown = self.watch.faults(
             now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
@@ -208,7 +221,7 @@ class Stepper:
         return measure.without_position(measured)
 
     def _hold(self, now_s: float) -> Duty:
-        """Asks the device for an answer without moving anything: friction holds the gap. Nothing is learned from it."""
+        """Return duties of 0 in mode RUN: the device answers, and friction holds the gap. The watch counts nothing."""
         limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
         if self.measure.leap is not None:
             limit = Limit.ENCODER
@@ -216,6 +229,10 @@ class Stepper:
         return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
 
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
+        """Return the duties that follow `plan`, or hold the gap while PAUSED, and count what the watch sees.
+
+        A duty that is not finite gives the fault NOT_FINITE, as in `_begin_anew`.
+        """
         followed = None if self.safety.operating_state is _PAUSED else plan
         try:
             drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
@@ -226,7 +243,11 @@ class Stepper:
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
     def _begin_anew(self) -> Duty:
-        """A number is not finite: nothing that it may have come into is kept, and nothing is driven."""
+        """Latch the fault NOT_FINITE, and return duties of 0 in mode OFF.
+
+        What the number may have entered is forgotten: the newest measurement, the watches on homing and motion, the
+        actuator.
+        """
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()
         self.homing = Homing(self._ceiling_N)

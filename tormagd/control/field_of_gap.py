@@ -1,4 +1,4 @@
-"""The field that a gap makes in the elastomer, and the reverse."""
+"""The field that a gap makes in the elastomer, and the gap that makes a field."""
 
 import math
 from typing import Final, final
@@ -9,9 +9,9 @@ from tormagd.physics.field import PowerFieldLaw, flux_density_T
 
 @final
 class FieldOfGap:
-    """Flux density at the shaft's surface, mT, over the gap, mm, in one insert: Eq. 6 with the power law's a.
+    """Flux density at the shaft's surface, mT, over the gap, mm, in one insert: Eq. 6 with a power law of the gap.
 
-    It computes what `PowerFieldLaw` and `flux_density_T` do, on floats alone.
+    It gives what `PowerFieldLaw` and `flux_density_T` give, computed on floats alone.
     """
 
     def __init__(self, law: PowerFieldLaw, relative_permeability: float, inner_radius_m: float) -> None:
@@ -25,13 +25,14 @@ class FieldOfGap:
         self._weakest_mT: Final = self.field_mT(farthest_mm)
 
     def field_mT(self, gap_mm: float) -> float:
-        """Return the flux density |b| at R_i for this gap. Raises DomainError outside the law's range of gaps."""
+        """Return the flux density, mT, at the shaft's surface for `gap_mm`. Raises DomainError outside the law's range
+        of gaps."""
         if not self._range_mm[0] <= gap_mm <= self._range_mm[1]:
             raise DomainError("gap_mm", gap_mm, f"a number from {self._range_mm[0]:g} to {self._range_mm[1]:g}")
         return 1e3 * (self._coefficient * math.pow(gap_mm, self._exponent) * self._per_moment_T)
 
     def gap_mm(self, field_mT: float) -> float:
-        """Return the gap that gives `field_mT`. Raises DomainError where no gap in the law's range does."""
+        """Return the gap, mm, that gives `field_mT`. Raises DomainError where no gap in the law's range does."""
         if not self._weakest_mT <= field_mT <= self._strongest_mT:
             raise DomainError(
                 "field_mT", field_mT, f"a number from {self._weakest_mT:g} to {self._strongest_mT:g}, which gaps give"

@@ -7,18 +7,19 @@ from tormagd.model.features import require_number
 from tormagd.physics.errors import DomainError
 
 STRETCHES: Final = 1024
-"So many equal ones a rising list is divided into, to find a place in it: few points share one."
+"Number of equal stretches that a rising list is divided into, to find a place fast: few points share one."
 LEAST_SPAN: Final = 1e-9
-"A list that does not rise has its points in the outermost of them."
+"A list that spans less counts as spanning this much: no division by 0."
 LEAST_STEP: Final = 1e-200
+"Between neighbours that differ by less there is no finite slope."
 
 
 @final
 class Rising:
-    """A list (n) of finite numbers that rises, with a fast search for places in it.
+    """A list (n) of finite numbers that rises, with a fast search for a value's place. The order is not checked.
 
-    Raises DomainError for numbers that are not finite, and for two that differ by less than LEAST_STEP: no slope is
-    between them. Equal numbers are allowed.
+    Raises DomainError for a number that is not finite or too large, and for neighbours that differ by less than
+    LEAST_STEP. Equal neighbours are allowed.
     """
 
     def __init__(self, values: list[float]) -> None:
@@ -28,18 +29,18 @@ class Rising:
                 raise DomainError("values", value, f"{values[place - 1]:g}, or {LEAST_STEP:g} from there")
         self.values: Final = values
         self._per_unit: Final = STRETCHES / max(values[-1] - values[0], LEAST_SPAN)
-        # the points before each stretch, as a value finds its own, and before what is beyond the last of them
+        # how many points lie before each stretch, and last, before what is beyond them; values find theirs alike
         points_in = [0] * (STRETCHES + 1)
         for value in values:
             points_in[min(max(int((value - values[0]) * self._per_unit), 0), STRETCHES)] += 1
         self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     def after(self, value: float) -> int:
-        """Return how many numbers are not above `value`, as `bisect_right` does. Raises DomainError for NaN."""
+        """Return how many numbers are at most `value`, as `bisect_right` does. Raises DomainError for NaN."""
         values = self.values
         stretch = (value - values[0]) * self._per_unit
         if not stretch >= 0.0:
-            if stretch != stretch:  # it would be taken for the last, which is the closest gap
+            if stretch != stretch:  # NaN would be taken for the last, which is the closest gap
                 raise DomainError("value", value, "a number")
             return 0
         place = self._points_before[int(stretch) if stretch < STRETCHES else STRETCHES]
@@ -49,13 +50,15 @@ class Rising:
 
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x`, linear between the points (n, n), and the outermost `ys` beyond them. Raises DomainError for
-    NaN."""
+    """Return y at `x`, linear between the points of `xs` and `ys` (n each).
+
+    Beyond the points the first or last of `ys` holds. Raises DomainError for NaN.
+    """
     return interpolated_before(xs.after(x), x, xs, ys)
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """Return `interpolated` where `after` is `xs.after(x)`. Does not look for NaN."""
+    """Return y at `x` as `interpolated`, with the place `after` = `xs.after(x)` already known. NaN is not refused."""
     if after == 0:
         return ys[0]
     if after == len(ys):
@@ -66,8 +69,10 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n), linear, and the last beyond. Raises
-    DomainError for NaN."""
+    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n), linear between them.
+
+    Beyond the last the last holds. Raises DomainError for NaN.
+    """
     if not steps < len(ys) - 1:
         if steps != steps:
             raise DomainError("steps", steps, "a number")

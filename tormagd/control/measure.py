@@ -11,22 +11,26 @@ from tormagd.model.displacement import MOVING_MM_S, Turn
 
 RATE_FILTER_S: Final = 0.05
 QUICK_FILTER_S: Final = 0.01
+"Time constants of the handle's rate, and of the rate that shows a stop sooner."
 SLIDING_MM: Final = 0.3
-"Friction takes on the level of another rate over some such travel; without travel it does not change."
+"Travel over which friction takes on the level of another rate; without travel its level stays."
 FAST_MM_S: Final = 2.0 * MOVING_MM_S
-"From here on friction hardly depends on the rate."
+"At higher rates friction hardly depends on the rate."
 MIN_DT_S: Final = 5e-6
 "Half a step of the device's clock: less time gives no speed."
 
 
 @final
 class Measure:
-    """The newest measurement of one device, filtered, with its silence (`sight`) and its encoders' steps (`leap`)."""
+    """The stage that turns one device's messages into positions, filtered speeds and the handle's motion.
+
+    `sight` tells whether the device is silent, `leap` whether an encoder has stepped as no carriage moves.
+    """
 
     measured: Measured | None = None
-    "The newest; None while the device has said nothing."
+    "The newest record; None while the device has said nothing."
     leap: Leap | None = None
-    "Of the encoders, until the device has said whether it was reset."
+    "The step of the encoders that no carriage makes, until the device has said whether it was reset; else None."
 
     def __init__(
         self, home_mm: float, derivative_filter_s: float, turns: bool, full_speed_mm_s: float, period_s: float
@@ -34,8 +38,9 @@ class Measure:
         """Take the constants of one device.
 
         `home_mm` is a carriage's distance from the centre plane on its home switch. `derivative_filter_s` is the time
-        constant of carriage speeds, `full_speed_mm_s` one carriage's speed. With `turns` the element is a handle that
-        turns round. Without it a finger presses, whose force always has the same sign.
+        constant of carriage speeds, `full_speed_mm_s` one carriage's greatest speed, `period_s` the control period.
+        With `turns` the element is a handle that turns round. Without it a finger presses, whose force always has the
+        same sign.
         """
         self.sight = Sight(period_s)
         self._home_mm: Final = home_mm
@@ -44,17 +49,17 @@ class Measure:
         self._full_speed_mm_s: Final = full_speed_mm_s
 
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
-        """Return what is measured at `now_s`, one tick after `last_s`, and keep it in `measured`.
+        """Measure at `now_s`, one tick after `last_s`: return the new record, and keep it in `measured`.
 
-        A `measurement` that is not new gives the last record again. Updates `sight`, and begins or ends a `leap`. With
-        `needs_homing` the device's word that it is homed does not count.
+        A `measurement` that is not new gives the last record again. Updates `sight`, and begins or ends a `leap`. A
+        leap ends when the counts come back, when the device says that it is not homed, or with `needs_homing`.
         """
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
         self.sight.update(last_s, now_s, is_new)
         measured = self.measured = self._measured(last, measurement)
         if self.leap is not None:
-            # it was reset, which it says itself; or it was a burst on a line, and the counts are right again
+            # a device that was reset says so itself; after a burst of noise on the line the counts are right again
             is_over = needs_homing or not measurement.is_homed
             if is_over or self.leap.has_come_back(measured, self._full_speed_mm_s, now_s):
                 self.leap = None
@@ -63,8 +68,10 @@ class Measure:
         return measured
 
     def without_position(self, measured: Measured) -> Measured:
-        """Return `measured` marked as not homed, and keep it. The next new measurement brings the device's own word
-        again."""
+        """Return `measured` marked as not homed, and keep it as the newest.
+
+        The next new measurement brings the device's own word again.
+        """
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
 
@@ -78,10 +85,11 @@ class Measure:
         self.sight.forget()
 
     def begin(self, measurement: Measurement) -> None:
-        """Begin with one measurement, at rest: speeds are 0 and the handle has not travelled."""
+        """Replace the newest record by one of `measurement` at rest: speeds are 0, and the handle has not travelled."""
         self.measured = self._first(measurement)
 
     def _first(self, measurement: Measurement) -> Measured:
+        """Return a record of `measurement` at rest, with a handle that has not travelled."""
         return Measured(
             number=measurement.number,
             is_homed=measurement.is_homed,
@@ -98,15 +106,18 @@ class Measure:
         )
 
     def _measured(self, last: Measured | None, measurement: Measurement) -> Measured:
-        """The same one again where the device has said nothing new. Speeds are filtered derivatives over the *device's*
-        clock, so that late delivery is not mistaken for slow motion."""
+        """Return the record of `measurement`, or `last` again where the device has said nothing new.
+
+        `last` is None before the first: the record is one at rest. Speeds are filtered derivatives over the *device's*
+        clock, so that late delivery is not mistaken for slow motion.
+        """
         if last is None:
             return self._first(measurement)
         dt_s = measurement.device_time_s - last.device_time_s
         if measurement.number == last.number or dt_s < MIN_DT_S:
             return last
         left_mm, right_mm = self._home_mm + measurement.left_mm, self._home_mm + measurement.right_mm
-        # without news of the handle it has not stopped: its motion is judged over all the time since the last
+        # a handle without a new Sense has not stopped: its motion is judged over all the time since the last Sense
         handle, handle_time_s = last.handle, last.handle_time_s
         if measurement.sensed_s != last.sensed_s:
             handle = self._handle(last, measurement.handle_mm, measurement.device_time_s - handle_time_s)
@@ -127,12 +138,13 @@ class Measure:
         )
 
     def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
+        """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` after `last`."""
         before = last.handle
         travel_mm = position_mm - last.handle_mm
         rate_mm_s = low_pass(before.turn.direction * before.rate_mm_s, travel_mm / dt_s, dt_s, RATE_FILTER_S)
         quick_mm_s = low_pass(before.turn.direction * before.quick_mm_s, travel_mm / dt_s, dt_s, QUICK_FILTER_S)
         slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
-        # friction's level is one of 300 and 42 mm/s, and another of 4: how much faster it has been does not count
+        # friction has one level at 42 and 300 mm/s, another at 4: a greater rate before counts as FAST_MM_S
         from_mm_s = min(before.sliding_mm_s, max(abs(rate_mm_s), FAST_MM_S))
         sliding_mm_s = from_mm_s + slid * (abs(rate_mm_s) - from_mm_s)
         if not self._turns:

@@ -11,10 +11,10 @@ from tormagd.model.model_file import ForceModel
 
 @final
 class Nominal:
-    """The force of one element as one model has it. It has no state, and asks the model only about what it was trained
-    on.
+    """The nominal element: the force that one model gives over the field. It has no state.
 
-    Without `has_rate`, the handle always moves as in the portrait: `only`.
+    The model is asked only within the range that it was trained on. Without `has_rate`, `now` and `planned` always give
+    `only`, the curve for the portrait's motion.
     """
 
     def __init__(self, model: ForceModel, contact: Contact, cip_percent: float, has_rate: bool) -> None:
@@ -23,7 +23,7 @@ class Nominal:
         self._cip_percent: Final = cip_percent
         self._has_rate: Final = has_rate
         known_mm = model.feature_ranges[0]
-        # what slides is planned for mobilised: the handle's way there is no force that a field could be found for
+        # a handle is planned for with friction mobilised: before that no field gives the force, the hand chooses it
         mobilised_mm = within(contact.displacement_mm, known_mm)
         self._displacements_mm: Final = (mobilised_mm, mobilised_mm) if contact.slides else known_mm
         self._rates_mm_s: Final = model.feature_ranges[1]
@@ -31,7 +31,7 @@ class Nominal:
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        """Return the force over the field for the handle's present motion."""
+        """Return the model's force over the field for the handle's present motion."""
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.motion_now(measured)
@@ -40,10 +40,10 @@ class Nominal:
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
     ) -> tuple[ForceCurve, tuple[Outside, ...]]:
-        """Return the force over the field for the handle of a setpoint, and what of it the model does not know.
+        """Return the model's force over the field for the motion to plan for, and what of it is out of range.
 
-        `setpoint` is None without a publisher, `measured` before a measurement. An `Outside` tells what was asked, and
-        what the model was asked instead.
+        `setpoint` is None without a publisher, `measured` before a measurement. Each `Outside` names a quantity of the
+        motion that the model does not know, the value asked for and the value used. Without `has_rate` there is none.
         """
         if not self._has_rate:
             return self.only, ()
@@ -57,6 +57,7 @@ class Nominal:
         return curve, outside
 
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
-        """Return the force over the field at this displacement and rate, each held within what the model knows."""
+        """Return the model's force over the field at this displacement, mm, and rate, mm/s, each held within the
+        model's range."""
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

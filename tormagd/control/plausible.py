@@ -6,13 +6,13 @@ from firmware_protocol.value import Value
 from tormagd.control.records import Measured
 
 LEAP_SPEEDS: Final = 3.0
-"No motor, and no pull of the magnets, moves a carriage faster than so many times the motor's own full speed,"
+"No motor, and no pull of the magnets, moves a carriage faster than so many times the motor's own full speed."
 LEAP_MM: Final = 0.1
-"and backlash, a screw that springs back and the encoder's counts come to less than this."
+"Backlash, a screw that springs back and the encoder's counts come to less than this."
 OVERRUN_MM: Final = 2.5
-"A carriage may overrun its switches, and have been found beyond the closed end, by less than this."
+"A carriage may overrun its switches, and be found beyond the closed end, by less than this."
 CLOSED_END_MM: Final = 45.0
-"The device's smallest gap; a scene may close less far, and begin with a device that another one has closed further."
+"The device's smallest gap. A scene that closes less far may begin with carriages that another scene has left closer."
 
 
 @final
@@ -39,7 +39,10 @@ class Leap(Value):
         self.right_from_mm: Final = right_from_mm
 
     def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
-        """Tell whether both carriages read places that they can have reached: the leap was noise on a line."""
+        """Tell whether both carriages read places that they can have reached from before the step.
+
+        The leap was noise on a line then. `full_speed_mm_s` is one carriage's.
+        """
         max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
             abs(measured.left_mm - self.left_from_mm) <= max_mm
@@ -53,9 +56,10 @@ class Leap(Value):
 def leap_between(
     last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
 ) -> Leap | None:
-    """Return the leap from `last`, found at `seen_s`, to `measured`, found at `now_s`. None: carriages can do this.
+    """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None.
 
-    The step took the longer of two times, the device's clock and the host's.
+    `last` was found at `seen_s`, `measured` at `now_s`. The step took the longer of two times, by the device's clock
+    and by the host's. `full_speed_mm_s` is one carriage's.
     """
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
@@ -68,8 +72,8 @@ def leap_between(
 def is_outside(measured: Measured, closed_mm: float, open_mm: float, is_left_open: bool, is_right_open: bool) -> bool:
     """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`.
 
-    A place is impossible outside the stroke. A carriage whose open switch is closed cannot be far from its open end
-    either.
+    A place outside the stroke is impossible. So is one far from the open end while the carriage's open switch is closed
+    (`is_left_open`, `is_right_open`).
     """
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     home_mm = open_mm / 2.0 - OVERRUN_MM

@@ -16,7 +16,7 @@ from tormagd.safety.operating_state import DeviceRequest
 
 @final
 class Wall(Value):
-    """An elastic wall at `place_mm` on the way of the handle that pushes on; until then it feels `friction_N`."""
+    """An elastic wall at `place_mm` on the handle's way. In front of it a handle that pushes on feels `friction_N`."""
 
     def __init__(self, place_mm: float, stiffness_N_mm: float, friction_N: float = 0.0) -> None:
         self.place_mm: Final = place_mm
@@ -24,23 +24,23 @@ class Wall(Value):
         self.friction_N: Final = friction_N
 
     def force_N(self, handle_mm: float) -> float:
-        """The force on a handle that pushes on and is there."""
+        """Return the force, N, on a handle that pushes on and is at `handle_mm`."""
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
 
 
 @final
 class TimedSetpoint(Value):
-    """The newest valid setpoint: a law of the force over the handle's way and place, `asked_N`.
+    """A publisher's newest valid setpoint. It states the force over the handle's place and way: `asked_N`.
 
-    force_N                      of a handle that pushes on, where there is no `wall`
+    force_N                      for a handle that pushes on, where there is no `wall`
     stamp_s                      when the publisher meant it, on the clock of `now_s`
     valid_for_s                  how long after the stamp it is followed
-    displacement_mm, rate_mm_s   the handle's, planned for; None where the publisher states none
-    preview_N                    the forces that follow it, `preview_dt_s` apart
-    holder                       numbers the publishers that have held the brake, one after the other
-    is_contested                 somebody else sends setpoints too
-    withdraw_N                   of a handle that withdraws; None where it is alike both ways
-    wall                         what is pushed against
+    displacement_mm, rate_mm_s   the handle's motion that is planned for; None where the publisher states none
+    preview_N                    the forces that follow `force_N`, `preview_dt_s` apart; empty without a preview
+    holder                       number of the publisher that holds the brake; each new holder has a greater one
+    is_contested                 another publisher sends setpoints too
+    withdraw_N                   for a handle that withdraws; None: the wall's friction, `force_N` without a wall
+    wall                         what the handle pushes against; None: nothing
     """
 
     def __init__(
@@ -70,8 +70,11 @@ class TimedSetpoint(Value):
         self.wall: Final = wall
 
     def asked_N(self, travel: "Travel") -> float:
-        """The force for a handle that is there and goes that way. A brake that withdraws from a wall is asked for the
-        wall's friction: it cannot push the handle back."""
+        """Return the force, N, that is asked for a handle with this `travel`.
+
+        A handle that withdraws is asked for `withdraw_N`. Where that is None, it is asked for the wall's friction, or
+        for `force_N` without a wall: a brake cannot push the handle back.
+        """
         if not travel.is_pushing and self.withdraw_N is not None:
             return self.withdraw_N
         if self.wall is None:
@@ -80,19 +83,21 @@ class TimedSetpoint(Value):
 
     @property
     def preview_s(self) -> float:
-        """How long after its stamp the preview ends."""
+        """How long after its stamp the preview ends, s; 0 without a preview."""
         return self.preview_dt_s * len(self.preview_N)
 
     @property
     def preview_slope_N_s(self) -> float:
-        """The mean slope of a preview that is there."""
+        """The mean slope of the preview, N/s. Ask only where there is a preview."""
         return (self.preview_N[-1] - self.force_N) / self.preview_s
 
 
 @final
 class Travel(Value):
-    """Where the handle is and how it moves, positive pushing on. A handle that was turned back, or is held while it is
-    pulled back, is withdrawing."""
+    """The handle's place, mm, and its rate, mm/s, both positive pushing on.
+
+    A handle that was turned back, or is held while it is pulled back, withdraws: `is_pushing` is False.
+    """
 
     def __init__(self, place_mm: float, rate_mm_s: float, is_pushing: bool = True) -> None:
         self.place_mm: Final = place_mm
@@ -101,6 +106,7 @@ class Travel(Value):
 
 
 AT_REST: Final = Travel(0.0, 0.0)
+"The travel of a handle before a measurement."
 
 
 @final
@@ -109,8 +115,9 @@ class Handle(Value):
 
     displacement_mm   travel since `turn`, or how deep a finger is in a pad
     rate_mm_s         positive the way the handle went last, or inwards
-    sliding_mm_s      >= 0, the rate at which friction slides: over the last travel, so that a stopped handle keeps it
-    quick_mm_s        the rate over less time, which shows a stop sooner; the same where it is not given
+    turn              where a handle last turned round, and which way it has gone since
+    sliding_mm_s      >= 0, the rate that friction has the level of: a mean over travel, which a stopped handle keeps
+    quick_mm_s        the rate filtered over less time, which shows a stop sooner; None: `rate_mm_s`
     """
 
     def __init__(
@@ -132,9 +139,12 @@ class Handle(Value):
 class Measured(Value):
     """What is measured of the carriages and the handle.
 
-    Carriage places are in mm from the centre plane, and meaningless unless homed. `force_N` is the sensor's, against
-    the handle's motion. Force and handle came at `sensed_s` on the host's clock, and at `handle_time_s` on the
-    device's. `handle_mm` is the encoder's place. `number` is the measurement's.
+    number                 the measurement's
+    left_mm, right_mm      carriage places from the centre plane, meaningless unless `is_homed`; with speeds
+    force_N                the sensor's, against the handle's motion
+    handle_mm              the handle's place on its encoder
+    device_time_s          when the carriages were measured, on the device's clock
+    sensed_s               when force and handle came, on the host's clock; `handle_time_s` on the device's
     """
 
     def __init__(
@@ -167,17 +177,17 @@ class Measured(Value):
 
     @property
     def gap_mm(self) -> float:
-        """Distance between the magnets."""
+        """Distance between the magnets, mm."""
         return self.left_mm + self.right_mm
 
     @property
     def gap_speed_mm_s(self) -> float:
-        """How fast it opens."""
+        """How fast the gap opens, mm/s."""
         return self.left_mm_s + self.right_mm_s
 
     @property
     def skew_mm(self) -> float:
-        """Left carriage minus right carriage."""
+        """Place of the left carriage minus that of the right, mm."""
         return self.left_mm - self.right_mm
 
 
@@ -185,12 +195,12 @@ class Measured(Value):
 class Belief(Value):
     """What is believed of the device at a plan.
 
-    device            its force over the model's without memory, for the rate at which the handle slides
-    at_speed          the same at the speed of a handle in motion
-    unseen            a device of which nothing is known, while what is known of this one is from another day; else None
+    device            its force over the model's without memory, at the rate at which the handle slides
+    at_speed          its force over the model's without memory, for a handle at speed
+    unseen            a device of which nothing is known, while `device` is known only from another day; else None
     lag_s             how late its carriages come
     predicted_N       the force that it is expected to show now; None where nothing is known, as before break-away
-    limits            what is wrong with what it shows
+    limits            what is wrong with its sensor, its encoder or the fit of its force
     sensor_doubted_s  for how long of sliding its force sensor has not been believed
     """
 
@@ -217,13 +227,13 @@ class Belief(Value):
 class Ask(Value):
     """The force to render.
 
-    asked_N     what the setpoint asks for now; None without one
-    force_N     of that, what to render now
-    path_N      (7) at `path.PATH_S` after the moment that is planned for
-    age_s       the setpoint's age, None without one
+    asked_N     what the setpoint asks for now; None without a setpoint
+    force_N     what of `asked_N` to render now
+    path_N      the forces (7) at `path.PATH_S` after the moment that is planned for
+    age_s       the setpoint's age; None without a setpoint
     limits      what holds the force back
     foresight   0..1, how well what comes is known: 1 from a preview, less where the force repeats, 0 where extrapolated
-    is_meant    a publisher wants it, nothing decays
+    is_meant    True while a valid setpoint is followed, False while the force decays
     """
 
     def __init__(
@@ -247,7 +257,7 @@ class Ask(Value):
 
 @final
 class Outside(Value):
-    """A quantity outside what the model knows: the value asked for, and the one used instead."""
+    """A quantity outside what the model knows: its name, the value asked for, and the value used instead."""
 
     def __init__(self, quantity: str, asked: float, used: float) -> None:
         self.quantity: Final = quantity
@@ -259,16 +269,20 @@ class Outside(Value):
 class Plan(Value):
     """Where the gap should go, and why.
 
-    number            lets a recording say which plan a tick used
-    setpoint_N        the force that the publisher asks for, None without a setpoint, and its age `setpoint_age_s`
+    number            counts plans: a recording says with it which plan a tick used
+    time_s            when the plan was made
+    setpoint_N        the force that the publisher asks for, and its age `setpoint_age_s`; None without a setpoint
     stamp_s           of the setpoint that the force follows; -inf where it follows none
     governed_N        the force to render now
     predicted_N       the force that the device is expected to show now; None where the model does not know
     field_mT          the gap's field for the force
     gap_mm            with its speed and acceleration, opening positive; never closer than `min_gap_mm`
-    confidence        0..1, of the model's in `field_mT`
+    confidence        0..1, of the model in `field_mT`
+    limits            what holds the force back
+    foresight         as in `Ask`
     trim              the device's force over the model's at `governed_N`
     outside           what the limit MODEL_RANGE is about
+    sensor_doubted_s  as in `Belief`
     search_age_s      how long ago the search for `field_mT` began; 0 where it is part of the plan
     """
 
@@ -317,9 +331,9 @@ class Plan(Value):
 
 @final
 class Duty(Value):
-    """What goes to the device: a duty for each motor, within -position.duty_limit..position.duty_limit, and its mode.
+    """What goes to the device: the drive mode, and a duty for each motor, within +-position.duty_limit.
 
-    `request` is the newest, numbered `request_number`. `limits` are what holds the force back.
+    `request` is the newest request to the device, numbered `request_number`. `limits` are what holds the force back.
     """
 
     def __init__(

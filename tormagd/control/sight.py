@@ -9,27 +9,27 @@ from typing import Final, final
 
 BLIND_S: Final = 0.005
 BLIND_PERIODS: Final = 5.0
-"""Without a new state for longer than both, where the carriages are is not known well enough to drive them. The answer
-to the first Drive after a stall may take twice as long."""
+"""The loop is blind after both of these times without a new State: the carriages' places are not known well enough to
+drive them. The answer to the first Drive after a stall may take twice as long."""
 UNSENSED_S: Final = 0.02
 "Without a new Sense for longer than this and BLIND_PERIODS, force and handle are not measured."
 SHOWN_S: Final = 0.1
-"A stall is shown for this long after."
+"A stall is shown for this long after its end."
 
 
 @final
 class Sight:
-    """The times of new states and of steps, and whether the loop is blind; at first it is not."""
+    """Whether the loop is blind, told from the times of steps and of new States; at first it is not."""
 
     seen_s: float = math.inf
-    "When a new state was last found."
+    "When a new State was last found; inf before the first."
     stalled_s: float
-    "When a stall last ended,"
+    "When a stall last ended; -inf before the first."
     stall_s: float = 0.0
-    "and how long it was, or the longest of those that came within SHOWN_S of each other."
+    "How long that stall was, or the longest of stalls that came within SHOWN_S of each other."
     is_blind: bool = False
     was_blind: bool = False
-    "At the step before."
+    "Whether the loop was blind at the step before."
 
     def __init__(self, period_s: float) -> None:
         self.stalled_s = -math.inf
@@ -52,8 +52,11 @@ class Sight:
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 
     def update(self, last_s: float, now_s: float, is_new: bool) -> None:
-        """Take a step at `now_s`, after the last one at `last_s`. `is_new`: this step has a state that the last one had
-        not."""
+        """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind`.
+
+        `is_new` says that a State has come since the last step. A step that comes too late ends a stall: the loop is
+        blind until a later step finds a new State.
+        """
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:
             before_s = self.stall_s if self.has_stalled(now_s) else 0.0
