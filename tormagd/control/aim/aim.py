@@ -32,23 +32,23 @@ from tormagd.scenes.scene import Scene
 _INSIDE: Final = Reach.INSIDE
 
 OLDEST_ANSWER_S: Final = 0.5
-"An older answer of a search beside the plans makes planning fail, and the gap opens."
+"With an older answer of a search beside the plans planning fails, and the gap opens."
 
 _PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
 _TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
 _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
-"From the path's distances from its beginning to the speed and acceleration there of the nearest parabola."
+"Weights from a path's distances from its beginning to speed and acceleration there, of the nearest parabola."
 
 
 class Element(NamedTuple):
-    """How the nominal device makes force.
+    """The nominal device: how its element makes force.
 
     nominal    the force over the field
     memory     relaxation and the field's hysteresis
     field      the field over the gap
     portrait   the force over the gap, without memory
     search     the search for a field
-    law        the force law that the model is held against; None for a pad, of which no law is known
+    law        the force law that the search's field is held near; None for a pad, of which no law is known
     is_beside  the search takes longer than a plan has, and runs beside the plans
     """
 
@@ -63,16 +63,17 @@ class Element(NamedTuple):
 
 @final
 class Aim:
-    """The last stage of planning, which makes one plan of the gap after another."""
+    """The last stage of planning: turns the force asked for into a field, the field into a gap, and both into a
+    plan."""
 
     number: int = 0
-    "Of the newest plan."
+    "Number of the newest plan."
     element_mT: float = 0.0
-    "The element's field at it: where several fields give a force, the one nearest to this is taken."
+    "The element's field at the newest plan: of several fields that give a force, the nearest to this is taken."
     question: Question | None = None
-    "What a search beside the plans is to be asked; None where plans search themselves."
+    "The newest plan's question to a search beside the plans; None where plans search themselves."
     answer: Answer
-    "Its newest, which plans use until the next one comes."
+    "The newest answer of a search beside the plans; plans use it until the next one comes."
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
         self._nominal: Final = element.nominal
@@ -90,8 +91,10 @@ class Aim:
         self._low_confidence: Final = config.limits.low_confidence
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
-        """Return the plan before the first, with the gap open and this `number`. The element's field lags by
-        `lag_mT`."""
+        """Begin at `now_s`, and return a plan with the gap open, no setpoint and this `number`.
+
+        The element's field lags `lag_mT` behind the gap's. The field of the open gap becomes the newest `answer`.
+        """
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
@@ -110,8 +113,9 @@ class Aim:
         """Return the next plan, for the force in `ask` and the device in `belief`.
 
         `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent.
-        Updates `number` and `element_mT`, and `question` where a search runs beside the plans. Raises DomainError where
-        no gap gives the field, or the newest answer is older than OLDEST_ANSWER_S.
+        `memory` gives the lag of the element's field. Updates `number` and `element_mT`, and `question` where a search
+        runs beside the plans. Raises DomainError where no gap gives the field, or the newest answer is older than
+        OLDEST_ANSWER_S.
         """
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
@@ -131,13 +135,19 @@ class Aim:
         return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
 
     def answer_to(self, question: Question) -> Answer:
-        """Return the answer of the search to `question`, for a search beside the plans. Changes nothing; raises
-        DomainError."""
+        """Search the field for `question`, for a search that runs beside the plans, and return the answer.
+
+        Changes nothing. Raises DomainError for a number that is not finite.
+        """
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        """The field for this force; where the search runs beside the plans, its newest answer."""
+        """Return the field for the model's force `wanted_N`.
+
+        Where the search runs beside the plans, note the `question` for it, and return its newest answer. Raises
+        DomainError for an answer older than OLDEST_ANSWER_S.
+        """
         if not self._is_beside:
             return self._search.solve(curve, wanted_N, self.element_mT)
         self.question = Question(now_s, curve.displacement_mm, curve.rate_mm_s, wanted_N, self.element_mT)
@@ -159,6 +169,7 @@ class Aim:
         limits: tuple[Limit, ...],
         outside: tuple[Outside, ...],
     ) -> Plan:
+        """Return the record of the plan to `gap_mm`, with the gap's motion ahead."""
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
@@ -191,7 +202,10 @@ class Aim:
         is_held: bool,
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
-        """What holds the force back, in the order in which it does; `is_held`: the ceiling holds the gap."""
+        """Return what holds the force back, in the order in which it does. `is_held`: the ceiling holds the gap.
+
+        F_MIN is told only while a publisher asks for a force.
+        """
         limits = (*ask.limits, *believed)
         if outside:
             limits = (*limits, Limit.MODEL_RANGE)
@@ -207,7 +221,11 @@ class Aim:
         return limits
 
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
-        """Speed and acceleration of the gap along these forces at PATH_S (7), within what the carriages do."""
+        """Return speed, mm/s, and acceleration, mm/s^2, of the gap at the beginning of the forces `path_N` (7) at
+        PATH_S.
+
+        Both are held within what the configuration lets the gap do.
+        """
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
         start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))
         speed, acceleration = 0.0, 0.0

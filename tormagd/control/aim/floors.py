@@ -9,7 +9,7 @@ from tormagd.control.records import Belief
 CEILING: Final = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
 LAW_SHARE: Final = 0.12
-"Greatest share by which the search's field may differ from the force law's; on sample 1 it differs by 1 to 11%."
+"Greatest share by which a field may differ from the force law's; on sample 1 the search's differs by 1 to 11%."
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
@@ -18,22 +18,25 @@ def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Devic
 
 
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap, mm, at which the device gives no more than `ceiling_N`, taken SURE deviations stronger."""
+    """Return the least gap, mm, at which the device, taken SURE deviations stronger, gives no more than `ceiling_N`."""
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
 
 
 def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return `ceiling_mm` of the device `belief.unseen`, which the real one may be; the closed gap, mm, where that is
-    None."""
+    """Return the least gap, mm, as `ceiling_mm`, for a device of which nothing is known (`belief.unseen`).
+
+    Until the handle has slid, the real device may be that one. Where `belief.unseen` is None, the closed gap is
+    returned.
+    """
     if belief.unseen is None:
         return portrait.gap_mm[-1]
     return ceiling_mm(portrait, belief.unseen, ceiling_N, bounds)
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
-    """Return `field_mT`, held within a share LAW_SHARE of the law's field for the model's force `wanted_N`.
+    """Return `field_mT`, held within a share LAW_SHARE of the field that the force law gives for `wanted_N`.
 
-    `law` is None where no law is known: the field stays as it is.
+    `wanted_N` is the model's force. `law` is None where no law is known: the field stays as it is.
     """
     if law is None:
         return field_mT

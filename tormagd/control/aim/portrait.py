@@ -14,13 +14,14 @@ from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
+"Number of gaps in a portrait."
 
 
 @final
 class Portrait:
-    """Force and its slope |dF/dgap|, N/mm, over the gap, at n points, for one contact and without memory.
+    """Force, N, and its slope |dF/dgap|, N/mm, over the gap, mm, at n points, for one contact and without memory.
 
-    Along the lists forces rise, and gaps fall evenly.
+    Along the lists forces rise, and gaps fall evenly. A look-up raises DomainError for NaN.
     """
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
@@ -32,48 +33,55 @@ class Portrait:
 
     @property
     def min_N(self) -> float:
-        """F_min: what the open gap gives."""
+        """F_min: the force that the open gap gives."""
         return self.force_N[0]
 
     @property
     def max_N(self) -> float:
-        """F_max: what the closed gap gives."""
+        """F_max: the force that the closed gap gives."""
         return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
-        """Return |dF/dgap| at the gap that gives this force; at the nearer end of the range where none does."""
+        """Return |dF/dgap| at the gap that gives `force_N`; at the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
-        """Return the gap of `gap_mm_at`, and |dF/dgap| at the next point of more force."""
+        """Return the gap of `force_N`, as `gap_mm_at`, and |dF/dgap| at the next point of more force.
+
+        Beyond the last point the slope is the last point's.
+        """
         after = self._rising_N.after(force_N)
         gap_mm = interpolated_before(after, force_N, self._rising_N, self.gap_mm)
         return gap_mm, self.slope_N_mm[min(after, len(self.slope_N_mm) - 1)]
 
     def gap_mm_at(self, force_N: float) -> float:
-        """Return the gap that gives this force; the nearer end of the range where none does."""
+        """Return the gap, mm, that gives `force_N`; the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.gap_mm)
 
     def force_N_at(self, gap_mm: float) -> float:
-        """Return the force at this gap; outside the range, the force of the nearer end."""
+        """Return the force, N, at `gap_mm`; outside the range, the force of the nearer end."""
         return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
-        """Return the rate of force, N/s, that this gap speed makes at the gap of this force."""
+        """Return the rate of force, N/s, that the speed `gap_speed_mm_s` makes at the gap that gives `force_N`."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 
 @final
 class PortraitSearch:
-    """The search for a model without the handle's rate: the gap of a force in `shown`, and its field."""
+    """Field search of a scene without the term `rate`: looks the force's gap up in a portrait, and takes that gap's
+    field."""
 
     def __init__(self, shown: Portrait, field: FieldOfGap) -> None:
         self._portrait: Final = shown
         self._field: Final = field
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`, as `FieldSolver.solve` does. `curve` gives the confidence of a force out of
-        reach. Raises DomainError for numbers that are not finite."""
+        """Return the field for `force_N`, as `FieldSolver.solve` does; `last_field_mT` is checked, and has no effect.
+
+        A force in reach has confidence 1. For one out of reach the field is that of the nearer end, with the confidence
+        that `curve` gives there. Raises DomainError for a number that is not finite.
+        """
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
         field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
@@ -88,7 +96,7 @@ class PortraitSearch:
 class LawOfField:
     """The magnetoelastic law of the insert (Eq. 29 to 34) over a portrait's gaps, scaled to the portrait's force.
 
-    The learned model is held against it. Force and field rise along the lists.
+    Search results are held near this law. Force and field rise along the lists.
     """
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
@@ -96,16 +104,17 @@ class LawOfField:
         self.fields_mT: Final = fields_mT
 
     def field_mT(self, force_N: float) -> float:
-        """Return the field for a force; the field of the nearer end where none gives it."""
+        """Return the field, mT, that gives `force_N` by the law; the field of the nearer end where none does."""
         return interpolated(force_N, self._rising_N, self.fields_mT)
 
 
 def law_beside(
     shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
 ) -> LawOfField:
-    """Return the force law over the gaps of the portrait `shown`, times the median ratio of the portrait's force to it.
+    """Return the force law at the gaps of the portrait `shown`, scaled to the portrait's force.
 
-    Raises `DomainError` where the gaps leave the law's domain.
+    The scale is the median ratio of the portrait's force to the law's. Raises DomainError where the gaps leave the
+    law's domain.
     """
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
@@ -114,8 +123,10 @@ def law_beside(
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
-    """Return the portrait that the model's `curve` predicts at GRID gaps over `gap_range_mm`, closed and open. Raises
-    `DomainError` where the field law ends."""
+    """Return the portrait that the model's `curve` predicts, at GRID gaps over `gap_range_mm`, closed and open.
+
+    Raises DomainError where the field law ends.
+    """
     gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))

@@ -22,19 +22,19 @@ from tormagd.control.interpolation import at_step
 Array = npt.NDArray[np.float64]
 
 GRID_S: Final = 0.01
-"Step of the grid of time that forces are remembered on; counts below are of its points."
+"Step of the grid of time on which forces are remembered. Counts below are of its points."
 HISTORY: Final = 1_000
 "Ten seconds: a dozen heart beats, two breaths."
 MIN_HISTORY: Final = 100
-"With less nothing is forecast."
+"With fewer points nothing is forecast."
 RISE_DELAYS: Final = (1, 2, 4, 7, 11)
 BEAT_DELAYS: Final = (1, 3, 8, 18, 38)
-"""Of the embeddings: a stretch is compared at these points before its end, as changes from there. They reach back to
-the rise of a pulse, or to what came before it."""
+"""Delays of the two embeddings, in points: a stretch is compared at these points before its end, as changes from the
+end. They reach back to the rise of a pulse, or to what came before it."""
 TAPS: Final = 5
-"As many as there are delays in each."
+"Number of delays in each embedding."
 STRIDE: Final = 3
-"Every third stretch is looked at."
+"Every third stretch of the history is compared."
 HORIZON: Final = 8
 "Points that are forecast: a plan looks 30 ms ahead, and further by the carriages' lag."
 HORIZON_S: Final = HORIZON * GRID_S
@@ -43,16 +43,16 @@ EVERY: Final = 2
 JUDGED: Final = 4
 "The point ahead that forecasts are judged at: the middle of what a plan looks at."
 MAX_STEP_S: Final = 0.1
-"Setpoints further apart than this are no stream: nothing that was learned outlives the gap."
+"Setpoints further apart than this are no stream: the forecast begins anew."
 SAME_N: Final = 1e-4
 "Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
 UNLIKE_N: Final = 0.05
-"Where every stretch differs by more, none is like the newest. On sample 1 30 mN do as well, 80 a little worse."
+"Where every stretch differs by more, nothing is forecast. On sample 1 30 mN do as well, 80 a little worse."
 RIDGE: Final = 0.01
 "Share by which the regression's variances are raised: stretches that hardly differ teach no dependence."
 MAX_LEVERAGE: Final = 100.0
-"""Nothing is forecast from a stretch of more leverage, as after a jump: 1 and its squared distance from the mean of
-those most like it, in their standard deviations."""
+"""Nothing is forecast from a stretch of more leverage, as after a jump. Leverage is 1 plus its squared distance from
+the mean of the stretches most like it, in their standard deviations."""
 LONG_S: Final = 2.0
 SHORT_S: Final = 0.2
 "Skill is earned over the long time, a few beats, and lost over the short."
@@ -66,8 +66,8 @@ _LONGEST: Final = BEAT_DELAYS[-1]
 def embedding(delays: tuple[int, ...]) -> Array:
     """Return the places of all stretches in a full history, as negative indices from its end.
 
-    Shape (TAPS + 1 + HORIZON, n): a column for each stretch, with its compared points, its end, and what followed. The
-    first column is the newest stretch: what followed is its own end.
+    Shape (TAPS + 1 + HORIZON, n). A column holds one stretch: the points at `delays` (TAPS), its end, and the points
+    that followed. The first column is the newest stretch, after which its own end is repeated.
     """
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
     ends = np.arange(-1 - HORIZON, _LONGEST - HISTORY - 1, -STRIDE)
@@ -75,12 +75,13 @@ def embedding(delays: tuple[int, ...]) -> Array:
 
 
 EMBEDDINGS: Final = np.stack([embedding(RISE_DELAYS), embedding(BEAT_DELAYS)])
-"Shape (2, TAPS + 1 + HORIZON, n)."
+"The places of both embeddings' stretches, shape (2, TAPS + 1 + HORIZON, n): see `embedding`."
 
 
 @final
 class Guess(Value):
-    """What was said of the force at one point of the grid, N: by each embedding, their mixture and the slope."""
+    """The force that was forecast for one point of the grid, N: by each embedding, by their mixture and by the
+    slope."""
 
     def __init__(self, rise_N: float, beat_N: float, forecast_N: float, slope_N: float) -> None:
         self.rise_N: Final = rise_N
@@ -90,43 +91,48 @@ class Guess(Value):
 
 
 NOTHING_SAID: Final[tuple[Guess | None, ...]] = (None,) * JUDGED
+"The guesses awaited while nothing is forecast."
 UNJUDGED_SHORT: Final = Skill(0.0, 0.0)
 LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
-"The skill of late where nothing is like the newest stretch: what is forecast after that has to earn it again."
+"The skill over SHORT_S where nothing is like the newest stretch: the next forecast has to earn trust again."
 
 
 @final
 class Forecast:
-    """Learner of one stream of setpoints, which tells how the stream goes on."""
+    """Learner of one stream of setpoints, which forecasts how the force goes on."""
 
     stamp_s: float
-    "Of the newest setpoint."
+    "Stamp of the newest setpoint; -inf before the first."
     force_N: float
+    "Force of the newest setpoint."
     time_s: float
-    "Of the newest point of the grid, not after the newest setpoint."
+    "Time of the newest point of the grid, not after the newest setpoint."
     history: bytes
-    "The forces on the grid, float64."
+    "The forces on the grid, float64, newest last."
     from_s: float
-    "The point of the grid that `changes_N` are from,"
+    "The point of the grid from which the forecast was made; -inf without a forecast."
     changes_N: list[float]
-    "from there to itself and the points ahead; empty while nothing is forecast."
+    "The forecast: changes of force from that point to itself and the points ahead; empty while nothing is forecast."
     awaited: tuple[Guess | None, ...]
-    "What was said of the next points of the grid, to be judged by what comes."
+    "Guesses (JUDGED) for the next points of the grid, to be judged by what comes; None where none was made."
     long: Skill
-    "Skill over the slope, of LONG_S"
+    "Skill of the forecast over the slope, of LONG_S."
     short: Skill
-    "and of SHORT_S."
+    "Skill of the forecast over the slope, of SHORT_S."
     rise_missed: float
-    "Mean square of what each embedding's forecast missed, N²."
+    "Mean squared error of the embedding RISE_DELAYS, N²."
     beat_missed: float
+    "Mean squared error of the embedding BEAT_DELAYS, N²."
 
     def __init__(self) -> None:
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     @property
     def trust(self) -> float:
-        """0..1: how far the forecast takes the place of the slope. It is the skill of LONG_S, less the share of it that
-        SHORT_S lost, and 0 while nothing is forecast."""
+        """How far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast.
+
+        It is the skill score of LONG_S, times 1 less what the score of SHORT_S is below 0, each held within 0..1.
+        """
         if not self.changes_N:
             return 0.0
         earned, lost = self.long.score, -self.short.score
@@ -137,10 +143,10 @@ class Forecast:
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     def update(self, stamp_s: float, force_N: float) -> None:
-        """Take one setpoint, and judge what was forecast for its time. Makes no forecast: `foresee` does.
+        """Take one setpoint, judge what was forecast for its time, and remember it on the grid. Makes no forecast.
 
-        A stamp up to GRID_S before the newest counts as the newest. A force with the newest stamp takes the place of
-        the newest force. An older stamp, or a pause of more than MAX_STEP_S, begins anew.
+        A stamp up to GRID_S before the newest counts as the newest. A force with the newest stamp replaces the newest
+        force. An older stamp, or a pause of more than MAX_STEP_S, begins anew.
         """
         if -GRID_S < stamp_s - self.stamp_s < 0.0:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
@@ -154,10 +160,11 @@ class Forecast:
         self.stamp_s, self.force_N = stamp_s, force_N
 
     def foresee(self, slope_N_s: float) -> bool:
-        """Forecast from the newest point of the grid, once for EVERY point, and return whether there was something to
-        do.
+        """Make a forecast from the newest point of the grid, and return whether one was due.
 
-        The forecast and `slope_N_s` are noted, to be judged by what comes.
+        One is due after every EVERY points, once the history has MIN_HISTORY points. The forecast is empty where
+        nothing is like the newest stretch. Its guess, and that of the slope `slope_N_s`, are noted to be judged by what
+        comes.
         """
         if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
             return False
@@ -165,7 +172,7 @@ class Forecast:
         changes: list[float] = []
         said: Guess | None = None
         if rise or beat:
-            # for one that finds nothing alike the other speaks
+            # where one embedding finds nothing alike, the other's forecast is taken
             rise, beat = rise or beat, beat or rise
             rise_weight = (self.rise_missed + rise_unlike) ** -2
             share = rise_weight / (rise_weight + (self.beat_missed + beat_unlike) ** -2)
@@ -178,12 +185,12 @@ class Forecast:
         return True
 
     def forces_N(self, begins_after_s: float, after_s: list[float]) -> list[float]:
-        """Return the forces (n) at `begins_after_s` + `after_s` (n), seconds >= 0 after the newest setpoint's stamp.
+        """Return the forecast forces (n) at `begins_after_s` + `after_s` (n), s, after the newest setpoint's stamp.
 
-        Beyond the forecast's end its last force holds. `trust` must be above 0.
+        The times are >= 0. Beyond the forecast's end its last force holds. Call it only while `trust` is above 0.
         """
         changes = self.changes_N
-        # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
+        # the forecast is shifted through the newest setpoint, which may have come after the point it was made from
         since_s = self.stamp_s - self.from_s
         base_N = self.force_N - at_step(since_s / GRID_S, changes)
         return [base_N + at_step((since_s + begins_after_s + later_s) / GRID_S, changes) for later_s in after_s]
@@ -195,7 +202,10 @@ class Forecast:
         self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
 
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
-        """Goes `count` points of the grid on: what was said of them is judged by what came."""
+        """Add `count` points to the grid, up to a new setpoint, and judge the guesses for them by what came.
+
+        A forecast that does not reach beyond the new setpoint is dropped.
+        """
         spacing_s = stamp_s - self.stamp_s
         times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]
         shares = [(time_s - self.stamp_s) / spacing_s for time_s in times_s]
@@ -211,6 +221,7 @@ class Forecast:
             self.changes_N = []
 
     def _judge(self, guess: Guess, came_N: float) -> None:
+        """Update the skills and both embeddings' errors with what came at the point of one guess."""
         error_N, slope_error_N = guess.forecast_N - came_N, guess.slope_N - came_N
         self.long = self.long.after(error_N, slope_error_N, _LONG_SHARE)
         self.short = self.short.after(error_N, slope_error_N, _SHORT_SHARE)
@@ -219,6 +230,7 @@ class Forecast:
         self.beat_missed += _LONG_SHARE * (beat_error_N * beat_error_N - self.beat_missed)
 
     def _guess(self, rise: list[float], beat: list[float], changes: list[float], slope_N_s: float) -> Guess:
+        """Return what each embedding, their mixture and the slope say of the point JUDGED steps ahead."""
         since_s = self.stamp_s - self.time_s
         return Guess(
             _ahead_N(self.force_N, rise, since_s),
@@ -229,21 +241,21 @@ class Forecast:
 
 
 def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
-    """JUDGED points ahead, along changes from a point `since_s` before the newest force."""
+    """Return the force JUDGED points ahead, along changes from a point `since_s` before the newest force."""
     return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
 
 
 def _search(history: Array) -> list[tuple[list[float], float]]:
-    """Return for each embedding the changes from the newest point of the grid to itself and the next HORIZON; none
-    without a like stretch.
+    """Forecast with each embedding, and return for each the changes of force and a distance.
 
-    Also returned is the distance of the stretch most like the newest: the mean square of a point, N², at least
+    The changes go from the newest point of the grid to itself and the next HORIZON points; there are none without a
+    like stretch. The distance is that of the stretch most like the newest: the mean square of a point, N², at least
     SAME_N's.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.
     """
-    # both at once: most of the time goes into the calls, not into their numbers
+    # both embeddings at once: most of the time goes into the calls, not into their numbers
     changes = history[EMBEDDINGS[:, :, : (len(history) - _LONGEST - 1 - HORIZON) // STRIDE + 2]]
     changes -= changes[:, TAPS : TAPS + 1]
     before = changes[:, :TAPS]
@@ -263,7 +275,7 @@ def _constants(rows: list[list[float]]) -> list[float]:
     """Return the regression's constants, the first 0, by elimination from its normal equations.
 
     `rows` are weighted sums of products, one row for each regressor, with 1 last. Columns are the regressors, then the
-    points that followed.
+    points that followed. A newest stretch of more leverage than MAX_LEVERAGE gives an empty list.
     """
     total = rows[TAPS][TAPS]
     variance = 0.0

@@ -23,27 +23,28 @@ LASTS_S: Final = [
     0.5 * (after_s - before_s)
     for before_s, after_s in zip([0.0, *TIMES_S[:-1]], [*TIMES_S[1:], TIMES_S[-1]], strict=True)
 ]
-"The time that each of them stands for: from half way to the one before to half way to the next."
+"The time that each of TIMES_S stands for: from half way to the one before to half way to the next."
 CHANGES_PER_S: Final = [1.0 / (after_s - before_s) for before_s, after_s in pairwise(TIMES_S)]
-"From how much the gap wanted changes to the next point to its speed."
+"Factors from the difference of a path's neighbouring points to its speed between them."
 SPEEDING_UP_S: Final = 0.025
 "Time constant with which the gap comes to another speed where carriages are in time; sample 1: 20 to 30 ms do as well."
 NEAR_S: Final = 0.18
-"What the gap gets to in this time is near. On sample 1, with a third, a finger's pulse is missed by 39, not 35 mN."
+"""What the gap gets to in this time is near. On sample 1, with a third of it, a finger's pulse is missed by 39, not 35
+mN."""
 FLATTEST_N_MM: Final = 1e-3
-"A force that hardly depends on the gap counts as if it did by this much."
+"Least slope |dF/dgap| of a weight: a force that hardly depends on the gap counts as if it did by this much."
 
 
 @final
 class Path:
-    """The best path for one portrait (force over gap) and one top speed of the gap; without state."""
+    """Finder of the gap's best path, for one portrait (force over gap) and one top speed of the gap; without state."""
 
     def __init__(self, portrait: Portrait, gap_speed_mm_s: float) -> None:
         self._portrait: Final = portrait
         self._gap_speed_mm_s: Final = gap_speed_mm_s
 
     def is_near(self, from_N: float, to_N: float, device: DeviceFit) -> bool:
-        """Tell whether this device's gap, at its top speed, gets from one force to the other within NEAR_S."""
+        """Tell whether the device's gap, at its top speed, gets from the force `from_N` to `to_N` within NEAR_S."""
         portrait = self._portrait
         away_mm = portrait.gap_mm_at(device.model_N(from_N)) - portrait.gap_mm_at(device.model_N(to_N))
         return abs(away_mm) < NEAR_S * self._gap_speed_mm_s
@@ -58,14 +59,14 @@ class Path:
         lag_s: float,
         most_N: list[float] | None = None,
     ) -> tuple[list[float], float]:
-        """Return the forces (7) at PATH_S along the best path for `wanted_N` (n) at TIMES_S, and the force to send.
+        """Find the best path for the forces `wanted_N` at TIMES_S, and return forces (7) at PATH_S and a force to send.
 
-        `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`. The returned force is
-        that of the gap to send the carriages to now. `most_N` (7) opens the path where it would give more; None: no
-        bound.
+        `wanted_N` has n >= 7 forces, for the first n of TIMES_S. The carriages are to be sent now to the gap of the
+        force to send. The gap follows its carriages with the time constant SPEEDING_UP_S + `lag_s`, and the forces (7)
+        are those of the gap. `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`.
 
-        The gap follows its carriages with the time constant SPEEDING_UP_S plus `lag_s`. So the carriages are sent ahead
-        of the path by its speed times this time; with `most_N`, `wanted_N` has to be of so much later already.
+        Without `most_N` the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7)
+        opens the path where it would give more than that. Then `wanted_N` has to be of so much later already.
         """
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
@@ -101,10 +102,10 @@ def nearest_path_mm(
     speed_mm_s: float,
     count: int,
 ) -> list[float]:
-    """Return the first `count` gaps of the best path for `wanted_mm` (n), with `weights` (n) > 0.
+    """Return the first `count` gaps of the path that misses `wanted_mm` (n) least, in squares times `weights` (n) > 0.
 
-    The points are the first n of the rising `times_s`; the path goes no faster than `speed_mm_s`. The first point is
-    `elapsed_s` after the gap was at `start_mm`.
+    The points are the first n >= `count` of the rising `times_s`. The path goes no faster than `speed_mm_s`, and was at
+    `start_mm` `elapsed_s` before the first point.
     """
     best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
     path_mm: list[float] = []
@@ -118,12 +119,15 @@ def nearest_path_mm(
 
 
 def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
-    """The gap that is best at each point (n) for it and all that comes after, if it can be reached in time."""
+    """Return for each point the gap (n) from which it and all later points are missed least.
+
+    The gap that the path comes from is not regarded.
+    """
     best_mm = wanted_mm[:]
-    # the least cost of the rest is convex in the gap, with a piecewise linear derivative: a step of the gap shifts its
-    # two sides apart, and a point adds a line
-    # the kinks beside the flat piece, nearest last, each less the distance that its side is shifted from its point back
-    # to time 0; and by how much the slope of the derivative grows where one is passed on the way out
+    # the least cost of what comes is convex in the gap, with a piecewise linear derivative: one point further back in
+    # time, its two sides are shifted apart by what the gap can move, and the point adds a line
+    # kinks of the derivative below and above its zero, nearest last, each less the shift of its side from there back to
+    # time 0; and by how much the derivative's slope grows where a kink is passed on the way out
     below_mm: list[float] = []
     below: list[float] = []
     above_mm: list[float] = []

@@ -5,14 +5,14 @@ from typing import Final, final
 from firmware_protocol.value import Value
 
 DOUBT_N: Final = 0.02
-"Before the first is judged, the two count as this far apart and equally good."
+"Before an error is judged, the two guesses count as this far apart and equally good."
 FORGIVEN_N: Final = 0.003
 "Differences as small as this neither earn trust nor lose it."
 
 
 @final
 class Skill(Value):
-    """Means of squares, N², with the newest counting most.
+    """Skill of one guess over another: means of squares, N², with the newest counting most.
 
     gained   the other guess's squared error less this one's
     apart    the squared difference of the two guesses
@@ -31,9 +31,12 @@ class Skill(Value):
 
     @property
     def score(self) -> float:
-        """Gained over apart. Of all mixtures, what was judged would have been met best by one with the share
-        (1 + score) / 2 of the first guess."""
+        """The skill score: `gained` over `apart`.
+
+        The mixture with the share (1 + score) / 2 of the first guess would have had the least squared error.
+        """
         return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
 
 
 UNJUDGED: Final = Skill(0.0, DOUBT_N * DOUBT_N)
+"The skill before an error is judged."

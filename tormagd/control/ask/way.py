@@ -1,9 +1,10 @@
-"""Whether the handle pushes on or withdraws.
+"""Way of the handle: whether it pushes on or withdraws.
 
-withdrawing   it has turned back, and either the hand pulls: the force that holds it has changed its sign; or it has
-              come back by SLID_MM. Or the force has turned by UNSEEN_N, and the encoder shows nothing
+turned   the encoder shows the handle going the other way, and its force is over PULLS_N there, or it came SLID_MM
+pulled   the encoder shows nothing, but the force has changed its sign and is over UNSEEN_N
 
-A held handle that trembles turns back by what bristles give, but its hand goes on pushing: its way stays.
+Either changes the way. A held handle that trembles turns back by what bristles give, but its hand goes on pushing: its
+way stays.
 """
 
 from typing import Final, final
@@ -11,25 +12,26 @@ from typing import Final, final
 from tormagd.control.records import AT_REST, Measured, Travel
 
 PULLS_N: Final = 0.1
-"More than noise and drift of a force sensor."
+"Least force of a hand that pulls: more than noise and drift of a force sensor."
 UNSEEN_N: Final = 0.5
-"Bristles give more than the encoder's reversal before a hand pulls so hard: the encoder stands still."
+"Before a hand pulls so hard, bristles give more than the encoder's reversal: the encoder stands still."
 SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, 5 N/mm at 1.5 N either way."
 
 
 def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
-    """Return where the handle is, mm, and how it moves, mm/s, positive pushing on."""
+    """Return the handle's place, mm, and rate, mm/s, both positive pushing on. `push_sign` is 1 or -1, as for `Way`."""
     handle = measured.handle
     return push_sign * measured.handle_mm, push_sign * handle.turn.direction * handle.quick_mm_s
 
 
 @final
 class Way:
-    """The stage that follows the handle of a brake along the way of the task."""
+    """The stage that follows a brake's handle along the way of the task: its place, its rate, and whether it pushes
+    on."""
 
     travel: Travel = AT_REST
-    "At the newest measurement; at rest while there is none."
+    "The newest travel; at rest before a measurement."
     changed_mm: float = 0.0
     "The encoder's place where the way last changed."
 
@@ -38,13 +40,17 @@ class Way:
         self._push_sign: Final = float(push_sign)
 
     def update(self, measured: Measured | None, is_sensor_believed: bool) -> Travel:
-        """Return where the handle is and goes. A force sensor that is not believed does not show which way."""
+        """Return the handle's travel, and keep it in `travel`.
+
+        `measured` is None while the device is silent: the handle counts as resting where it was. With
+        `is_sensor_believed` False the force shows no way, and only travel on the encoder does.
+        """
         before = self.travel
         if measured is None:
             self.travel = Travel(before.place_mm, 0.0, before.is_pushing)
             return self.travel
         turn, place_mm = measured.handle.turn, measured.handle_mm
-        # how far it is against the way that it is known to go, and which force resists that
+        # 1 where the encoder shows the handle pushing on, -1 where withdrawing; a positive force resists that motion
         onward = self._push_sign * turn.direction
         is_pushing = before.is_pushing
         has_turned = (onward > 0.0) != is_pushing
