@@ -26,30 +26,33 @@ from tormagd.scenes.scene import Scene
 
 MIN_DT_S: Final = 0.003
 MAX_DT_S: Final = 0.02
-"Readings teach at most this often; a gap in the readings counts as the second at most."
+"Readings teach every MIN_DT_S at most; a gap between readings counts as MAX_DT_S at most."
 CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
 STOPPING_MM_S: Final = 0.5 * MOVING_MM_S
 STUCK_N: Final = 0.08
-"""A handle whose rate over the last 10 ms is less, and that gives so much less than friction, is stuck, whatever its
-slower rate still says."""
+"""A handle is stuck where its rate over the last 10 ms is under STOPPING_MM_S and its force so much less than friction.
+Its slower rate may still say that it slides."""
 COMES_TO_REST: Final = 3.0
-"A handle that has slid no faster for some travel creeps; one that has slid so many times faster only comes to rest."
+"A handle whose `sliding_mm_s` is at least this many times its rate only comes to rest: it does not creep."
 MIN_EXPECTED_N: Final = 0.1
-"Of less force no share is told."
+"Least force that a share is computed of."
 UNTARED_N: Final = 0.15
-"A zero that is further off is the limit SENSOR_ZERO: half an hour's drift."
+"A zero that is further off gives the limit SENSOR_ZERO: half an hour's drift."
 CONTRADICTED_N: Final = 0.4
-"A profile whose force is further off than rest, warmth and another zero explain is another device's."
+"A reading further off than this contradicts a fit from another day: no rest, warmth or zero explains it."
 MIN_FORESIGHT: Final = 0.5
-"With less what is planned leaps, and no carriages are on time."
+"With less foresight a plan's gap leaps, and any carriages come late: no lag is learned."
 
 
 @final
 class Learned(Value):
     """What is known of a device from another day.
 
-    `slow_factor` is its force at a creep over its force at speed. The share `slow_learned`, 0..1, of it was learned at
-    a creep. `lag_s` is its carriages'.
+    device         the fit of its force
+    slow_factor    its force at a creep over its force at speed
+    slow_learned   the share of `slow_factor` that was learned at a creep, 0..1
+    sensor_zero_N  what its force sensor reads without a force
+    lag_s          how late its carriages come
     """
 
     def __init__(
@@ -72,28 +75,30 @@ NOTHING_LEARNED: Final = Learned()
 
 @final
 class Believe:
-    """The estimators of one device."""
+    """The stage that learns one device from its readings: it updates the estimators, and says what is believed."""
 
     read: int = -1
-    "Number of the newest measurement that taught,"
+    "Number of the newest measurement that taught; -1 before the first."
     read_s: float
-    "and when."
+    "When that measurement taught; -inf before the first."
     heard_N: float = 0.0
-    "What the model said then."
+    "The model's force at the newest reading at speed."
     limits: tuple[Limit, ...] = ()
-    "What is wrong with what the sensor shows."
+    "What is wrong with the sensor or with the fit, as the newest reading at speed shows."
     taught: DeviceFit = UNSEEN
-    "What is known of the device from another day."
+    "The fit from another day that was taught; UNSEEN without one."
     is_prior: bool = False
-    "What is known from another day is believed of the device."
+    "Whether a fit from another day was taught, and no reading has contradicted it."
     is_contradicted: bool = False
-    "The first slide has shown another device than `taught`."
+    "Whether the first slide has shown another device than `taught`."
 
     def __init__(
         self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory, min_model_N: float
     ) -> None:
-        """Begin with an unseen device. `min_model_N` is the model's force with the gap open, for `min_N`. `update`
-        advances `memory`."""
+        """Begin with an unseen device.
+
+        `memory` is advanced by `update`. `min_model_N` is the model's force with the gap open, for `min_N`.
+        """
         terms = scene.terms
         trim = config.trim
         self._min_model_N: Final = min_model_N
@@ -108,16 +113,18 @@ class Believe:
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
         self.read_s = -math.inf
         self.learns = terms.learning
-        """Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it
-        forgotten."""
+        """Whether anything is learned. Without learning the sensor is still judged, and a dispute still takes the fit
+        back."""
         self._has_lag: Final = terms.motor
         self._has_creep: Final = terms.creep and nominal.contact.slides
         self._fits: Final = terms.scale or terms.offset
 
     @property
     def device(self) -> DeviceFit:
-        """The device's force over the model's without memory, as its element is relaxed now, at speed. Of two that fit
-        the readings it is the one with more force."""
+        """The fit of the device's force to the model's without memory, at speed, with the element as relaxed as now.
+
+        In a dispute of device and sensor it is the explanation with more force: the fit, scaled up by `sensor.lead_N`.
+        """
         fit, lead_N = self.strength.fit, self.sensor.lead_N
         if lead_N > 0.0:
             fit = fit.times(1.0 + lead_N / max(fit.force_N(self.heard_N), MIN_EXPECTED_N))
@@ -125,7 +132,7 @@ class Believe:
 
     @property
     def min_N(self) -> float:
-        """F_min of this device: what its open gap gives at speed."""
+        """F_min of this device: the force of its open gap at speed."""
         return self.device.force_N(self._min_model_N)
 
     def knows_zero(self, now_s: float) -> bool:
@@ -133,13 +140,15 @@ class Believe:
         return self.zero.sd_N(now_s) <= self._unknown_sd_N
 
     def learned(self) -> Learned:
-        """Return what is known of this device, for `teach` on another day; in a dispute, scale and offset from before
-        it."""
+        """Return what is known of this device, to `teach` on another day.
+
+        In a dispute, scale and offset are those from before it.
+        """
         slow = self.slow
         return Learned(self.strength.fit, slow.factor, slow.learned, self.zero.zero_N, self.carriages.lag_s)
 
     def teach(self, learned: Learned) -> None:
-        """Take `learned` for all that is known of the device, and begin every estimator of it anew.
+        """Replace all that is known of the device by `learned`, and begin its estimators anew.
 
         Until the handle has slid, the device may still be another one. The element's memory and the watch on the
         encoder stay.
@@ -162,7 +171,7 @@ class Believe:
         """Learn from `measured`, where it is new, and return the belief at `now_s`.
 
         `measured` is None while the device is silent: nothing is learned. A device that is not homed teaches no force.
-        Raises DomainError for a measured gap outside the field law's range.
+        The element's memory follows the measured gap. Raises DomainError for a gap outside the field law's range.
         """
         model_N: float | None = None
         if measured is not None:
@@ -176,7 +185,7 @@ class Believe:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan.
 
         `foresight`, 0..1, is the plan's. Below MIN_FORESIGHT, or without a homed device, nothing is learned and the
-        expected gap starts again.
+        expected gap starts again. Where nothing is to be learned, or without the term `motor`, nothing happens.
         """
         if not (self.learns and self._has_lag):
             return
@@ -187,6 +196,7 @@ class Believe:
             self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, measured: Measured | None, model_N: float | None) -> Belief:
+        """Return the belief. `model_N` is the model's force now; None: nothing is predicted."""
         device = at_speed = self.device
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
@@ -202,13 +212,18 @@ class Believe:
         return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, self.sensor.doubted_s)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
-        """Learns from the newest reading, where the model says `model_N`."""
+        """Learn from the newest reading, with the model's force `model_N` at the measured gap.
+
+        It teaches as at speed where friction is mobilised and the handle moves, else as at a creep. The watch on a
+        brake's encoder takes every reading. An old force, and a reading within MIN_DT_S of the last, teach nothing
+        else.
+        """
         if self._nominal.contact.slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
         if measured.number == self.read or now_s - self.read_s < MIN_DT_S:
             return
         if now_s - measured.sensed_s > self._unsensed_s:
-            return  # its force is an old one
+            return  # the force was sensed too long ago
         dt_s = min(now_s - self.read_s, MAX_DT_S)
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
@@ -222,7 +237,8 @@ class Believe:
             self._hear_at_creep(now_s, measured, model_N, dt_s, is_mobilised)
 
     def _is_stuck(self, measured: Measured, model_N: float) -> bool:
-        """Whether the handle has stopped with less than friction: a hand that meets a wall does, within 10 ms."""
+        """Tell whether the handle has stopped with less than friction, as a hand that meets a wall does within 10
+        ms."""
         handle = measured.handle
         if abs(handle.quick_mm_s) >= STOPPING_MM_S:
             return False
@@ -230,6 +246,10 @@ class Believe:
         return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
 
     def _hear_at_creep(self, now_s: float, measured: Measured, model_N: float, dt_s: float, is_mobilised: bool) -> None:
+        """Learn slow friction from one reading of a handle that creeps, without a dispute.
+
+        A handle that rests or comes to rest teaches nothing.
+        """
         self.strength.settle()
         if not self._has_creep or self.sensor.is_disputed:
             return
@@ -241,12 +261,16 @@ class Believe:
             return
         expected_N = self.strength.fit.force_N(self.slow.followed_N)
         reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
-        # before it is mobilised friction is less than the model's; more is more all the same
+        # friction not yet mobilised is less than the model's: only a greater reading teaches then
         is_lesson = self.knows_zero(now_s) and (is_mobilised or reading_N > expected_N)
         if expected_N > MIN_EXPECTED_N and is_lesson:
             self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
 
     def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
+        """Take one reading of a handle that slides at speed: zero, judgement of the sensor, fit, limits.
+
+        In a dispute, or while the zero is unknown, the fit learns nothing.
+        """
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
         reading_N, zero_sd_N = measured.force_N - direction * zero.zero_N, zero.sd_N(now_s)
@@ -276,20 +300,28 @@ class Believe:
             zero.trust()
 
     def _dispute(self, model_N: float) -> None:
-        """The device is taken for what it was before the readings left it."""
+        """Take the device for what it was before the readings left the fit, and the zero for unknown.
+
+        Before the handle has slid, only what was taught from another day remains of the fit.
+        """
         self.zero.doubt()
         before_N = self.strength.fit.force_N(model_N)
         if self.sensor.has_slid:
             self.strength.shift(self.sensor.back_N)
         else:
-            self.strength.forget(self.taught)  # all else that is known of it came from this sensor
+            self.strength.forget(self.taught)  # all else known of the device came from this sensor
         self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
 
     def _fit(self, measured: Measured, model_N: float, reading_N: float, dt_s: float) -> None:
+        """Learn the fit's scale and offset from one reading, unless it may be an old or a wrong one.
+
+        A fit from another day that the first slide contradicts is forgotten first. Without learning the reading is only
+        compared with the fit.
+        """
         if self._has_creep:
             self.slow.follow(model_N, measured.handle_mm)
         if self.sensor.freshness.is_stale or self.sensor.wrong_s > 0.0:
-            return  # there may be no lesson in it
+            return  # the reading may be old or wrong
         if not (self.learns and self._fits):
             self.sensor.compare(self.strength.fit, model_N)
             return
@@ -299,16 +331,16 @@ class Believe:
             self.strength.forget()
         self.strength.update(model_N, reading_N, dt_s)
         self.sensor.fit_moved(self.strength.fit.force_N(model_N) - before_N, model_N, dt_s)
-        # what is known of a creep stays what it is while the rest is learned
+        # the force at a creep stays while scale and offset are learned
         self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
         if self.strength.is_held:
             self.limits = (Limit.TRIM, *self.limits)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute of device and sensor; without one do nothing.
+        """Take the operator's word in a dispute of device and sensor; without a dispute do nothing.
 
-        `device`: the dispute ends, and scale and offset are as uncertain as an unseen device's. `sensor`: it is not
-        believed until its readings agree again.
+        `device`: the dispute ends, the sensor's zero is believed again, and scale and offset are as uncertain as an
+        unseen device's. `sensor`: the sensor is not believed until its readings agree again.
         """
         if not self.sensor.is_disputed:
             return

@@ -21,35 +21,36 @@ SETTLED_MM: Final = 0.1
 MAX_DT_S: Final = 0.02
 "A longer pause between plans counts as this."
 AGE_S: Final = 0.0015
-"So long before a plan its carriages were measured."
+"The carriages were measured so long before the plan."
 
 
 @final
 class CarriageLag:
-    """Estimator of one device's carriage lag, `lag_s`."""
+    """Estimator of one device's carriage lag: the time constant `lag_s` from planned to measured gap."""
 
     lag_s: float = 0.0
     "T, 0..MAX_LAG_S."
     information_mm2_s: float = 0.0
-    "M."
+    "M, which grows with speed and forgets."
     expected_mm: float | None = None
-    "e; None: it begins with the next plan."
+    "e; None: it begins with the next plan's gap."
     is_settling: bool = False
-    "The carriages are still behind a jump."
+    "Whether the carriages are still behind a jump."
 
     def update(
         self, dt_s: float, planned_mm: float | None, gap_mm: float, speed_mm_s: float, top_speed_mm_s: float
     ) -> None:
-        """Take one plan, made `dt_s` after the last, with the gap measured AGE_S before it.
+        """Learn from one plan, made `dt_s` after the last, with the gap and its speed measured AGE_S before it.
 
-        `planned_mm` is None where the plan did not know what comes: the expected gap begins again at the next plan's.
+        `planned_mm` is None where the plan did not know what comes: nothing is learned, and the expected gap begins
+        anew. While the carriages are behind a jump nothing is learned either. `dt_s` counts as 0 to MAX_DT_S.
         `top_speed_mm_s` bounds the measured speed, which a new filter may overstate.
         """
         if planned_mm is None:
             self.expected_mm, self.is_settling = None, False
             return
         dt_s = min(max(dt_s, 0.0), MAX_DT_S)
-        speed_mm_s = min(max(speed_mm_s, -top_speed_mm_s), top_speed_mm_s)  # a filter that has just begun may show any
+        speed_mm_s = min(max(speed_mm_s, -top_speed_mm_s), top_speed_mm_s)  # a new filter may overstate it
         expected_mm = self.expected_mm
         if expected_mm is None:
             expected_mm = planned_mm

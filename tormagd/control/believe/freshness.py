@@ -12,52 +12,58 @@ from typing import Final, final
 STALE_N: Final = 0.03
 "Three times the noise of a sensor."
 FROZEN_N: Final = 0.15
-"A sensor that shows nothing of this is broken."
+"A sensor that shows nothing of such a change is broken."
 FROZEN_S: Final = 0.1
 "No sensor is frozen sooner: it shows ten readings a second at least."
 FROZEN_RUNS: Final = 12.0
 "White noise as large as a step shows one value so often once in five million times."
 RESOLVED: Final = 1.5
 ALTERNATES: Final = 0.4
-"Noise is resolved where runs are this many times the least one in the mean, and so many of the changes go back."
+"""A sensor's noise is resolved under two conditions. Its mean run is under RESOLVED times its shortest, and over the
+share ALTERNATES of its changes go back."""
 HEARD: Final = 100
-"So many runs tell a sensor's noise."
+"Number of runs that tell a sensor's noise."
 
 
 @final
 class Freshness:
-    """Statistics of one sensor's readings."""
+    """Judge of whether one force sensor still shows new values."""
 
     has_heard: bool = False
+    "Whether a first reading has come."
     reading_N: float = 0.0
-    "The newest."
+    "The newest reading."
     still_s: float = 0.0
-    "For how long it has been the same."
+    "How long the reading has been the same."
     stood_N: float = 0.0
-    "The model's force when it began to be."
+    "The model's force when the reading last changed."
     changed_N: float = 0.0
-    "By how much the device's force has changed since."
+    "By how much the device's force has changed since the reading last changed."
     runs: int = 0
-    "How many runs there were, HEARD at most."
+    "Number of runs there were, HEARD at most."
     run_s: float = 0.0
-    "How long a run is in the mean,"
+    "Mean length of a run."
     min_run_s: float = math.inf
-    "and at the least."
+    "Length of the shortest run."
     change_N: float = 0.0
-    "How the value changed last,"
+    "The newest change of the reading, with its sign."
     step_N: float = 0.0
-    "and by how much at the least."
+    "The least change of the reading: the sensor's step."
     alternates: float = 0.0
-    "Which share of the changes goes back."
+    "Share of the changes that go back on the change before."
 
     @property
     def is_stale(self) -> bool:
-        """Whether the newest reading is an old one."""
+        """Whether the newest reading is an old one: the force has changed and the reading has not."""
         return self.changed_N > STALE_N + self._steps_N
 
     @property
     def is_frozen(self) -> bool:
-        """Whether the sensor should have shown another value by now."""
+        """Whether the sensor should have shown another value by now, so that it is broken.
+
+        It should not within FROZEN_S. Later it should once the force has changed by FROZEN_N and two steps. One of
+        resolved noise also should after FROZEN_RUNS mean runs.
+        """
         if self.still_s <= FROZEN_S:
             return False
         is_resolved = self.alternates > ALTERNATES and self.run_s < RESOLVED * self.min_run_s
@@ -70,10 +76,10 @@ class Freshness:
         return 2.0 * min(self.step_N, FROZEN_N)
 
     def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> None:
-        """Take one reading, which stands for `dt_s` > 0. The model's force is `model_N`, the device's force over it
-        `scale`. Updates `is_stale` and `is_frozen`.
+        """Take one reading, which stands for `dt_s` > 0, and update `is_stale` and `is_frozen`.
 
-        With `learns` a change of the reading also teaches the sensor's noise and resolution.
+        `model_N` is the model's force, `scale` the device's force over the model's. With `learns` a change of the
+        reading also teaches the sensor's noise and resolution.
         """
         if not self.has_heard:
             self.has_heard, self.stood_N = True, model_N
@@ -87,6 +93,7 @@ class Freshness:
         self.changed_N = scale * abs(model_N - self.stood_N)
 
     def _take_run(self, change_N: float, run_s: float) -> None:
+        """Learn noise and resolution from a run that lasted `run_s` and ended with a change of `change_N`."""
         self.runs = min(self.runs + 1, HEARD)
         share = 1.0 / self.runs
         self.run_s += share * (run_s - self.run_s)

@@ -1,7 +1,8 @@
-"""Whether the handle's encoder is believed: a force that grows with the gap's force needs a shaft that moves.
+"""Whether the handle's encoder is believed.
 
 At rest, friction holds what the hand gives, and more force only comes with a motion of the shaft. So a force that rises
-with the gap's, while the encoder stands, shows a lost encoder, or a sensor that reads what nobody feels.
+with the gap's force while the encoder stands shows a fault. Either the encoder is lost, or the sensor reads what nobody
+feels.
 """
 
 import math
@@ -10,53 +11,54 @@ from typing import Final, final
 from tormagd.control.filter import low_pass
 
 STANDS_MM: Final = 0.01
-"Just over a count of the encoder: a handle within it stands."
+"A handle that keeps within this stands: just over a count of the encoder."
 SETTLES_S: Final = 0.3
-"What the rate's filter leaves of a motion, and what the force sensor still has to tell of it, has gone by then."
+"By then what the filters of rate and force keep of a motion has gone."
 RISES_N: Final = 0.15
 "More than STANDS_MM bends of the stiffest elastomer, 12 N/mm, and noise."
 MODEL_RISES_N: Final = 0.1
 "Least change of the model's force that shows a moved gap."
 FILTER_S: Final = 0.01
 UNHEARD_S: Final = 0.1
-"After so long without a reading it is watched anew."
+"After so long without a reading the watch begins anew."
 FORGETS_S: Final = 5.0
-"A sensor's zero drifts, and an elastomer recovers: the least force of so long ago is none any more."
+"Time constant in which the least force is forgotten: a sensor's zero drifts, and an elastomer recovers."
 
 
 @final
 class HandleWatch:
-    """Watch on the encoder: compares the force of a resting handle with the model's force at the gap."""
+    """Watch on the handle's encoder: compares the force of a resting handle with the model's force at the gap."""
 
     at_mm: float = math.inf
-    "Where the handle stands."
+    "The encoder's place at which the handle stands."
     heard_s: float = 0.0
+    "When the newest reading was sensed, on the host's clock."
     still_s: float = 0.0
-    "For how long it stands."
+    "How long the handle has stood."
     force_N: float = 0.0
-    "Mean size of the force over FILTER_S."
+    "Mean magnitude of the force over FILTER_S."
     min_N: float = 0.0
-    "The least of it since the handle stands."
+    "The least of these means since the handle stands."
     min_model_N: float = 0.0
-    "What the model gave then."
+    "The model's force at that time."
     rested_N: float = 0.0
-    "What the model gave when the handle came to stand."
+    "The model's force when the handle came to stand."
     is_lost: bool = False
-    "The encoder is not believed until it moves."
+    "Whether the encoder is lost: it is not believed until it moves."
 
     def moved_gap_at_rest(self, model_N: float) -> bool:
-        """Tell whether the model's force has changed to `model_N` by more than MODEL_RISES_N since the handle came to
-        stand.
+        """Tell whether the gap's force has changed by more than MODEL_RISES_N since the handle came to stand.
 
-        Friction at rest does not follow a changing gap.
+        `model_N` is the model's force now. Friction at rest does not follow a changing gap.
         """
         return abs(model_N - self.rested_N) > MODEL_RISES_N
 
     def update(self, sensed_s: float, handle_mm: float, reading_N: float, model_N: float) -> None:
-        """Take one reading of handle and force, with the model's force `model_N` at the measured gap.
+        """Take one reading of handle and force, and update `is_lost`.
 
-        May set `is_lost`; a motion, or a pause of more than UNHEARD_S, clears it. A `sensed_s` (host time) that is not
-        newer changes nothing.
+        `model_N` is the model's force at the measured gap. The encoder is lost where it stands while the force rises by
+        RISES_N and the model's by MODEL_RISES_N. A motion of the handle, or a pause of more than UNHEARD_S, clears
+        `is_lost`. A `sensed_s` (host's clock) that is not newer changes nothing.
         """
         dt_s = sensed_s - self.heard_s
         if not dt_s > 0.0:

@@ -4,7 +4,7 @@
     lag      l goes to +-width along a rising or falling field, over a change by `turn`
     relaxed  r is what Prony series of two parts leave: of the force without field, and of what the field adds
 
-Both follow the measured gaps and hold for every device, so neither is learned. What has relaxed shifts the force alike
+Both follow the measured gaps and hold for every device, so neither is learned. What has relaxed lowers the force alike
 at all fields.
 """
 
@@ -19,33 +19,34 @@ from tormagd.model.memory import Memory
 from tormagd.physics.relaxation import PronyState
 
 BEYOND_MM: Final = 2.0
-"Beyond the closed end, where a carriage may overrun, the model is asked no further."
+"The model is asked no further beyond the closed end, where a carriage may overrun."
 
 
 @final
 class ElementMemory:
-    """The memory of one element, which begins with the first known gap.
+    """Relaxation and field lag of one element, from the first known gap on.
 
     A brake is taken as rested at the gap it was switched on with, and relaxes for a handle at the roller's speed. A pad
     is taken as untouched, and relaxes for what presses it.
     """
 
     field_mT: float = 0.0
-    "Of the newest gap."
+    "The gap's field at the newest gap."
     lag_mT: float = 0.0
-    "How far the element's own is behind it."
+    "How far the element's own field lags behind the gap's."
     free: PronyState = ()
-    "Branches of the force without field, N,"
+    "Relaxation branches of the force without field, N."
     added: PronyState = ()
-    "and of what the field adds."
+    "Relaxation branches of the force that the field adds, N."
     relaxed_N: float = 0.0
+    "Force that has relaxed."
     time_s: float
-    "Before the first gap that means something: -inf."
+    "When the memory was last updated; -inf before the first known gap."
     opened_mm: float = 0.0
-    "Until then: by how much the gap has opened since the device was switched on."
+    "Before the first known gap: by how much the gap has opened since the device was switched on."
 
     def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
-        """Begin before the first gap. `gap_range_mm` is the closed and the open gap."""
+        """Begin before the first known gap. `gap_range_mm` is the closed and the open gap."""
         self.time_s = -math.inf
         self._free: Final = memory.free
         self._added: Final = memory.added
@@ -61,7 +62,7 @@ class ElementMemory:
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`.
 
-        0 before anything was measured.
+        It is 0 before the first known gap.
         """
         change_mT = field_mT - self.field_mT
         if self.time_s == -math.inf:
@@ -72,8 +73,10 @@ class ElementMemory:
         return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
     def force_N(self, curve: ForceCurve) -> float:
-        """Return the model's force now, for the memoryless force over the field `curve`. Before a measurement the field
-        is 0 mT."""
+        """Return the model's force now, N, with memory; `curve` is its force over the field without.
+
+        Before the first known gap the field is 0 mT, and nothing has relaxed.
+        """
         return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
 
     def update(self, now_s: float, measured: Measured) -> None:
@@ -85,7 +88,7 @@ class ElementMemory:
         slides = self._nominal.contact.slides
         is_empty = self.time_s == -math.inf
         if slides and not measured.is_homed:
-            # until both switches are found, positions count from where the carriages were, as if they were open
+            # before homing, positions count from where the carriages were at switching on, as if that were the open gap
             if is_empty:
                 self.opened_mm = max(measured.gap_mm - self._open_mm, self.opened_mm)
             return
@@ -104,12 +107,15 @@ class ElementMemory:
         self._follow(curve, free_N, field_mT, now_s)
 
     def _begin(self, field_mT: float, free_N: float, added_N: float, now_s: float) -> None:
-        """After a long rest at that field and load."""
+        """Begin after a long rest at `field_mT`, with the force `free_N` without field and `added_N` by the field."""
         self.field_mT, self.lag_mT, self.relaxed_N, self.opened_mm, self.time_s = field_mT, 0.0, 0.0, 0.0, now_s
         self.free, self.added = self._free.relaxed(free_N), self._added.relaxed(added_N)
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
-        """The gap went straight to that field; `curve` is the force there without memory, `free_N` without field."""
+        """Follow a straight change of the gap's field to `field_mT`.
+
+        `curve` is the force over the field without memory, `free_N` its force at 0 mT.
+        """
         self.lag_mT = self.lag_at_mT(field_mT)
         dt_s = max(now_s - self.time_s, 0.0)
         self.field_mT, self.time_s = field_mT, now_s

@@ -20,28 +20,29 @@ Disputed = Literal["device", "sensor"]
 "What an operator may say in a dispute: the device has changed, or the sensor is wrong."
 
 FILTER_S: Final = 0.01
-"Of the readings' mean."
+"Time constant of the readings' mean."
 LEARNS_S: Final = 0.5
 "A device that has not slid for so long has shown nothing to dispute."
 MOVED_N: Final = 0.12
 "Hysteresis, a creep and a kelvin may move a device's force so far at once."
 SHAPE: Final = 0.25
-"And so far for each newton that the model says more or less than lately: field laws differ in shape,"
+"A device's force may move by this share of the change of the model's force of late: field laws differ in shape."
 VISCOUS_N_S_MM: Final = 6e-4
-"and for each mm/s that the handle goes faster or slower than lately."
+"A device's force may also move by so much for each mm/s by which the handle's rate has changed of late."
 LATELY_S: Final = 1.0
+"Time constant of what counts as of late."
 SLACK_N: Final = 0.05
-"So much of that the force of a gap that hardly moves has, too: it is not forgotten sooner for it."
+"So much slack a gap that hardly moves gives, too: what the fit has learned is not forgotten sooner for it."
 RELAXES_1_S: Final = 0.012
-"Of its force an elastomer may lose, or win back, this share a second beyond what its model remembers,"
+"An elastomer may lose, or win back, this share of its force a second beyond what its model remembers."
 RELAXED: Final = 0.12
-"and no more than this altogether, or in SLOWEST_S again."
+"An elastomer may lose no more than this share altogether, or in SLOWEST_S again."
 SLOWEST_S: Final = 900.0
 AGREES_N: Final = 0.06
 AGREES_S: Final = 0.2
-"Readings this near to the fit for so long agree."
+"Readings within AGREES_N of the fit for so long agree with it."
 NAMED_S: Final = 0.1
-"A dispute that is settled sooner is not worth a word."
+"A dispute is reported once it has lasted for longer."
 RISES_N_S: Final = 2.0
 "Greatest rate of `lead_N`: a device that is 20% stronger at once is followed in 0.2 s."
 LEADS_S: Final = 0.03
@@ -51,46 +52,50 @@ NOISE_N: Final = 0.05
 WRONG_S: Final = 0.05
 "Evidence for so long shows that the sensor is wrong."
 TRUSTED_AGAIN_S: Final = 1.0
-"A wrong sensor has to agree for longer."
+"The readings of a wrong sensor have to agree for longer than this."
 
 
 @final
 class SensorTrust:
-    """Judge of one force sensor. It keeps what was known of the device while the two are in dispute."""
+    """Judge of one force sensor against the fit of its device. Finds, follows and ends their disputes.
+
+    It notes by how much the fit has to go back where a dispute begins.
+    """
 
     known_s: float = 0.0
-    "For how long the device has slid, LEARNS_S at most."
+    "How long the device has slid, LEARNS_S at most."
     measured_N: float = 0.0
     "Mean of the readings over FILTER_S."
     model_N: float = 0.0
-    "The model's force, a mean over LATELY_S,"
+    "Mean of the model's force over LATELY_S."
     rate_mm_s: float = 0.0
-    "and the handle's rate."
+    "Mean of the handle's rate over LATELY_S."
     direction: float = 0.0
-    "The way it goes, 1 or -1."
+    "The way the handle goes, 1 or -1; 0 before the first reading."
     slack_N: float = 0.0
-    "What the fit may learn at once, as what is around it has changed lately."
+    "What the fit may learn at once, as model force, rate or zero have changed of late."
     moved_N: float = 0.0
     "What the fit has learned of late, and would have to unlearn in a dispute."
     relaxed_N: float = 0.0
     "How much of RELAXED is used up."
     is_disputed: bool = False
+    "Whether sensor and device are in dispute: the fit does not learn."
     disputed_s: float = 0.0
-    "For how long of sliding."
+    "How long the dispute has lasted, in time of sliding."
     back_N: float = 0.0
-    "By how much the fit had to go back when it began."
+    "By how much the fit had to change when the newest dispute began."
     began_way: float = 0.0
-    "The way that the handle went when it began."
+    "The handle's `direction` when the newest dispute began."
     agreed_s: float = 0.0
-    "For how long the readings have agreed with the fit."
+    "How long the readings have agreed with the fit in the dispute."
     lead_N: float = 0.0
-    "By how much the device is taken for stronger than its fit, at the model's force of now."
+    "By how much the device is taken for stronger than its fit, at the model's present force."
     is_doubted: bool = False
-    "The sensor is shown to be wrong."
+    "Whether the sensor is shown to be wrong."
     doubted_s: float = 0.0
-    "For how long of sliding it has been."
+    "How long the sensor has been doubted, in time of sliding."
     wrong_s: float = 0.0
-    "For how long there has been evidence of it."
+    "How long the readings have been such as no device gives; falls while they are not."
 
     def __init__(self, bounds: DeviceBounds) -> None:
         self._bounds: Final = bounds
@@ -98,12 +103,12 @@ class SensorTrust:
 
     @property
     def has_slid(self) -> bool:
-        """Whether the device has shown itself in this session."""
+        """Whether the device has slid for LEARNS_S, and so shown itself in this session."""
         return self.known_s >= LEARNS_S
 
     @property
     def is_named(self) -> bool:
-        """Whether the dispute is worth a word."""
+        """Whether the dispute has lasted long enough to be reported."""
         return self.is_disputed and self.disputed_s > NAMED_S
 
     def update(
@@ -116,14 +121,14 @@ class SensorTrust:
         zero_sd_N: float,
         dt_s: float,
     ) -> None:
-        """Take one reading and judge it against `fit`. May begin or end a dispute.
+        """Take one reading and judge it against `fit`. May begin or end a dispute, and doubt the sensor.
 
         The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1. `reading_N` is the force against this
         motion, less the sensor's zero, which is known to within `zero_sd_N`. The model's force is `model_N`. The
         reading stands for `dt_s` > 0. All arguments are finite.
         """
         if self.is_disputed:
-            zero_sd_N = 0.0  # it is for a reversal to tell
+            zero_sd_N = 0.0  # a reversal has to tell the zero first
         self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
         self._hear(model_N, reading_N, dt_s)
         self._allow(fit, model_N, rate_mm_s, direction, zero_sd_N, dt_s)
@@ -132,8 +137,8 @@ class SensorTrust:
     def fit_moved(self, learned_N: float, model_N: float, dt_s: float) -> None:
         """Take the change `learned_N` that one reading made to the fit's force, where the model's force is `model_N`.
 
-        Begins a dispute when recent changes exceed what a device changes by itself. Nothing happens before LEARNS_S of
-        sliding.
+        Begins a dispute when the changes of late exceed what a device changes by itself. Nothing happens before
+        LEARNS_S of sliding.
         """
         if not self.has_slid:
             return
@@ -144,17 +149,18 @@ class SensorTrust:
             self._forget(model_N, dt_s)
 
     def compare(self, fit: DeviceFit, model_N: float) -> None:
-        """Begin a dispute where the mean reading has left a `fit` that does not learn now. The model's force is
-        `model_N`."""
+        """Begin a dispute where the mean reading has left `fit`, while the fit does not learn.
+
+        The model's force is `model_N`. Nothing happens before LEARNS_S of sliding.
+        """
         over_N = self.measured_N - fit.force_N(model_N)
         if self.has_slid and abs(over_N) > MOVED_N + self.slack_N + SURE * fit.deviation_N(model_N):
             self._begin(over_N)
 
     def zero_moved(self, found_N: float) -> float:
-        """Take a change `found_N` of the sensor's zero that a reversal of the handle has shown. Return the shift, N,
-        that this makes in the fit's force.
+        """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts the fit, N.
 
-        The shift is `found_N` times the handle's `direction` in a dispute that began since the reversal, else 0. The
+        In a dispute that began since the reversal the shift is `found_N` times the handle's `direction`, else 0. The
         share of RELAXED that is used up returns to 0.
         """
         self.relaxed_N = 0.0
@@ -181,8 +187,11 @@ class SensorTrust:
     def _allow(
         self, fit: DeviceFit, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float, dt_s: float
     ) -> None:
-        """What the device may show that its fit did not: what is around it has changed."""
-        # a zero that is wrong shows twice where the handle has turned
+        """Update `slack_N`: what the device may show that its fit did not, as conditions have changed of late.
+
+        Also updates the means and the direction that changes are counted from.
+        """
+        # where the handle has turned a wrong zero counts twice
         is_turned = direction * self.direction < 0.0
         slack_N = (
             SURE * max(fit.deviation_N(model_N) - fit.deviation_N(self.model_N), 0.0)
@@ -196,7 +205,11 @@ class SensorTrust:
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LATELY_S)
 
     def _judge(self, over_N: float, is_strange: bool, dt_s: float) -> None:
-        """Takes by how much the readings are over the fit's force as evidence of who is right."""
+        """Judge who is right by how much the readings are over the fit's force, `over_N`.
+
+        With `is_strange` no device gives such readings. May doubt the sensor, and begin or end a dispute. In a dispute
+        moves `lead_N`.
+        """
         agrees = not is_strange and abs(over_N) <= AGREES_N + self.slack_N
         self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
         if self.wrong_s > WRONG_S and not self.is_doubted:
@@ -216,17 +229,19 @@ class SensorTrust:
             self._settle()
 
     def _settle(self) -> None:
+        """End the dispute, if any: the sensor is believed again."""
         self.is_disputed = self.is_doubted = False
         self.disputed_s = self.agreed_s = self.doubted_s = self.wrong_s = 0.0
         self.lead_N = self.moved_N = 0.0
 
     def _begin(self, over_N: float) -> None:
+        """Begin a dispute with readings `over_N` over the fit's force, and note how far the fit has to go back."""
         self.is_disputed, self.disputed_s, self.agreed_s = True, 0.0, 0.0
         self.lead_N, self.began_way = max(over_N, 0.0), self.direction
         self.back_N, self.moved_N = -self.moved_N, 0.0
 
     def _forget(self, model_N: float, dt_s: float) -> None:
-        """What a device changes by itself in `dt_s` is no move of it."""
+        """Reduce `moved_N` by what a device changes by itself in `dt_s`, and count what relaxing uses up of RELAXED."""
         self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
         by_itself_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
         relaxes_N = min(RELAXES_1_S * model_N * dt_s, max(RELAXED * model_N - self.relaxed_N, 0.0))
@@ -238,7 +253,7 @@ class SensorTrust:
             self.moved_N = max(self.moved_N - by_itself_N - RELAXES_1_S * model_N * dt_s, 0.0)
 
     def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
-        """Whether the newest readings are such as no device gives."""
+        """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices."""
         if self.freshness.is_frozen:
             return True
         unknown_N = NOISE_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)

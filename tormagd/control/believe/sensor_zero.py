@@ -15,7 +15,7 @@ from firmware_protocol.value import Value
 
 TARED_SD_N: Final = 0.02
 TARED_VARIANCE_N2: Final = TARED_SD_N * TARED_SD_N
-"Of a sensor that begins: it is taken for tared."
+"Deviation and variance of a sensor that begins: it is taken for tared."
 WANDERS_S: Final = 600.0
 DRIFT_N2_S: Final = 0.05**2 / WANDERS_S
 "5 mN a minute (plant card). For WANDERS_S the zero may wander to and fro; in an hour it may have gone one way."
@@ -24,25 +24,24 @@ MAX_SD_N: Final = 0.3
 UNKNOWN_SD_N: Final = 0.05
 "With more than this, and than the scene tolerates, readings teach nothing: ten minutes without a reversal."
 MAX_ZERO_N: Final = 0.4
-"A sensor further off did not drift: such a zero is not taken."
+"A zero further off is not taken: no sensor drifts so far."
 LEVEL_S: Final = 0.15
 "A level is a mean over this much sliding, in which noise leaves 2 mN."
 READ_SD_N: Final = 0.025
-"What gap, field and speed that change around a reversal leave of half the sum."
+"What gap, field and speed that change around a reversal leave of the half sum."
 VISCOUS_N_S_MM: Final = 5e-4
-"And so much more for each mm/s that the handle comes back at another speed: devices' viscous friction differs by that."
+"The half sum is off by so much for each mm/s of speed changed: devices' viscous friction differs by that."
 RELAXES_N_S: Final = 0.01
-"And so much more for each second that lies between: the elastomer relaxes."
+"The half sum is off by so much for each second between the levels: the elastomer relaxes."
 LONGEST_TURN_S: Final = 10.0
 "Levels further apart are not compared."
 
 
 @final
 class Level(Value):
-    """Means of a handle's newest sliding one way: of the reading along the motion and the model's force, N, and of the
-    rate, mm/s.
+    """Means over a handle's newest sliding one way: the reading along the motion, the model's force and the rate.
 
-    `heard_s` is the time of sliding in the mean, and `until_s` the host time of its last reading.
+    `heard_s` is the time of sliding in the means, and `until_s` the host time of the last reading.
     """
 
     def __init__(self, reading_N: float, model_N: float, rate_mm_s: float, heard_s: float, until_s: float) -> None:
@@ -53,7 +52,7 @@ class Level(Value):
         self.until_s: Final = until_s
 
     def heard(self, reading_N: float, model_N: float, rate_mm_s: float, dt_s: float, now_s: float) -> "Level":
-        """Return the level with one more reading, which stands for `dt_s` > 0.
+        """Return the level with one more reading, which stands for `dt_s` > 0 and came at `now_s`.
 
         The mean is plain over the first LEVEL_S and forgets after them.
         """
@@ -73,21 +72,25 @@ class SensorZero:
     """Estimator of one sensor's zero, `zero_N`, with its variance."""
 
     zero_N: float = 0.0
+    "What the sensor reads without a force."
     variance_N2: float = TARED_VARIANCE_N2
+    "Variance of the zero at `told_s`."
     undoubted_N2: float = TARED_VARIANCE_N2
-    "What it was before the zero was doubted."
+    "Variance before the zero was doubted."
     told_s: float = math.inf
-    "When the variance was that."
+    "When the variance was told: at the first reading, or the newest reversal; inf before."
     direction: float = 0.0
-    "The way the handle goes, 1 or -1."
+    "The way the handle goes, 1 or -1; 0 before the first reading."
     level: Level | None = None
-    "Of that way."
+    "Level of the present way; None before the first reading."
     before: Level | None = None
-    "Of the way before, until the two have been compared."
+    "Level of the way before, until the two have been compared; None without one."
 
     def sd_N(self, now_s: float) -> float:
-        """Return the zero's standard deviation at `now_s`. Drift counts from the first reading or the newest
-        reversal."""
+        """Return the zero's standard deviation at `now_s`, N, at most MAX_SD_N.
+
+        Drift counts from the first reading or the newest reversal.
+        """
         since_s = max(now_s - self.told_s, 0.0)
         drifted_N2 = DRIFT_N2_S * since_s * max(since_s / WANDERS_S, 1.0)
         return math.sqrt(min(self.variance_N2 + drifted_N2, MAX_SD_N * MAX_SD_N))
@@ -97,12 +100,14 @@ class SensorZero:
         self.told_s = min(self.told_s, now_s)
 
     def doubt(self) -> None:
-        """Set the variance to its greatest, and remember the old one: the zero may be any."""
+        """Set the variance to its greatest, and keep the old one for `trust`: the zero may be any."""
         self.undoubted_N2, self.variance_N2 = self.variance_N2, MAX_SD_N * MAX_SD_N
 
     def trust(self) -> None:
-        """Take back the last `doubt`: the variance from before returns, unless a reversal has made it smaller. Call it
-        only after a `doubt`."""
+        """Take back the last `doubt`: the variance from before returns, unless a reversal has made it smaller.
+
+        Call it only after a `doubt`.
+        """
         self.variance_N2 = min(self.variance_N2, self.undoubted_N2)
 
     def update(
@@ -118,13 +123,14 @@ class SensorZero:
     ) -> bool:
         """Take one reading, and return whether a reversal has told the zero just now.
 
-        The handle slides at `rate_mm_s` the way `direction`, 1 or -1. `reading_N` is the force against this motion, the
-        model's force `model_N`. The reading stands for `dt_s` > 0. `scale` is the device's force over the model's,
-        known to within `scale_sd`. All arguments are finite.
+        A reversal tells it once the handle has slid for LEVEL_S both ways. The handle slides at `rate_mm_s` the way
+        `direction`, 1 or -1. `reading_N` is the force against this motion, the model's force `model_N`. The reading
+        stands for `dt_s` > 0. `scale` is the device's force over the model's, known to within `scale_sd`. All arguments
+        are finite.
         """
         level = self.level
         if level is None or direction != self.direction:
-            # what was heard for too short a time is no level
+            # a mean over too short a time is no level
             self.before = level if level is not None and level.heard_s >= LEVEL_S else None
             self.level, self.direction = Level(reading_N, model_N, rate_mm_s, dt_s, now_s), direction
             return False
@@ -138,7 +144,11 @@ class SensorZero:
     def _compare(
         self, now_s: float, before: Level, level: Level, between_s: float, scale: float, scale_sd: float
     ) -> bool:
-        """Learns from the levels before and after a reversal, which took `between_s`, and says whether it could."""
+        """Learn the zero from the levels before and after a reversal, and return whether they told it.
+
+        They do not where they lie `between_s` of more than LONGEST_TURN_S apart, or the zero found is beyond
+        MAX_ZERO_N.
+        """
         by_model_N = level.model_N - before.model_N
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - scale * by_model_N)
         if between_s > LONGEST_TURN_S or abs(found_N) > MAX_ZERO_N:

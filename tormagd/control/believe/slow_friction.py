@@ -14,33 +14,34 @@ from typing import Final, final
 from tormagd.control.believe.strength import MAX_RELAXED, DeviceBounds, DeviceFit
 
 STRIBECK_MM_S: Final = 5.0
-"Handles of this speed have left most of static friction behind (plant card)."
+"At this speed most of static friction is gone (plant card)."
 SLOWEST_MM_S: Final = 0.3
 "A slower handle may stand."
 REACH_MM: Final = 0.35
-"Over this travel friction follows a field that rises."
+"Travel over which friction follows a rising field."
 LEARNED_S: Final = 0.3
+"Time constant of learning the factor at rest."
 MIN_STATIC: Final = 0.9
 MAX_STATIC: Final = 1.15
-"Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model."
+"Bounds of k: static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model."
 BELIEVED_SD: Final = 3.0
 "Standard deviations of the fit within which a creep is believed; with two, seven of draws 0 to 39 stand at the bound."
 NOISE_N: Final = 0.03
-"A sensor that reads less than the weakest device's force, which has relaxed, and this noise, teaches nothing."
+"A reading below the weakest device's force, relaxed, and this noise teaches nothing."
 
 
 @final
 class SlowFriction:
-    """Estimator of one device's factor k."""
+    """Estimator of one device's factor k: its force at rest over its force at speed."""
 
     factor: float = 1.0
     "k."
     learned: float = 0.0
-    "Which share of the factor was learned at a creep, 0..1."
+    "Share of the factor that was learned at a creep, 0..1."
     followed_N: float = 0.0
     "The model's force as far as the bristles of the contact have followed it."
     handle_mm: float = 0.0
-    "Where the handle was then."
+    "Where the handle was when they last followed."
 
     def __init__(self, bounds: DeviceBounds) -> None:
         self._bounds: Final = bounds
@@ -53,8 +54,10 @@ class SlowFriction:
         return 1.0 + _slowness(rate_mm_s) * (self.factor - 1.0)
 
     def follow(self, model_N: float, handle_mm: float) -> None:
-        """Follow the model's force `model_N` with the handle at `handle_mm`: a fall at once, a rise over REACH_MM of
-        travel."""
+        """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`.
+
+        A fall is followed at once, a rise with the handle's travel since the last call, over REACH_MM.
+        """
         rise_N = model_N - self.followed_N
         if rise_N > 0.0:
             rise_N *= 1.0 - math.exp(-abs(handle_mm - self.handle_mm) / REACH_MM)
@@ -70,10 +73,10 @@ class SlowFriction:
             self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), self._least), self._most)
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`.
+        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within `believable`.
 
-        `reading_N` is the force against the motion. A force below what any device gives teaches nothing. The force of
-        `fit` at `followed_N` must be above 0 N.
+        `reading_N` is the force against the motion, less the sensor's zero. A force below what any device gives teaches
+        nothing. The force of `fit` at `followed_N` must be above 0 N.
         """
         if reading_N < self._bounds.min_scale * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
             return
@@ -91,13 +94,16 @@ def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
 
 
 def believable(fit: DeviceFit, model_N: float, bounds: DeviceBounds) -> tuple[float, float]:
-    """Return the least and the greatest k of a device with this fit, where the model's force is `model_N`. The force of
-    `fit` there must be above 0 N."""
+    """Return the least and the greatest k of a device with this `fit`, where the model's force is `model_N`.
+
+    The force of `fit` there must be above 0 N.
+    """
     unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
     least, most = factor_bounds(bounds)
     return max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)
 
 
 def _slowness(rate_mm_s: float) -> float:
+    """Return e(v): 1 at rest, 0 at speed."""
     ratio = rate_mm_s / STRIBECK_MM_S
     return math.exp(-ratio * ratio)

@@ -19,26 +19,27 @@ SCALE_SD: Final = 0.17
 MAX_RELAXED: Final = 0.21
 "The greatest share of its force that an elastomer loses in the course of hours."
 OFFSET_SD_N: Final = 0.1
-"Of the offset: what relaxation and hysteresis do around 0.5 N."
+"Spread of the offset of devices not yet seen: what relaxation and hysteresis do around 0.5 N."
 ERROR_N2_S: Final = 3e-4
 """Density of what the model does not follow, N^2 s: with these spreads a new device is learned in some hundredths of a
 second. Chosen on sample 1 and draws 0 to 11, for their steps."""
 SCALE_LASTS_S: Final = 600.0
-"In which what was learned of the scale is forgotten: the device has warmed, by a kelvin or less."
+"Time constant in which the scale is forgotten: the device has warmed, by a kelvin or less."
 SCALE_VARIANCE: Final = SCALE_SD * SCALE_SD
 OFFSET_VARIANCE_N2: Final = OFFSET_SD_N * OFFSET_SD_N
 SURE: Final = 2.0
 "Standard deviations within which a force is taken to lie."
 SURPRISE_S: Final = 0.03
 SURPRISE_N: Final = 0.01
-"""A mean error over SURPRISE_S of more than SURPRISE_N is the device's own. Its offset is then learned sooner, in a
-fifth of its time at twice as much."""
+"""A mean error over SURPRISE_S of more than SURPRISE_N is the device's own. Its offset is then learned sooner: at twice
+SURPRISE_N in a fifth of its time."""
 MIN_ADAPTS_IN_S: Final = 0.04
+"However great the surprise, the offset is learned no sooner than in this time."
 
 
 @final
 class DeviceBounds(Value):
-    """What a device may be: its scale over the model, 1 of the model's own, and its offset at speed, N."""
+    """What a device may be: bounds of its scale, 1 for the model's own device, and of its offset at speed, N."""
 
     def __init__(self, min_scale: float, max_scale: float, min_offset_N: float, max_offset_N: float) -> None:
         self.min_scale: Final = min_scale
@@ -81,20 +82,20 @@ class DeviceFit(Value):
         return math.sqrt(max(self.offset_variance_N2, 0.0))
 
     def force_N(self, model_N: float) -> float:
-        """Return the device's force where the model's is `model_N`; it may be below 0."""
+        """Return the device's force, N, where the model's is `model_N`; it may be below 0."""
         return self.scale * model_N + self.offset_N
 
     def model_N(self, force_N: float) -> float:
-        """Return the model's force with which the device gives `force_N`."""
+        """Return the model's force, N, with which the device gives `force_N`."""
         return (force_N - self.offset_N) / self.scale
 
     def deviation_N(self, model_N: float) -> float:
-        """Return the standard deviation of the device's force where the model's is `model_N`."""
+        """Return the standard deviation, N, of the device's force where the model's is `model_N`."""
         variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
         return math.sqrt(max(variance, 0.0))
 
     def times(self, factor: float) -> "DeviceFit":
-        """Return the fit of a device with `factor` > 0 times the force, and its variances times the square."""
+        """Return the fit of a device with `factor` > 0 times the force, and `factor` squared times the variances."""
         square = factor * factor
         return DeviceFit(
             factor * self.scale,
@@ -115,7 +116,8 @@ class DeviceFit(Value):
         return DeviceFit(self.scale, self.offset_N)
 
     def relaxed(self, relaxed_N: float) -> "DeviceFit":
-        """Return the fit that gives, for a model's force m, what this fit gives for m - `relaxed_N`."""
+        """Return the fit that gives, for a model's force m, the force and deviation that this fit gives for m -
+        `relaxed_N`."""
         by_scale_N = relaxed_N * self.scale_variance
         return DeviceFit(
             self.scale,
@@ -126,8 +128,11 @@ class DeviceFit(Value):
         )
 
     def surely_within_N(self, max_N: float, bounds: DeviceBounds) -> float:
-        """Return the model's force at which the device, taken SURE deviations stronger, gives `max_N`. No scale is
-        taken for beyond the `bounds`."""
+        """Return the model's force, N, at which the device, taken SURE deviations stronger, gives `max_N`.
+
+        The result is held from `max_N` / `bounds.max_scale` to `max_N` / `bounds.min_scale`. The first is returned
+        where the fit is so uncertain that no force is surely within `max_N`.
+        """
         # scale m + offset + SURE sqrt(variance of that) = max, a quadratic: the smaller root is where the sum is meant
         room_N, sure = max_N - self.offset_N, SURE * SURE
         square = self.scale * self.scale - sure * self.scale_variance
@@ -144,7 +149,10 @@ UNSEEN: Final = DeviceFit()
 
 
 def forgotten(fit: DeviceFit, dt_s: float, adapts_in_s: float) -> DeviceFit:
-    """Return the fit after `dt_s` without a reading: its variances go to those of a device not yet seen."""
+    """Return the fit after `dt_s` without a reading: its variances go to those of a device not yet seen.
+
+    Scale and offset stay. The offset's variance goes sooner where `adapts_in_s`, s, is less.
+    """
     keeps_scale = math.exp(-dt_s / SCALE_LASTS_S)
     keeps_offset = math.exp(-dt_s * ERROR_N2_S / (2.0 * OFFSET_VARIANCE_N2 * (adapts_in_s * adapts_in_s)))
     return DeviceFit(
@@ -170,8 +178,8 @@ def observe(
     """Return the fit after one reading, and whether one of the `bounds` held its scale.
 
     `measured_N` is the reading, `model_N` the model's force, `dt_s` the time since the last reading. At `dt_s` <= 0 the
-    fit is unchanged. The offset adapts in about `adapts_in_s`. Without `learns_scale` or `learns_offset` this value
-    stays, and its variance counts (Schmidt). All arguments are finite.
+    fit is unchanged. The offset adapts in about `adapts_in_s`, and is not bounded here. Without `learns_scale` or
+    `learns_offset` this value stays, and its variance counts (Schmidt). All arguments are finite.
     """
     if dt_s <= 0.0:
         return fit, False
@@ -202,23 +210,30 @@ def observe(
 
 @final
 class Strength:
-    """Estimator of one device's scale and offset. It learns the offset sooner where readings surprise."""
+    """Estimator of one device's scale and offset: `fit`. It learns the offset sooner where readings surprise."""
 
     fit: DeviceFit = UNSEEN
+    "What is known of the device's force."
     surprise_N: float = 0.0
-    "By how much the readings of the last SURPRISE_S were more than expected."
+    "Mean of the readings over SURPRISE_S, less what was expected."
     is_held: bool = False
-    "Scale or offset is at one of its bounds."
+    "Whether scale or offset is at one of its bounds."
 
     def __init__(self, adapts_in_s: float, bounds: DeviceBounds, learns: tuple[bool, bool]) -> None:
-        """Begin with the fit of a device not yet seen. `adapts_in_s` is the offset's time without surprise. `learns`
-        enables scale and offset."""
+        """Begin with the fit of a device not yet seen.
+
+        `adapts_in_s` is the time in which the offset adapts without surprise. `learns` says whether scale and offset
+        are learned.
+        """
         self._adapts_in_s: Final = adapts_in_s
         self._bounds: Final = bounds
         self._learns: Final = learns
 
     def update(self, model_N: float, reading_N: float, dt_s: float) -> None:
-        """Take one reading, which stands for `dt_s` > 0, where the model's force is `model_N`."""
+        """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`.
+
+        Scale and offset are held within the bounds; `is_held` says so.
+        """
         error_N = reading_N - self.fit.force_N(model_N)
         self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)
         adapts_in_s = self._adapts_in_s / (1.0 + (self.surprise_N / SURPRISE_N) ** 2)
@@ -247,6 +262,6 @@ class Strength:
         self.settle()
 
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
-        """Replace all that was learned by `fit`."""
+        """Replace the fit by `fit`, and forget the surprise."""
         self.fit = fit
         self.settle()
