@@ -12,16 +12,16 @@ from tormagd.safety.codes import Limit
 
 @final
 class Acted:
-    """Number of ticks in which each limit of the output has acted. Duties have no slew limit."""
+    """Number of ticks in which each limit of the output has acted. There is no limit on how fast duties change."""
 
     rate: int = 0
-    "The speed of the gap's reference,"
+    "The limit on the speed of the gap's reference."
     slew: int = 0
-    "its acceleration,"
+    "The limit on the acceleration of the gap's reference."
     not_finite: int = 0
-    "a number that was not finite,"
+    "A number was not finite."
     range: int = 0
-    "a duty out of its range."
+    "A duty was out of its range."
 
 
 @final
@@ -29,7 +29,8 @@ class Drive(Value):
     """The duties of one tick, and the limits that held the gap back.
 
     left_duty, right_duty     as the device takes them, each within its limit
-    left_motor, right_motor   what the motors need at their nominal supply
+    left_motor, right_motor   the duties that the motors need at their nominal supply
+    limits                    the limits that held the gap back
     """
 
     def __init__(
@@ -43,28 +44,30 @@ class Drive(Value):
 
 
 class Actuator:
-    """A follower of a plan's gap. `begin`, `resume` and `update` raise NotImplementedError; each actuator gives its
-    own."""
+    """What makes the gap follow a plan, by duties of two motors.
+
+    `begin`, `resume` and `update` raise NotImplementedError; each actuator gives its own.
+    """
 
     reference: Reference | None = None
     "Where the gap is driven; None while nothing is driven."
     acceleration_scale: float = 1.0
-    "1 or more: how fast the actuator has shown to gain speed, times what is asked of all."
+    "Acceleration that the actuator has shown over the one that is asked of all devices, 1 or more."
 
     def __init__(self) -> None:
         self.acted = Acted()
 
     @property
     def reference_mm(self) -> float:
-        """Where the gap is driven; NaN while nothing is."""
+        """The gap that is driven to, mm; NaN while nothing is driven."""
         return math.nan if self.reference is None else self.reference.gap_mm
 
     def begin(self, gap_mm: float) -> None:
-        """Begin at this gap, at rest."""
+        """Begin to drive at the gap `gap_mm`, at rest."""
         raise NotImplementedError
 
     def resume(self, measured: Measured) -> None:
-        """Go on, without a jump, from the gap and speed that a blind time ended with."""
+        """Go on, without a jump, from the measured gap and speed that a blind time ended with."""
         raise NotImplementedError
 
     def update(
@@ -78,8 +81,8 @@ class Actuator:
     ) -> Drive:
         """Return the duties of one tick, `dt_s` > 0 after the last.
 
-        Without a `plan` the gap is held. With one it opens while the force `is_over` the ceiling. The gap is never to
-        be closer than the plan's least. Raises DomainError for a duty that is not finite: call `forget` then.
+        `plan` None holds the gap. With a plan the gap opens while the force is over the ceiling, `is_over`. The gap is
+        never to be closer than the plan's least. Raises DomainError for a duty that is not finite: call `forget` then.
         """
         raise NotImplementedError
 
@@ -92,7 +95,7 @@ class Actuator:
         self.acceleration_scale = 1.0
 
     def forget(self) -> None:
-        """Stop, forget the device, and count a number that was not finite."""
+        """Stop, forget the device, and count in `acted` a number that was not finite."""
         self.stop()
         self.lose_device()
         self.acted.not_finite += 1

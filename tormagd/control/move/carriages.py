@@ -1,6 +1,6 @@
 """The carriages as the actuator: from a gap with its speed and acceleration to two duties.
 
-target     where the plan leads by when a duty of now shows; a floor that acts ends the motion towards it
+target     where the plan leads by the time that a duty given now takes effect; never beyond a bound of the gap
 reference  follows the target at the speed and acceleration of the motors
 expected   the reference behind the windings' lag
 duty       of each carriage: PID on expected minus measured, plus what speed, acceleration, friction and pull take
@@ -22,13 +22,13 @@ from tormagd.scenes.scene import Scene
 WEAK_MM: Final = 1.0
 "Carriages further behind than this have weaker motors than believed."
 EXCHANGE_S: Final = 0.0015
-"From a duty to its effect as the encoders report it: a period in the exchange, half a period that it is held."
+"Time from a duty to its effect in the encoders' report: a period in the exchange, half a period that it is held."
 COULOMB_SPEED_MM_S: Final = 0.5
 "Below this reference speed the friction feed-forward fades."
 RESTING_MM_S: Final = 0.02
 "A slower reference has arrived."
 MAX_ACCELERATION_SCALE: Final = 2.0
-"No more is asked of lively motors; the liveliest of the plant card do 2.4 times as much."
+"Greatest `acceleration_scale`; the liveliest motors of the plant card do 2.4 times as much."
 SCALE_PER_MM_S: Final = 100.0
 """Growth of `acceleration_scale` a second, for each mm that carriages are ahead of what is expected while acceleration
 limits them."""
@@ -38,7 +38,7 @@ LAGGING_MM: Final = 0.1
 
 @final
 class Carriages(Actuator):
-    """The two carriages of one device.
+    """The actuator that drives the two carriages of one device.
 
     Carriages whose motors are livelier than believed get ahead of what is expected, and `acceleration_scale` grows.
     Weaker ones are asked for no less.
@@ -70,20 +70,23 @@ class Carriages(Actuator):
         self._learns: Final = terms.learning
 
     def begin(self, gap_mm: float) -> None:
-        """See `Actuator.begin`: the integrals begin empty, so no duty jumps."""
+        """Begin at the gap `gap_mm`, at rest and with empty integrals, so that no duty jumps."""
         self.reference = Reference(gap_mm)
         self.expected.begin(gap_mm)
         self.left.begin()
         self.right.begin()
 
     def resume(self, measured: Measured) -> None:
-        """See `Actuator.resume`: the device went on with its last duty."""
+        """Go on from the measured gap and speed after a blind time, in which the device kept its last duty.
+
+        The speed counts as no faster than the motors' own; the integrals stay.
+        """
         speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
         self.reference = Reference(measured.gap_mm, speed_mm_s)
         self.expected.begin(measured.gap_mm, speed_mm_s)
 
     def forget(self) -> None:
-        """See `Actuator.forget`."""
+        """Forget all motion and the device, and count in `acted` a number that was not finite, as `Actuator.forget`."""
         self.begin(0.0)
         super().forget()
 
@@ -96,10 +99,15 @@ class Carriages(Actuator):
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """See `Actuator.update`."""
+        """Return the duties of one tick, `dt_s` > 0 after the last, and take both position loops one tick on.
+
+        `plan` None holds the gap. With a plan the gap opens while the force is over the ceiling, `is_over`. Updates
+        reference, expected gap, integrals and counts, and may learn `acceleration_scale`. Call `begin` first. Raises
+        DomainError for a duty that is not finite: call `forget` then.
+        """
         assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
-        # a homed carriage that is found beyond the closed end has to come back from there
+        # a homed carriage may be found beyond the closed end: its pull counts as at the closed end
         pull = 0.0
         if self._has_motor:
             pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._closed_mm)) / self._supply_V
@@ -108,7 +116,7 @@ class Carriages(Actuator):
             self.reference, now_s, dt_s, plan, self._speeds(pull, measured), is_over, limits
         )
         self.reference = reference
-        # either also takes half of the skew, so that the faster waits for the slower
+        # each carriage also takes half of the skew as an error, so that the faster waits for the slower
         skew_mm = self._synchronisation * measured.skew_mm / 2.0
         half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
         left_mm, right_mm = half_mm - measured.left_mm - skew_mm, half_mm - measured.right_mm + skew_mm
@@ -119,7 +127,7 @@ class Carriages(Actuator):
         if abs(reference.speed_mm_s) < RESTING_MM_S:
             self.left.rest(left_mm, dt_s)
             self.right.rest(right_mm, dt_s)
-        # the firmware gives a carriage at its open switch no opening duty: nothing may be learned or concluded there
+        # at its open switch the firmware gives a carriage no opening duty: the loop must neither wind up nor saturate
         left = self.left.update(left_mm, left_mm_s, ahead, dt_s, measurement.is_left_open)
         right = self.right.update(right_mm, right_mm_s, ahead, dt_s, measurement.is_right_open)
         return self._drive(left, right, measurement.supply_V, limits)
@@ -134,7 +142,11 @@ class Carriages(Actuator):
         is_over: bool,
         limits: list[Limit],
     ) -> tuple[Reference, bool]:
-        """The reference `dt_s` later, and whether the limit of its acceleration held it back."""
+        """Return the reference `dt_s` later, and whether the limit of its acceleration held it back.
+
+        `plan` None: the reference stops. With a plan, `is_over` sends it open, and what holds the gap back is added to
+        `limits`. Counts in `acted`.
+        """
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
@@ -151,21 +163,24 @@ class Carriages(Actuator):
         return reference, is_slewed
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
-        """Return the speeds of the motors and the configuration, or the carriages' measured speed where they fall
-        behind.
+        """Return the gap's speeds: at no load, and the greatest that the reference may open and close with.
 
-        The speed is never below half, so a carriage that is held still is found by its following error.
+        Where the carriages fall behind, their measured speed takes the place of the motors'. It counts as at least half
+        of the motors', so that a carriage held still is found by its following error.
         """
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
         closing_mm_s = min(motors_mm_s, self._gap_speed_mm_s)
-        # the magnets' pull helps to close, but a reserve is worth more there than a little speed
+        # the magnets' pull helps to close, but there a reserve of duty is worth more than a little speed
         opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
-        """After a period in which the limit of its acceleration held the reference back; the errors are the gap's."""
+        """Update `acceleration_scale` after a period in which the acceleration limit held the reference back.
+
+        The errors are the gap's, expected minus measured. While the reference slows down nothing is learned.
+        """
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
             return
         # a carriage that did not get as far as it should is not ahead because it need not come back as far
@@ -175,20 +190,27 @@ class Carriages(Actuator):
         self.acceleration_scale = min(max(scale, 1.0), MAX_ACCELERATION_SCALE)
 
     def _feed_forward(self, reference: Reference, pull: float) -> float:
-        """The duty that the reference's speed and acceleration take, with friction and the magnets' `pull`, a duty."""
+        """Return the duty for the reference's speed and acceleration, with friction and the magnets' `pull`, a duty.
+
+        It is 0 in a scene without the term `motor`.
+        """
         if not self._has_motor:
             return 0.0
         speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
         moving = min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
         # to close, the pull helps a fifth as much: the screw's friction eats the rest
         resisting = self._coulomb + (pull if moving > 0.0 else 0.0)
-        # what the gears lose has to be added to speed up, and helps to brake
+        # the gears' loss has to be added to speed up, and helps to brake
         loss = math.copysign(self._gear_loss, acceleration * speed)
         inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
         return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
     def _drive(self, left: float, right: float, supply_V: float, limits: list[Limit]) -> Drive:
-        """The bridges switch the device's real supply: the same volts take less duty of a higher one."""
+        """Return the duties at the device's real supply, held within the duty limit.
+
+        The same volts take less duty of a higher supply; one under half of the nominal counts as half. Counts duties
+        out of range in `acted`, and adds SATURATED to `limits` where a loop is saturated.
+        """
         is_saturated = self.left.is_saturated or self.right.is_saturated
         if is_saturated:
             limits.append(Limit.SATURATED)

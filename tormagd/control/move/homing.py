@@ -12,16 +12,16 @@ from tormagd.safety.codes import Fault
 LONGEST_S: Final = 12.0
 "The slowest homing from a closed gap takes under 10 s."
 BACKS_OFF_MM: Final = 3.0
-"A carriage that goes further towards closed than a firmware backs off from a switch goes the wrong way,"
+"A firmware backs off less from a switch: a carriage that goes further towards closed goes the wrong way."
 WENT_BACK_MM: Final = 0.5
-"and one whose homing failed has gone there by this."
+"A carriage whose homing failed went the wrong way if it came so far towards closed."
 ZEROED_MM: Final = 1.0
 "No carriage moves so far between two looks: the device has set its zero."
 STATUS_S: Final = 0.1
-"Status says that the device homes still; it comes every 20 ms."
+"A homing device sends a Status every 20 ms: without one for so long it is not known to home still."
 OVER_S: Final = 0.04
 RISES: Final = 1.25
-"The sensor may show this many times what it showed when homing began."
+"The sensor may show this many times what it showed when homing began, for OVER_S at most."
 
 _HOMING: Final = DeviceMode.HOMING
 _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
@@ -29,34 +29,38 @@ _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
 
 @final
 class Homing:
-    """The watch on one homing after another; `faults` are those of the newest look."""
+    """The watch on one homing of the device after another; `faults` are those of the newest look."""
 
     is_running: bool = False
+    "Whether the device homes, as of the newest look."
     began_s: float = 0.0
+    "When the homing began."
     time_s: float = 0.0
-    "Of the newest look."
+    "When the newest look of a homing was."
     left_mm: float = 0.0
-    "How far open the carriages have been,"
+    "How far open the left carriage has been."
     right_mm: float = 0.0
+    "How far open the right carriage has been."
     left_at_mm: float = 0.0
-    "and where they are."
+    "Where the left carriage is."
     right_at_mm: float = 0.0
+    "Where the right carriage is."
     switches: int = 0
-    "Which open switches were seen closed."
+    "Which open switches were seen closed, as bits of `Switches`."
     max_N: float = 0.0
-    "What the force sensor may show,"
+    "The greatest force that the sensor may show in this homing."
     over_s: float = 0.0
-    "and for how long it has shown more."
+    "How long the sensor has shown more."
     faults: tuple[Fault, ...] = ()
     "What was wrong at the newest look."
 
     def __init__(self, ceiling_N: float) -> None:
-        """Take what the force sensor may show at any time, `ceiling_N`."""
+        """Begin before a homing. `ceiling_N` is the force that the sensor may show at any time."""
         self._ceiling_N: Final = ceiling_N
 
     @property
     def went_back_mm(self) -> tuple[float, float]:
-        """How far left and right carriage have come back towards closed from where they were most open."""
+        """How far the left and the right carriage have come back towards closed from where they were most open."""
         return self.left_mm - self.left_at_mm, self.right_mm - self.right_at_mm
 
     def __str__(self) -> str:
@@ -70,7 +74,10 @@ class Homing:
         )
 
     def update(self, now_s: float, measurement: Measurement) -> None:
-        """Take one look at the device, and set `faults`."""
+        """Take one look at the device, and set `faults`: WRONG_DIRECTION, HOMING, OVER_FORCE, STATUS_STALE, or none.
+
+        A device that neither homes nor has just stopped homing has none.
+        """
         self.faults = ()
         if measurement.mode is not _HOMING:
             if self.is_running:
@@ -81,6 +88,7 @@ class Homing:
             self._follow(now_s, measurement)
 
     def _begin(self, now_s: float, measurement: Measurement) -> None:
+        """Begin with a device that was found homing: its places, its switches, and the force it may show."""
         self.is_running, self.began_s, self.time_s, self.over_s = True, now_s, now_s, 0.0
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -88,6 +96,7 @@ class Homing:
         self.max_N = max(self._ceiling_N, RISES * abs(measurement.force_N))
 
     def _follow(self, now_s: float, measurement: Measurement) -> None:
+        """Watch a homing that goes on, and set the first fault that shows."""
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -104,7 +113,10 @@ class Homing:
             self.faults = (Fault.STATUS_STALE,)
 
     def _end(self, now_s: float, measurement: Measurement) -> None:
-        """Homed, or given up by the device, or ended by a request to open."""
+        """Judge a homing that has ended: done, given up by the device, or ended by a request to open.
+
+        A homed device must have shown both open switches. One that latched must not have gone the wrong way.
+        """
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN
         if measurement.is_homed:
@@ -115,4 +127,5 @@ class Homing:
 
 
 def _outermost_mm(outermost_mm: float, last_mm: float, now_mm: float) -> float:
+    """Return how far open a carriage has been; begin anew at `now_mm` where the device has set its zero."""
     return now_mm if abs(now_mm - last_mm) > ZEROED_MM else max(outermost_mm, now_mm)

@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 PULL_STATED_MM: Final = 45.0
 "The gap for which `motor.pull_V` is stated."
 MAX_MARGIN_DB: Final = 200.0
-"Of a gain margin: a loop that no gain makes swing, or that swings with every gain, has so much or so little."
+"Bound of a gain margin: that of a loop that no gain makes swing, or, negative, that swings with every gain."
 PULL_DEPTH_MM: Final = 32.0
 "Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
 
@@ -33,9 +33,9 @@ class TransferFunction(NamedTuple):
 class Margins(NamedTuple):
     """Stability margins of the open position loop.
 
-    gain_margin_dB     up or down, the nearer, within MAX_MARGIN_DB; negative where the loop swings
+    gain_margin_dB     to more or less gain, whichever is nearer, within +-MAX_MARGIN_DB; negative where the loop swings
     phase_margin_deg   negative where the loop swings
-    crossover_Hz       where the gain is 1
+    crossover_Hz       where the gain falls through 1 for the last time; 0.05 Hz where it never does
     """
 
     gain_margin_dB: float
@@ -49,9 +49,9 @@ def full_speed_mm_s(motor: Motor) -> float:
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:
-    """Return the voltage that either motor needs against the magnets' pull, to open from `gap_mm` >= 0.
+    """Return the voltage that one motor needs against the magnets' pull, to open from `gap_mm` >= 0.
 
-    `stated_V` is that at PULL_STATED_MM (`motor.pull_V`). The pull falls with the fourth power of `gap_mm` +
+    `stated_V` is the voltage at PULL_STATED_MM (`motor.pull_V`). The pull falls with the fourth power of `gap_mm` +
     PULL_DEPTH_MM.
     """
     nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
@@ -60,17 +60,17 @@ def pull_V(stated_V: float, gap_mm: float) -> float:
 
 
 def mechanical_time_s(motor: Motor) -> float:
-    """Time constant of the speed after a voltage step, s: J R / Ke^2."""
+    """Return the time constant of the speed after a voltage step, s: J R / Ke^2."""
     return motor.inertia_kg_m2 * motor.resistance_ohm / motor.back_emf_V_s**2
 
 
 def electrical_time_s(motor: Motor) -> float:
-    """Time constant of the current after a voltage step, s: L / R."""
+    """Return the time constant of the current after a voltage step, s: L / R."""
     return motor.inductance_mH * 1e-3 / motor.resistance_ohm
 
 
 def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
-    """H(z) from duty to carriage position, mm, exact for a duty held over each period."""
+    """Return H(z) from duty to carriage position, mm, of third order, exact for a duty held over each period."""
     inductance_H = motor.inductance_mH * 1e-3
     advance_mm = motor.screw_lead_mm / (2.0 * math.pi * motor.gear_ratio)
     # states: current A, motor speed rad/s, carriage position mm; last row and column carry the held input
@@ -97,7 +97,7 @@ def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
 
 
 def _exponential(matrix: Array) -> Array:
-    """Matrix exponential by scaling and squaring a Taylor series; exact to rounding for these small matrices."""
+    """Return the matrix exponential by scaling and squaring a Taylor series; exact to rounding for small matrices."""
     squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300))) + 4)
     scaled = matrix / 2.0**squarings
     total = term = np.eye(len(matrix))
@@ -110,15 +110,19 @@ def _exponential(matrix: Array) -> Array:
 
 
 def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
-    """Return the delay, s, beyond one exchange's, that the position loop bears before it swings; 0 where it swings
-    already."""
+    """Return the delay, s, beyond one period's exchange, that the position loop bears before it swings.
+
+    It is 0 where the loop swings already.
+    """
     known = margins(motor, position, period_s)
     return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
 
 
 def margins(motor: Motor, position: Position, period_s: float, *, delay_periods: float = 1.0) -> Margins:
-    """Return the margins of the position loop as it is computed: PID and its filter in z, H(z), and the exchange's
-    delay. `delay_periods` is the last, in periods."""
+    """Return the margins of one carriage's position loop as it is computed: PID and its filter in z, H(z), and a delay.
+
+    `delay_periods` is the delay of the exchange, in periods of `period_s`.
+    """
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)
     plant = zero_order_hold(motor, period_s)
@@ -140,7 +144,7 @@ def margins(motor: Motor, position: Position, period_s: float, *, delay_periods:
     rising = rising[rising < crossing]
     if rising.size:
         gain_margin = min(gain_margin, 20.0 * math.log10(float(magnitude[rising].min())))
-    if phase_deg[crossing] < -180.0:  # it swings: by so much less gain it would not, if any keeps it from that
+    if phase_deg[crossing] < -180.0:  # the loop swings: the margin is how much less gain would end that, if any does
         before = turning[turning <= crossing]
         gain_margin = -20.0 * abs(math.log10(float(magnitude[before[-1]]))) if before.size else -MAX_MARGIN_DB
     return Margins(gain_margin, 180.0 + float(phase_deg[crossing]), float(frequency[crossing]))

@@ -26,7 +26,7 @@ SEARCH_SHARE: Final = 0.5
 REPORT_S: Final = 0.1
 "A longer pause between two Status counts as this."
 LOWEST_SUPPLY: Final = 0.5
-"Of the nominal voltage: what reads less gives no speed, and the device says so itself."
+"Least share of the nominal voltage that counts: a lower reading gives no speed, and the device reports it."
 
 _HOMING: Final = DeviceMode.HOMING
 _RETRACTING: Final = DeviceMode.RETRACTING
@@ -35,7 +35,10 @@ _FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED
 
 
 def is_open(measurement: Measurement, is_placed: bool) -> bool:
-    """Tell whether the gap is open: by the carriages' places where `is_placed`, else by both open switches."""
+    """Tell whether the gap is open.
+
+    Where `is_placed`, the carriages' places say so, else both open switches.
+    """
     if is_placed:
         return min(measurement.left_mm, measurement.right_mm) >= -OPEN_MM
     return measurement.is_left_open and measurement.is_right_open
@@ -43,25 +46,28 @@ def is_open(measurement: Measurement, is_placed: bool) -> bool:
 
 @final
 class Opening:
-    """The watch on a device that is not driven from here; `faults` are those of the newest look."""
+    """The watch on the opening of a device that is not driven by the core; `faults` are those of the newest look."""
 
     is_watching: bool = False
+    "Whether the newest look was judged."
     device_s: float = 0.0
-    "The device's clock at the newest State,"
+    "The device's clock at the newest State."
     left_mm: float = 0.0
-    "where the carriages were then,"
+    "Where the left carriage was at that State."
     right_mm: float = 0.0
+    "Where the right carriage was at that State."
     left_late_s: float = 0.0
-    "and how much later they are than at the device's own speed."
+    "How late the left carriage is against the device's own speed."
     right_late_s: float = 0.0
+    "How late the right carriage is against the device's own speed."
     reported_s: float = 0.0
-    "When the newest Status came,"
+    "When the newest Status came."
     waits_s: float = 0.0
-    "and for how long a device whose carriages' places are not known has not been open."
+    "How long a device whose carriages' places are not known has not been open."
     unheard_request: int = 0
-    "The newest request before this watch: it was another device's, or was for another end."
+    "The newest request before this watch began: it was another device's, or for another end."
     told_request: int = -1
-    "The request that followed the newest fault. Only what is asked for after it is judged."
+    "The request that followed the newest fault: only later requests are judged. -1: none."
     faults: tuple[Fault, ...] = ()
     "What was wrong at the newest look; told once."
 
@@ -80,15 +86,17 @@ class Opening:
         )
 
     def rest(self, request_number: int) -> None:
-        """Stop watching, and clear `faults`: the device is driven, homes or has gone. Requests up to `request_number`
-        are not judged."""
+        """Stop watching, and clear `faults`: the device is driven, homes or has gone.
+
+        Requests up to `request_number` are not judged.
+        """
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
-        """Take one look at the device, and set `faults`, each told once. A device that homes is not judged.
+        """Take one look at a device that is not driven, and set `faults`: NOT_OPENING or none, told once.
 
-        With `is_placed` the carriages' places are known; `is_blind` says not at present. `safety` gives the newest
-        request.
+        With `is_placed` the carriages' places are known; with `is_blind` not at present. `safety` gives the newest
+        request. A device that homes is not judged, nor one that had a fault, before another request.
         """
         number = safety.request_number
         if self.faults:
@@ -118,6 +126,7 @@ class Opening:
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
 
     def _follow(self, measurement: Measurement) -> None:
+        """Judge the carriages by their places: NOT_OPENING where one is later than LATE_S."""
         dt_s = max(measurement.device_time_s - self.device_s, 0.0)
         share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
         speed_mm_s = share * self._full_mm_s
@@ -129,6 +138,11 @@ class Opening:
             self.faults = (Fault.NOT_OPENING,)
 
     def _listen(self, measurement: Measurement, is_asked: bool, is_placed: bool) -> None:
+        """Judge the device by its word, while its places are unknown or the loop is blind.
+
+        NOT_OPENING comes after a search's time while it says that it opens. It comes after LATE_S where it was asked to
+        open and does not. A device that shows both open switches, or a failure, is not late.
+        """
         if not is_placed:
             self._place(measurement)
         dt_s = min(measurement.reported_s - self.reported_s, REPORT_S)
@@ -144,5 +158,8 @@ class Opening:
 
 
 def _late_s(late_s: float, before_mm: float, now_mm: float, speed_mm_s: float) -> float:
-    """How late a carriage is that was as late before it came from there to here; one that is open is not."""
+    """Return how late a carriage is at `now_mm` that was `late_s` late at `before_mm`, against `speed_mm_s`.
+
+    A carriage that is open is not late.
+    """
     return 0.0 if now_mm >= -OPEN_MM else max(late_s - (now_mm - before_mm) / speed_mm_s, 0.0)

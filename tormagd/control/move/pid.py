@@ -23,9 +23,9 @@ class Pid:
     """The position loop of one carriage. Its integral starts at 0: friction holds a resting carriage."""
 
     integral: float = 0.0
-    "Duty."
+    "The integral part of the duty."
     is_saturated: bool = False
-    "The limit held the newest duty back."
+    "Whether the duty limit held the newest duty back."
 
     def __init__(self, position: Position) -> None:
         self._proportional_per_mm: Final = position.proportional_per_mm
@@ -39,8 +39,10 @@ class Pid:
         self.integral, self.is_saturated = 0.0, False
 
     def rest(self, error_mm: float, dt_s: float) -> None:
-        """Let the integral decay, in its time constant, where |`error_mm`| is at most ON_TARGET_MM. Call it while the
-        reference rests."""
+        """Let the integral decay, in its time constant, where |`error_mm`| is at most ON_TARGET_MM.
+
+        Call it while the reference rests.
+        """
         if abs(error_mm) <= ON_TARGET_MM:
             self.integral = self.integral * self._integral_time_s / (self._integral_time_s + dt_s)
 
@@ -61,7 +63,7 @@ class Pid:
         growth = proportional / self._integral_time_s + (duty - asked) / self._back_calculation_s
         if is_blocked:
             growth = min(growth, 0.0)
-        # the integral never needs more than the whole duty, whatever a long saturation makes of back-calculation
+        # no carriage needs more than the whole duty from the integral, whatever a long saturation adds up to
         self.integral = min(max(self.integral + growth * dt_s, -self._limit), self._limit)
         self.is_saturated = within != asked and duty == within
         return duty

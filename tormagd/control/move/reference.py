@@ -8,7 +8,7 @@ from tormagd.control.filter import low_pass
 from tormagd.control.records import Plan
 
 CARRY_S: Final = 0.012
-"A plan's gap is carried forward along its speed by no more than three inference periods."
+"A plan's gap is carried forward along its motion by no more than this, three inference periods."
 APPROACH_S: Final = 0.01
 "Time constant of the last stretch: below it the reference would chase every quantum of its target."
 MIN_BRAKING: Final = 0.2
@@ -27,8 +27,11 @@ class Reference(Value):
 
 @final
 class Speeds(Value):
-    """Speeds of the gap, mm/s, > 0: at no load, where the motors have no torque left, and the reference's greatest each
-    way."""
+    """Speeds of the gap, mm/s, > 0.
+
+    no_load_mm_s                 where the motors have no torque left
+    opening_mm_s, closing_mm_s   the reference's greatest each way
+    """
 
     def __init__(self, no_load_mm_s: float, opening_mm_s: float, closing_mm_s: float) -> None:
         self.no_load_mm_s: Final = no_load_mm_s
@@ -37,10 +40,10 @@ class Speeds(Value):
 
 
 def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
-    """Return where the plan leads, `lag_s` from now, when the present duty shows.
+    """Return where `plan` leads, with speed and acceleration, `lag_s` from now, when the present duty takes effect.
 
-    The plan is carried on by CARRY_S at most beside `lag_s`. The least gap `floor_mm` and the greatest `open_mm` hold
-    it, and end the motion towards them.
+    A plan is carried on by its age, CARRY_S at most, and `lag_s`. The least gap `floor_mm` and the greatest `open_mm`
+    hold the place, and end the motion towards them.
     """
     age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + lag_s
     gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
@@ -63,10 +66,10 @@ def follow(
 ) -> tuple[Reference, bool, bool]:
     """Return the reference `dt_s` later, and two limits: whether speed held it back, and whether acceleration did.
 
-    It closes no faster than it can stop at `floor_mm`. It approaches the target at the greatest speed that it can still
-    brake from with `acceleration_mm_s2`. So a step is time-optimal and does not overshoot. The target's own speed is
-    added, which follows a moving target without lag. A target that turns round leaves less to brake with. While
-    speeding up, the acceleration falls to nothing at `speeds.no_load_mm_s`.
+    The reference closes no faster than it can stop at `floor_mm`. It approaches `target` at the greatest speed that it
+    can still brake from with `acceleration_mm_s2`. So a step is time-optimal and does not overshoot. The target's own
+    speed is added, which follows a moving target without lag. A target that turns round leaves less to brake with.
+    While speeding up, the acceleration falls to nothing at `speeds.no_load_mm_s`.
     """
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
@@ -89,7 +92,10 @@ def follow(
 
 
 def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> float:
-    """The fastest from which that distance still suffices to come to rest, in steps of `dt_s`."""
+    """Return the greatest speed from which `distance_mm` still suffices to come to rest, in steps of `dt_s`.
+
+    Near the target the speed is no more than the distance in APPROACH_S.
+    """
     change = braking_mm_s2 * dt_s
     fastest = (math.sqrt(change * change + 8.0 * braking_mm_s2 * distance_mm) - change) / 2.0
     return min(fastest, distance_mm / max(APPROACH_S, dt_s))
@@ -97,7 +103,7 @@ def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> flo
 
 @final
 class Expected:
-    """The expected gap, for a gap that follows its reference: the reference with its jerk limited.
+    """The gap that the carriages are expected at: the reference with its jerk limited.
 
     The windings take the acceleration with a lag, and the exchange adds a delay.
     """
@@ -105,15 +111,17 @@ class Expected:
     gap_mm: float = 0.0
     speed_mm_s: float = 0.0
     filtered_mm_s: float = 0.0
-    "The speed as the measured one is filtered."
+    "The speed, filtered as the measured speeds are."
 
     def begin(self, gap_mm: float, speed_mm_s: float = 0.0) -> None:
-        """Begin at this gap and speed."""
+        """Begin at the gap `gap_mm` with the speed `speed_mm_s`."""
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """Follow the `reference` for `dt_s`, `lag_s` behind it. `filter_s` is the time constant of the measured speeds'
-        filter."""
+        """Follow `reference` for `dt_s`, with the time constant `lag_s`.
+
+        `filter_s` is the time constant of the measured speeds' filter.
+        """
         self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
         self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)
         self.filtered_mm_s = low_pass(self.filtered_mm_s, self.speed_mm_s, dt_s, filter_s)

@@ -1,4 +1,4 @@
-"""Faults and limits: what shows that the device, positions, link, force or motion is wrong."""
+"""The watch on a device: what shows that the device, its positions, link, force or motion is wrong."""
 
 import math
 from typing import Final, final
@@ -22,54 +22,61 @@ STILL_MM_S: Final = 0.5
 STARTS_OVER: Final = 1.25
 "Static over kinetic friction at most: a start from rest may take so many times the greatest force."
 OVER_N: Final = 0.1
-"What the sensor may be off besides."
+"How far the sensor may be off besides."
 OVER_HELD_S: Final = 0.03
 OVER_FAULT_S: Final = 0.1
-"A force over the ceiling opens the gap after the first, and is a fault after the second."
+"A force over the ceiling opens the gap after OVER_HELD_S, and is a fault after OVER_FAULT_S."
 SENSOR_FAULT_S: Final = 2.0
-"A sensor that has not been believed for so long of sliding is a fault: forces are then only as good as the model."
+"A sensor not believed for so long of sliding is a fault: forces are then only as good as the model."
 SENSE_FAULT_S: Final = 0.1
 STATUS_FAULT_S: Final = 0.1
-"Without a Sense, and without a Status, for so long: Status comes every 20 ms, Sense with every State."
+"A Sense, or a Status, that is older is a fault: Status comes every 20 ms, Sense with every State."
 OPPOSED_S: Final = 0.1
 "A carriage that moves against its duty for so long does not brake: it brakes from full speed within 0.06 s."
 WENT_AGAINST_S: Final = 0.015
-"Carriages that come apart, or to a stop, after one of them has gone against its duty for so long do so for that."
+"Carriages that come apart, or to a stop, do so by wrong wiring if one has gone against its duty for so long."
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
-"""Of the delay that the position loop bears besides its own period: from the first on a round trip is a limit, from the
-second on a fault, and no enabling."""
+"""Shares of the delay that the position loop bears besides its own period. A round trip over the first is a limit; over
+the second a fault, and refuses enabling."""
 CLOCK_OFF: Final = 0.01
 CLOCK_FAULT: Final = 0.1
-"A clock that is off by a greater share is a limit, and a fault."
+"A device's clock that is off by more than CLOCK_OFF is a limit, by more than CLOCK_FAULT a fault."
 STALL_SHARE: Final = 0.8
-"Of the device's timeout: a shorter stall of ours did not make it run out."
+"A stall of the host shorter than this share of the device's timeout did not make it run out."
 
 _DEVICE_RUN: Final = DeviceMode.RUN
 
 
 def ceiling_N(scene: Scene) -> float:
-    """Return the greatest force, N, that the sensor may show in a scene: STARTS_OVER times the scene's greatest, plus
-    OVER_N."""
+    """Return the greatest force, N, that the sensor may show in `scene`.
+
+    It is STARTS_OVER times the scene's greatest force, plus OVER_N.
+    """
     return STARTS_OVER * scene.force.most_N + OVER_N
 
 
 @final
 class Watch:
-    """The watch on one device. Times count in periods: a process that stood still saw nothing."""
+    """The watch on one device: counts for how long a driven device misbehaves, and tells its faults and limits.
+
+    Times count in periods: a process that stood still saw nothing.
+    """
 
     enabled_s: float = math.inf
+    "When the device was enabled; inf while it is not."
     straying_s: float = 0.0
-    "For how long the gap has been too far from its reference."
+    "How long the gap has been too far from its reference."
     still_s: float = 0.0
-    "For how long a carriage has been driven without moving."
+    "How long a carriage has been driven without moving."
     opposed_s: float = 0.0
-    "For how long a carriage has moved against its duty."
+    "How long a carriage has moved against its duty."
     over_s: float = 0.0
-    "For how long the measured force has been over the ceiling while the handle moved."
+    "How long the measured force has been over the ceiling while the handle moved."
     left_duty: float = 0.0
+    "The left motor's duty at the step before."
     right_duty: float = 0.0
-    "Of the step before."
+    "The right motor's duty at the step before."
 
     def __init__(self, config: Config, scene: Scene) -> None:
         limits, device, period_s = config.limits, config.device, 1.0 / config.rates.control_hz
@@ -95,14 +102,13 @@ class Watch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the force has been over the ceiling for so long that the gap opens."""
+        """Whether the force has been over the ceiling for so long that the gap has to open."""
         return self.over_s > OVER_HELD_S
 
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
-        """Return the `conditions` of a command, with the skew of the carriages and the greatest values that a command
-        may find.
+        """Return `conditions` completed by the carriages' skew, and by the greatest values that a command may find.
 
-        `measured` is None while the device is silent: not fresh, and the skew infinite.
+        `measured` is None while the device is silent: the conditions are then not fresh, and the skew is infinite.
         """
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
@@ -113,7 +119,7 @@ class Watch:
         )
 
     def begin(self, enabled_s: float) -> None:
-        """Begin all counts anew for a device enabled at `enabled_s`, inf where it is not enabled."""
+        """Begin all counts anew for a device enabled at `enabled_s`; inf: not enabled."""
         self.enabled_s = enabled_s
         self.straying_s = self.still_s = self.opposed_s = self.over_s = 0.0
 
@@ -127,31 +133,33 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        """Return all faults that show now, and change nothing; `latch` sorts them.
+        """Return all faults that show now, and change nothing: `operating_state.latch` sorts them.
 
-        `leap` is an encoder step that no carriage makes, None without one. `sensor_doubted_s` is how long the force
-        sensor has not been believed.
+        `leap` is an encoder step that no carriage makes, None without one: ENCODER shows once a later Status has come.
+        `sensor_doubted_s` is how long the force sensor has not been believed. Faults of link and motion show only while
+        `safety.is_driven`.
         """
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
-            if measurement.reported_s > leap.seen_s:  # so it was not reset in between
+            if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
                 faults.append(Fault.ENCODER)
         elif measured.is_homed and not safety.needs_homing:
-            # switches come with Status: without a State, positions are older than they are
+            # switches come with Status: without a new State, positions are older than the switches
             is_left_open = not sight.is_blind and measurement.is_left_open
             is_right_open = not sight.is_blind and measurement.is_right_open
             if is_outside(measured, self._closed_mm, self._open_mm, is_left_open, is_right_open):
                 faults.append(Fault.OUT_OF_STROKE)
         if safety.is_driven:
             faults += self._of_link(now_s, measurement, sight)
-            if leap is None:  # what follows from positions says nothing then
+            if leap is None:  # after a leap positions say nothing of the motion
                 faults += self._of_motion(measured, sensor_doubted_s)
                 if measurement.mode is not _DEVICE_RUN and not faults and now_s - self.enabled_s > STARTING_S:
                     faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """Return what is not as it should be and no fault, and change nothing."""
+        """Return the limits SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK, as they show now. Changes
+        nothing."""
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
@@ -170,6 +178,7 @@ class Watch:
         """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`.
 
         Counts for how long a gap strays, a carriage stands or goes against its duty, and the force is over the ceiling.
+        A count begins again where its cause has gone. On a brake the force counts only while the handle moves.
         """
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
@@ -184,6 +193,10 @@ class Watch:
         self.left_duty = self.right_duty = 0.0
 
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
+        """Return the faults that the device reports; none while a clearing of its faults may still be under way.
+
+        A timeout after a stall of this host counts as the host's.
+        """
         shown: int = measurement.faults
         if not shown or now_s < safety.clearing_until_s:
             return []
@@ -193,11 +206,16 @@ class Watch:
         return list(device_faults(measurement.faults, is_host_stall=is_ours))
 
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
+        """Return the faults of the link: messages too old, a round trip too long, a device's clock too far off.
+
+        While the answer to the first Drive after a stall may be on its way, no message is too old. A Sense is too old
+        only where the scene needs the sensor.
+        """
         faults: list[Fault] = []
-        # the tick that is nearest to a time's end judges it: the next one would be a period late
+        # the tick nearest to the end of a timeout judges it: the next one could be a period late
         at_s = now_s + self._period_s / 2.0
         if not sight.is_waiting(now_s):
-            # what has just come over a slow line is old too, and a loop around it would swing
+            # a State that has just come over a slow line is old too, and a loop around such a delay would swing
             if at_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s:
                 faults.append(Fault.MEASUREMENT_STALE)
             if self._needs_sensor and at_s - measurement.sensed_s > SENSE_FAULT_S:
@@ -211,6 +229,10 @@ class Watch:
         return faults
 
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
+        """Return the faults of motion and force, by the counted times.
+
+        SENSOR is one only where the scene needs the sensor, OVER_FORCE only on a brake.
+        """
         faults: list[Fault] = []
         is_skewed = abs(measured.skew_mm) > self._max_apart_mm
         is_still = self.still_s > self._no_motion_time_s
@@ -220,7 +242,7 @@ class Watch:
             faults.append(Fault.SKEW)
         if self.straying_s > self._following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
-        if self.over_s > OVER_FAULT_S and self._slides:  # of a pad it is the finger that presses so hard
+        if self.over_s > OVER_FAULT_S and self._slides:  # on a pad the finger itself may press so hard
             faults.append(Fault.OVER_FORCE)
         if self._needs_sensor and sensor_doubted_s > SENSOR_FAULT_S:
             faults.append(Fault.SENSOR)
@@ -229,7 +251,7 @@ class Watch:
         return faults
 
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
-        """Whether a carriage that is driven stands."""
+        """Tell whether a carriage that is driven stands."""
         # a duty that turns round before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
         is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
@@ -238,7 +260,10 @@ class Watch:
         return is_left_still or is_right_still
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        """A carriage that is driven well moves the other way; one that comes to a stop there, did."""
+        """Count in `opposed_s` for how long a carriage that is driven well moves against its duty.
+
+        The count stands while a driven carriage stands, and ends once one moves the right way or none is driven.
+        """
         left_mm_s = right_mm_s = 0.0
         is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
         if is_left_driven:
