@@ -1,7 +1,7 @@
 """The closed loop in virtual time: the daemon's core against the simulated device, as fast as the processor goes.
 
-The same `plan` and `step`, the same connection, the same protocol bytes as in the daemon; only time, sockets and the
-port are replaced. It stands beside the rooms because it joins control with simulation, which no room may.
+`plan` and `step`, the connection and the protocol bytes are the daemon's own; only time, sockets and the port are
+replaced. The module stands beside the rooms because it joins control with simulation, which no room may.
 """
 
 from collections.abc import Callable, Iterable
@@ -37,14 +37,19 @@ SEARCH_S: Final = 0.012
 MAX_UNREAD_BYTES: Final = 4096
 "Bytes that a serial port keeps for a program that does not read."
 MAX_UNREAD_FRAMES: Final = 512
-"Frames that a CAN socket keeps, about."
+"Frames that a CAN socket keeps for a program that does not read, about."
 
 
 @final
 class Sample(Value):
     """One control tick: what was asked, what the controller knew, and the plant's true state.
 
-    `measurement` is what the step was given; the connection's may be newer by now.
+    measured      what the core measured; None while the device has said nothing
+    reference     where the gap is driven; None while nothing is driven
+    output        the duties sent
+    plan          the plan that the step used
+    truth         the plant's state
+    measurement   what the step was given, None without a link; the connection's may be newer by now
     """
 
     def __init__(
@@ -69,7 +74,7 @@ class Sample(Value):
 
 
 class VirtualPort:
-    """Backend whose far end is the simulated device; `device` may be replaced by one that behaves badly."""
+    """Backend to the simulated device over serial bytes; `device` may be replaced by one that behaves badly."""
 
     def __init__(self, device: SerialDevice) -> None:
         self.now_s = 0.0
@@ -78,13 +83,15 @@ class VirtualPort:
         self._unread = b""
 
     def open(self) -> Self:
-        """Forget everything under way and return this port, with a new codec."""
+        """Drop all bytes that wait for their reader, and return this port with a new codec."""
         self.stream, self._unread = FrameStream(), b""
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`; the device's bytes wait for their reader, MAX_UNREAD_BYTES and the newest at
-        most."""
+        """Let the device run until `now_s`.
+
+        Its bytes wait for their reader, MAX_UNREAD_BYTES and the newest at most.
+        """
         self.now_s = now_s
         self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
 
@@ -94,7 +101,7 @@ class VirtualPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return all valid messages that have arrived."""
+        """Return all valid messages that have arrived since the last call."""
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
 
@@ -107,7 +114,7 @@ class VirtualPort:
 
 
 class VirtualBus:
-    """Backend whose far end is a simulated device on a CAN bus, through the real backend's codec of frames."""
+    """Backend to a simulated device on a CAN bus, with the real backend's codec of frames."""
 
     def __init__(self, device: CanLine) -> None:
         self.now_s = 0.0
@@ -116,13 +123,16 @@ class VirtualBus:
         self._unread: list[CanFrame] = []
 
     def open(self) -> Self:
-        """Forget all received frames and return this bus, with a new codec."""
+        """Drop all frames that wait for their reader, and return this bus with a new codec."""
         self.stream = CanStream(DEFAULT_NODE)
         self._unread.clear()
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`; the device's newest MAX_UNREAD_FRAMES frames wait for their reader."""
+        """Let bus and device run until `now_s`.
+
+        The device's newest MAX_UNREAD_FRAMES frames wait for their reader; frames of other senders are dropped.
+        """
         self.now_s = now_s
         arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
         self._unread = [*self._unread, *arrived][-MAX_UNREAD_FRAMES:]
@@ -133,7 +143,7 @@ class VirtualBus:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return all valid messages of the device that have arrived."""
+        """Return all valid messages of the device that have arrived since the last call."""
         arrived, self._unread = self._unread, []
         self.stream.received = []
         return self.stream.unpack_all(arrived)
@@ -198,10 +208,11 @@ class ClosedLoop:
         return self.connection.measurement
 
     def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
-        """Run one control period and return what happened in it.
+        """Run one control period, and return what happened in it.
 
-        A given `plan` is used instead of planning: a bench sweep asks for gaps, not forces. Raises ValueError without a
-        plan in a loop without a planner.
+        `setpoint` is the newest; None: no publisher. With a `plan` nothing is planned, and this one is used: a bench
+        sweep asks for gaps, not forces. Raises ValueError without a plan in a loop without a planner, and DomainError
+        where planning fails, as `Planner.plan`.
         """
         self._ticks += 1
         now_s = self.now_s
@@ -220,17 +231,22 @@ class ClosedLoop:
         return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
 
     def skip(self) -> None:
-        """Let one control period pass in which the daemon, stopped or killed, does nothing. What the device sends
-        waits."""
+        """Let one control period pass in which the daemon, stopped or killed, does nothing.
+
+        The device runs on, and what it sends waits for the next tick.
+        """
         self._ticks += 1
         self._port.advance(self.now_s)
 
     def command(self, name: str) -> None:
-        """Carry out an operator's command. Raises RefusedError."""
+        """Carry out the operator's command `name` under the present conditions. Raises RefusedError."""
         self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
-        """Return what commands are decided on, as of now."""
+        """Return the conditions on which commands are taken or refused, as of now.
+
+        Without a planner the device's F_min counts as 0 N.
+        """
         believe = None if self.planner is None else self.planner.believe
         return conditions(
             self.now_s,
@@ -246,15 +262,18 @@ class ClosedLoop:
     def run(
         self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
     ) -> Iterable[Sample]:
-        """Yield the ticks of the next `duration_s`; `setpoint` gives the newest setpoint at a time, None for none."""
+        """Run the ticks of the next `duration_s` one by one, and yield their samples.
+
+        A tick runs when its sample is asked for. `setpoint` gives the newest setpoint at a time; None: no publisher.
+        """
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
     def arm(self, plan: Plan | None = None) -> None:
-        """Connect, home and enable, as an operator does. Raises RuntimeError if the device does not get there within
-        HOMING_S.
+        """Connect, home and enable, as an operator does.
 
-        `plan` is used in every tick, as in `tick`.
+        `plan` is used in every tick, as in `tick`. Raises RuntimeError where the device does not answer, begin to home,
+        or home within HOMING_S each, or is not enabled. Raises RefusedError for a refused command.
         """
         self._until(lambda m: True, "answer", plan)
         self.command("home")
@@ -265,14 +284,16 @@ class ClosedLoop:
             raise RuntimeError(f"not enabled: {self.stepper.safety}")
 
     def _newest_plan(self) -> Plan:
+        """Return the planner's newest plan. Raises ValueError without a planner."""
         if self.planner is None:
             raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
         return self.planner.planned
 
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """Plan where a setpoint is new or the inference period is over; before it hand over a search's answer.
+        """Plan where a setpoint is new or the inference period is over; without a planner do nothing.
 
-        Nothing happens without a planner.
+        Before, a search's answer that is due is handed over. After, a forecast is made, and the plan's question to a
+        search is noted, unless one is pending.
         """
         planner = self.planner
         if planner is None:
@@ -285,14 +306,17 @@ class ClosedLoop:
             self._asked = self._asked or planner.question
 
     def _search(self, planner: Planner, now_s: float) -> None:
-        """Answer the pending question to the search once SEARCH_S is over, as a process of its own would."""
+        """Answer the pending question once SEARCH_S is over, as a search in a process of its own would."""
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
             planner.answered(planner.aim.answer_to(asked))
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
-        """Tick until a measurement has `reached` what is wanted. Raises RuntimeError after HOMING_S."""
+        """Run ticks until `reached` is true of a measurement; `plan` is used in each.
+
+        Raises RuntimeError after HOMING_S: the device did not `what`.
+        """
         for _ in range(round(HOMING_S / self._period_s)):
             self.tick(plan=plan)
             if self.measurement is not None and reached(self.measurement):
@@ -305,10 +329,9 @@ class ClosedLoop:
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
-    """Return a publisher in virtual time: a function of the time that gives the newest setpoint sent, None before the
-    first.
+    """Return a publisher in virtual time: a function from the time, s, to the newest setpoint, None before the first.
 
-    `times_s` (n) rise, `forces_N` (n) are sent at these times.
+    `forces_N` (n) are sent at the rising `times_s` (n), each valid for `valid_for_s`.
     """
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()

@@ -1,7 +1,7 @@
 """One typed, validated configuration.
 
 A TOML file, or the defaults. Unknown keys, wrong types, NaN and infinities, values out of range and impossible
-orderings are refused with the key's path, the value and what is allowed.
+orderings are refused. The error names the key's path, the value and what is allowed.
 """
 
 from pathlib import Path
@@ -249,8 +249,11 @@ class Config(Strict, frozen=True):
 
 
 def load_config(path: Path | None) -> Config:
-    """Read the configuration in `path`, or take the defaults; without stated rates it is at its scene's. Raises
-    ConfigError."""
+    """Read the configuration file `path`; None: take the defaults. Raises ConfigError.
+
+    Where the file states none of rates.control_hz, rates.inference_hz and rates.of_scene, `rates.of_scene` becomes
+    true: the daemon then runs at its scene's rates.
+    """
     config = Config() if path is None else convert(path, Config)
     stated = {} if path is None else read_toml(path).get("rates", {})
     if stated.keys() & {"control_hz", "inference_hz", "of_scene"}:

@@ -1,4 +1,4 @@
-"""What `tools/benchmark.py scenes` measured: how exactly and at what cost each scene is served, and what was chosen."""
+"""Figures from `tools/benchmark.py scenes`: how exactly and at what cost each scene is served, and what was chosen."""
 
 from importlib import resources
 
@@ -17,7 +17,8 @@ class Way(Struct, frozen=True):
 class Share(Struct, frozen=True):
     """The processor time of a daemon that serves a scene in one way, live on the simulated device.
 
-    `daemon` is of all its processes, over wall time. `step_us` and `plan_us` are the core's own, in the median.
+    daemon             the share of wall time that all its processes take
+    step_us, plan_us   the core's own time for a step and for a plan, medians
     """
 
     way: Way
@@ -39,13 +40,17 @@ class Tried(Struct, frozen=True):
 
     @property
     def worst_N(self) -> float:
-        """The greatest of the three."""
+        """The greatest RMS error of the three samples, N."""
         return max(self.rms_N)
 
 
 class Judged(Struct, frozen=True):
-    """The worst device of a group, `deciding` or `judging`, in one situation: the RMS error of the force, N, as chosen
-    and in the usual way."""
+    """The worst device of a group in one situation.
+
+    group      `deciding` or `judging`: the devices that a way was chosen on, or those that it was judged on
+    rms_N      the RMS error of the force in the chosen way
+    usual_N    the RMS error in the usual way
+    """
 
     group: str
     device: str
@@ -56,7 +61,13 @@ class Judged(Struct, frozen=True):
 
 
 class MeasuredScene(Struct, frozen=True):
-    """One scene: every way that was tried, the usual one first, the chosen one, and how that was judged."""
+    """What was measured of one scene.
+
+    fingerprint   the scene's, which changes with what the scene asks for
+    chosen        the way that was chosen
+    tried         every way that was tried, the usual one first
+    judged        how the chosen way did on other devices
+    """
 
     name: str
     fingerprint: str
@@ -67,7 +78,7 @@ class MeasuredScene(Struct, frozen=True):
 
     @property
     def usual(self) -> Tried:
-        """The scene at 1000 Hz of control and 500 of plans."""
+        """The scene served in the usual way: 1000 Hz of control and 500 of plans."""
         return self.tried[0]
 
     @property
@@ -76,12 +87,12 @@ class MeasuredScene(Struct, frozen=True):
         return self.usual.worst_N <= self.tolerance_N
 
     def of(self, way: Way) -> Tried:
-        """What was found of a way that was tried. Raises StopIteration for another."""
+        """Return what was found of `way`. Raises StopIteration where it was not tried."""
         return next(each for each in self.tried if each.way == way)
 
 
 class Measured(Struct, frozen=True):
-    """The file: how it was made, what each way costs, and every scene."""
+    """The file of measurements: how it was made, what each way costs, and every scene."""
 
     command: str
     machine_us: float
@@ -92,26 +103,26 @@ class Measured(Struct, frozen=True):
     scenes: tuple[MeasuredScene, ...]
 
     def share(self, way: Way) -> Share | None:
-        """What a way costs; None where nobody measured it."""
+        """Return what serving in this `way` costs; None where it was not measured."""
         return next((each for each in self.shares if each.way == way), None)
 
     def scene(self, fingerprint: str) -> MeasuredScene | None:
-        """The scene that asks for just this; None where it was not measured."""
+        """Return what was measured of the scene with this `fingerprint`; None where none was."""
         return next((each for each in self.scenes if each.fingerprint == fingerprint), None)
 
 
 FILE = "measured.json"
 TOLERATED = 0.8
-"Of a scene's tolerance: an error within it may be chosen."
+"Share of a scene's tolerance: an error within it may be chosen."
 WORSE = 0.2
-"Of a scene's tolerance: an error that is so much over the usual way's may be chosen."
+"Share of a scene's tolerance: an error that is so much over the usual way's may be chosen."
 
 
 def measured() -> Measured:
-    """Read the file that comes with the package."""
+    """Read the file of measurements that comes with the package, and return it."""
     return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measured)
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
-    """The greatest error, N, of a way that may be chosen in place of the usual one."""
+    """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`."""
     return max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)

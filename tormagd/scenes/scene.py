@@ -45,7 +45,7 @@ class Force(Strict, frozen=True):
 
     @property
     def waiting_N(self) -> float:
-        """The least that is asked of the device while somebody sends setpoints."""
+        """The least force, N, that is asked of the device while somebody sends setpoints."""
         return self.least_N if self.standby_N is UNSET else max(self.least_N, self.standby_N)
 
 
@@ -57,8 +57,10 @@ class Bandwidth(Strict, frozen=True):
 
 
 class Signal(Strict, frozen=True):
-    """The force that the task asks for over time: a recording, or `force`'s range up and down, as much of it as the
-    device gives. A device whose carriages are too slow for it is refused."""
+    """The force that the task asks for over time: a recording, or `force`'s range up and down.
+
+    Of the range, as much is asked as the device gives. A device whose carriages are too slow for the signal is refused.
+    """
 
     file: str = ""
     "A CSV with the columns t_s,force_N, relative to the scene file; forces between its rows are on a smooth curve."
@@ -109,16 +111,16 @@ class Budget(Strict, frozen=True):
 
 
 class Terms(Strict, frozen=True):
-    """The parts of the controller's model. One that is left out is not computed.
+    """The parts of the controller's model. A part that is left out is not computed.
 
     `rate`        the handle's rate and displacement are inputs of the learned model; without it the force over the
                   gap is one table, that of a handle at the thesis's 42 mm/s, and there is no search
-    `creep`       what friction does beside that of sliding at a creep, Stribeck's and static, is learned
+    `creep`       the friction of a creeping handle beside that of a sliding one, static and Stribeck's, is learned
     `scale`       the device's force over the model's is learned: friction, modulus, field
     `offset`      the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds
                   back, beyond what its model expects
-    `memory`      what the elastomer has relaxed away of the force, and how far the field lags behind that of its gap,
-                  is told by the model from where the gap has been
+    `memory`      the model follows, from where the gap has been, how much force the elastomer has relaxed away and
+                  how far its field lags behind the gap's
     `forecast`    setpoints are carried along their slope to now and ahead, and a force that repeats itself is foreseen
     `motor`       how late the carriages are is learned and made up for, and the duty that the reference takes is fed
                   forward: for its speed and acceleration, the dry friction of gearbox and screw, and the magnets'
@@ -140,11 +142,11 @@ class Terms(Strict, frozen=True):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The names of the terms that are out."""
+        """The names of the terms that are left out."""
         return tuple(name for name in TERMS if not getattr(self, name))
 
     def without(self, *names: str) -> "Terms":
-        """These terms with some more left out. Raises ValueError for a name that is none."""
+        """Return these terms with `names` left out, too. Raises ValueError for a name that is no term."""
         for name in names:
             if name not in TERMS:
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
@@ -189,7 +191,7 @@ class Solver(Strict, frozen=True):
 
 
 class Scene(Strict, frozen=True):
-    """One task. Raises ConfigError, through `load_scene`, where its statements contradict each other."""
+    """One task. Raises ValueError where its statements contradict each other; `load_scene` makes it a ConfigError."""
 
     name: str
     description: str
@@ -234,6 +236,7 @@ class Scene(Strict, frozen=True):
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
 
     def _require_no_brake(self) -> None:
+        """Raise ValueError where a tactile scene states what only a brake has."""
         usual = Insert(self.insert.name, self.insert.model)
         for key in ("inner_radius_mm", "outer_radius_mm", "thickness_mm", "roller_radius_mm"):
             value = getattr(self.insert, key)
@@ -246,12 +249,15 @@ class Scene(Strict, frozen=True):
 
     @property
     def roller_radius_mm(self) -> float | None:
-        """The lever: a newton at the roller is so many mNm at the handle's shaft. A pad has none."""
+        """The lever, mm: a newton at the roller is so many mNm at the handle's shaft. None for a pad."""
         return self.insert.roller_radius_mm if self.element == "torque" else None
 
     @property
     def fingerprint(self) -> str:
-        """Hash what is asked: all that is stated but names, budget, and how it is served (terms, rates, search)."""
+        """The hash, 16 hex digits, of what the scene asks for.
+
+        The scene's name, description and budget, and how it is served (terms, rates, search), do not count.
+        """
         task = msgspec.structs.replace(
             self, name="", description="", terms=EVERY_TERM, bandwidth=Bandwidth(), solver=Solver(), budget=Budget()
         )
@@ -259,15 +265,21 @@ class Scene(Strict, frozen=True):
 
 
 def shipped_scenes() -> tuple[str, ...]:
-    """The names of the scenes that come with the package."""
+    """Return the names of the scenes that come with the package, sorted."""
     return shipped(_SHIPPED, ENDING)
 
 
 def scene_path(name_or_path: str) -> Path:
-    """The file of a shipped scene's name, or the path itself. Raises ConfigError naming the shipped scenes."""
+    """Return the path of the shipped scene with this name, or of the file at this path.
+
+    Raises ConfigError naming the shipped scenes where there is neither.
+    """
     return named("scene", name_or_path, _SHIPPED, ENDING)
 
 
 def load_scene(name_or_path: str) -> Scene:
-    """Read the scene in a file or of a shipped name. Raises ConfigError naming file, key, value and what is allowed."""
+    """Read and check a shipped scene, by its name, or the scene in a file.
+
+    Raises ConfigError naming file, key, value and what is allowed.
+    """
     return convert(scene_path(name_or_path), Scene)

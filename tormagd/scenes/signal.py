@@ -15,7 +15,10 @@ Array = npt.NDArray[np.float64]
 
 
 def recorded(path: Path) -> tuple[Array, Array]:
-    """Times from the first row on, s, and forces, N (n each), of a file of forces. Raises ConfigError."""
+    """Read a file of forces, and return its times from the first row on, s, and forces, N (n each).
+
+    Raises ConfigError naming `signal.file`.
+    """
     try:
         table = read_forces(path)
     except ForceFileError as error:
@@ -27,9 +30,11 @@ def recorded(path: Path) -> tuple[Array, Array]:
 def asked(
     signal: Signal, beside: Path, range_N: tuple[float, float], longest_s: float, rate_hz: int
 ) -> tuple[Array, Array]:
-    """Times, s, and forces, N, at `rate_hz` until the signal, or once up and down, ends, at most `longest_s`.
+    """Return times, s, and forces, N (n each), that `signal` asks for, `rate_hz` of them a second.
 
-    Only forces within `range_N` are asked for: a brake has a least one, and says so with the limit F_MIN.
+    They end with the recording, or with the range gone once up and down, after `longest_s` at the latest. Forces are
+    held within `range_N`, least and greatest: a brake has a least force, and reports it with the limit F_MIN. A file is
+    relative to the folder `beside`. Raises ConfigError for a file that is not as allowed.
     """
     low_N, high_N = range_N
     if signal.file:
@@ -51,8 +56,10 @@ def asked(
 
 
 def _through(time_s: Array, known_s: Array, known_N: Array) -> Array:
-    """Cubic Hermite curves through the rows, with the slopes of their neighbours: a corner at every row would shake the
-    carriages."""
+    """Return the forces (n) at `time_s` on cubic Hermite curves through the rows `known_s`, `known_N`.
+
+    Slopes are from a row's neighbours: a corner at every row would shake the carriages.
+    """
     slope = np.gradient(known_N, known_s)
     after = np.clip(np.searchsorted(known_s, time_s, side="right"), 1, len(known_s) - 1)
     start = after - 1
