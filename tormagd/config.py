@@ -85,7 +85,7 @@ class Rates(Strict, frozen=True):
 
 
 class RealTime(Strict, frozen=True):
-    """Each of these is optional; one that is refused by the kernel is a plain warning and a line of `doctor`."""
+    """Each of these is optional; one that the kernel refuses stands in `status` until a start is granted it."""
 
     fifo_priority: Annotated[int, Meta(ge=0, le=90)] = 0
     "Of SCHED_FIFO; 0 asks for none, because only a machine that is set up for it allows one."

@@ -142,28 +142,6 @@ def test_without_a_daemon_every_command_ends_with_3(run_dir, ctl, arguments, mon
     assert list(run_dir.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [],
-        ["fly"],
-        ["send"],
-        ["send", "step", "--rate", "nan"],
-        ["send", "step", "--rate", "0"],
-        ["send", "step", "--valid-for-ms", "-1"],
-        ["send", "step", "--source", ""],
-        ["home", "--timeout", "0"],
-        ["plot", "a.mcap"],
-        ["dashboard", "--port", "70000"],
-        ["scene", "burn"],
-    ],
-)
-def test_usage_errors_exit_2(arguments, capsys):
-    with pytest.raises(SystemExit, match=r"^2$"):
-        main(arguments)
-    assert "usage:" in capsys.readouterr().err
-
-
 def test_scenes_are_listed_and_shown(ctl):
     listed = ctl("--json", "scene", "list").result["scenes"]
     assert {"coronary", "pulse", "brain"} <= {scene["name"] for scene in listed}
@@ -313,6 +291,25 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
             "control   warning, 1000 Hz, late 41 us (p50) 304 us (p99), overruns 2, stalls 3, merged 1",
             "late by   7 kernel, 1 Connection.receive, 1 TelemetryLoop.publish",
         ),
+        (),
+    ),
+    "what the kernel refused": (
+        {"not_granted": ["realtime.fifo_priority = 50: not permitted", "realtime.lock_memory: no"]},
+        (
+            "kernel    did not grant realtime.fifo_priority = 50: not permitted\n"
+            "kernel    did not grant realtime.lock_memory: no\n          next: tormagctl doctor",
+        ),
+        (),
+    ),
+    "nothing of the kernel where it granted all": ({}, (), ("kernel", "doctor")),
+    "when it was asked, where that was long ago": (
+        {"setpoint_cf": 1.62, "setpoint_age_ms": 36_000.0, "measured_cf": None},
+        ("force     asked 1.620 N 36 s ago, governed 1.500 N, measured -",),
+        (),
+    ),
+    "how well the force was followed": (
+        {"following": {"rms_N": 0.136, "aligned_rms_N": 0.044, "delay_ms": 180.0}},
+        ("followed  to 136 mN RMS, 44 mN with a delay of 180 ms taken out",),
         (),
     ),
     "a compiled core": ({"build": "compiled"}, ("core      compiled",), (COST, REMEDY)),

@@ -371,6 +371,12 @@ async def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Pa
             await page.resize(width, height)
             await page.until(FITS)
             await page.until(DRAWN)
+        fake_daemon.says(
+            not_granted=["realtime.lock_memory: no"],
+            following={"rms_N": 0.136, "aligned_rms_N": 0.044, "delay_ms": 180.0},
+        )
+        await page.until("document.querySelector('#codes').textContent.includes('did not grant realtime.lock_memory')")
+        assert await page.ask("document.querySelector('#followed').textContent") == "136 (44 less 180 ms)"
         fake_daemon.is_silent = True
         await page.until("document.querySelector('#silence').textContent.startsWith('nothing heard for')")
 

@@ -3,6 +3,7 @@ import os
 import resource
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from firmware_protocol.build import COST, REMEDY, Build
@@ -11,7 +12,7 @@ from tormagd.ctl import doctor as checks, headroom
 from tormagd.ctl.doctor import Verdict, examine, judged
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.main import main
-from tormagd_client.endpoints import Endpoints
+from tormagd_client.endpoints import Endpoints, in_folder
 
 LIMITS = """Limit                     Soft Limit           Hard Limit           Units
 Max locked memory         {memlock}            unlimited            bytes
@@ -140,6 +141,74 @@ def test_each_trouble_is_found_and_has_a_remedy(good, check, config, files, verd
     assert bool(finding.remedy) == (verdict != "ok")
 
 
+REFUSED = ("realtime.fifo_priority = 50: not permitted; see LimitRTPRIO", "realtime.lock_memory: no memory")
+
+
+@pytest.fixture
+def told(good, fake_daemon, status_with):
+    """What is found where a daemon runs: of a caller and a file that allow everything, and as it says of itself."""
+
+    def found(not_granted=(), realtime=REALTIME.realtime, **changes):
+        known = fake_daemon.answers["describe"]()["result"]
+        known |= {"configuration": msgspec.to_builtins(Config(realtime=realtime)), "configuration_file": "/a.toml"}
+        fake_daemon.answers["describe"] = lambda: {"ok": True, "result": known}
+        fake_daemon.says(not_granted=list(not_granted), **changes)
+        running = checks.running(in_folder(str(fake_daemon.directory)), 5.0)
+        return {each["name"]: each for each in judged(REALTIME, Machine(good), None, running).result["checks"]}
+
+    return found
+
+
+def test_a_daemon_that_runs_says_itself_what_it_was_granted(good, told):
+    """Whatever whoever calls is allowed: nothing that was refused is unlimited, and nothing that is set recommended."""
+    write(good, "proc/swaps", SWAPPING["proc/swaps"])
+    refused = told(REFUSED)
+    assert [name for name, each in refused.items() if each["verdict"] == "fail"] == ["sched_fifo", "memlock"]
+    assert (refused["sched_fifo"]["found"], "LimitRTPRIO=90" in refused["sched_fifo"]["remedy"]) == (
+        f"refused: {REFUSED[0]}",
+        True,
+    )
+    assert (refused["swap"]["verdict"], "unlimited" in str(refused["memlock"]["found"])) == ("warn", False)
+    assert not [each for each in refused.values() if each["remedy"].startswith("set realtime.")]
+    for path, text in NOTHING.items():  # what whoever calls may not do changes nothing
+        write(good, path, text)
+    granted = told()
+    assert {each["verdict"] for each in granted.values()} == {"ok"}
+    assert (granted["daemon"]["found"], granted["sched_fifo"]["found"]) == (
+        "tormagd 0 runs by /a.toml",
+        "granted: realtime.fifo_priority = 50",
+    )
+    unset = told(realtime=RealTime())
+    assert unset["memlock"]["remedy"] == "set realtime.lock_memory = true in /a.toml and start it again"
+
+
+def test_a_daemon_s_device_and_build_are_what_it_says(told, status_with):
+    link = status_with()["link"] | {"state": "BACK_OFF", "cause": "no such port", "remedy": "plug it in"}
+    found = told(link=link, build="interpreted: no C compiler")
+    assert (found["device port"]["found"], found["device port"]["remedy"]) == (
+        "/dev/tormag: BACK_OFF: no such port",
+        "plug it in",
+    )
+    assert (found["build"]["verdict"], found["build"]["found"]) == ("warn", "interpreted: no C compiler")
+
+
+def test_where_none_answers_it_is_said_that_the_caller_is_judged(good, run_dir):
+    for endpoints in (in_folder(str(run_dir)), Endpoints(control="tcp://192.0.2.1:5555")):
+        found = judged(REALTIME, Machine(good), None, checks.running(endpoints, 0.01)).result["checks"][0]
+        assert (found["name"], found["verdict"]) == ("daemon", "warn")
+        assert "judged by who calls this" in found["found"]
+
+
+def test_it_reads_what_the_service_reads(run_dir, tmp_path, monkeypatch, ctl):
+    file = tmp_path / "tormagd.toml"
+    file.write_text(f'[device]\nport = "/dev/of_the_service"\n[endpoints]\ncontrol = "ipc://{run_dir}/control"\n')
+    monkeypatch.setattr("tormagd.ctl.main.SERVICE_CONFIG", file)
+    assert "/dev/of_the_service does not exist" in ctl("doctor", "--wait", "0.01").out
+    named = tmp_path / "named.toml"
+    named.write_text(f'[endpoints]\ncontrol = "ipc://{run_dir}/control"\n')
+    assert "/dev/tormag does not exist" in ctl("doctor", "--wait", "0.01", "--config", str(named)).out
+
+
 def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_to_do(good, monkeypatch):
     assert checks.build(REALTIME, Machine(good)) == checks.Finding("build", Verdict.OK, "compiled")
     monkeypatch.setattr(checks, "settle", lambda: Build(False, "no C compiler (cc) when it was installed"))
@@ -194,7 +263,7 @@ def test_this_machine_agrees_with_the_kernels_own_answers():
 def test_json_counts_and_lines(capsys):
     assert main(["--json", "doctor"]) in (0, 1)
     result = json.loads(capsys.readouterr().out)["result"]
-    assert len(result["checks"]) == result["ok"] + result["warn"] + result["fail"] == len(checks.CHECKS)
+    assert len(result["checks"]) == result["ok"] + result["warn"] + result["fail"] == len(checks.CHECKS) + 1
     assert set(result["checks"][0]) == {"name", "verdict", "found", "remedy"}
 
 

@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -46,6 +47,8 @@ def full(
         faults=["SKEW"],
         limits=["RATE"],
         late_ticks_by={"kernel": 2},
+        not_granted=["realtime.fifo_priority = 50: Operation not permitted; see LimitRTPRIO"],
+        following={"rms_N": 0.136, "aligned_rms_N": 0.044, "delay_ms": 180.0},
     )
     return fake_daemon
 
@@ -63,6 +66,10 @@ SHOWN: list[tuple[str, dict[str, str], Any]] = [
     ("operating_state", {"tormag_operating_state": "FAULT"}, 0.0),
     ("fault", {"code": "SKEW"}, 1.0),
     ("limit", {"code": "RATE"}, 1.0),
+    ("not_granted", {"setting": "realtime.fifo_priority"}, 1.0),
+    ("following_rms_newtons", {}, 0.136),
+    ("following_aligned_rms_newtons", {}, 0.044),
+    ("following_delay_seconds", {}, pytest.approx(0.18)),
     ("loop_stalls", {"loop": "control"}, 3.0),
     ("loop_lateness_seconds", {"loop": "control", "percentile": "p99"}, pytest.approx(304e-6)),
     ("late_ticks", {"culprit": "kernel"}, 2.0),
@@ -102,6 +109,16 @@ def test_prometheus_s_own_parser_finds_no_fault(full: Any, ctl: Any) -> None:
         check=False,
     )
     assert (checked.returncode, checked.stdout, checked.stderr) == (0, "", "")
+
+
+def test_without_its_extra_it_says_which(ctl: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    monkeypatch.delitem(sys.modules, "tormagd.ctl.metrics")
+    error = ctl("--json", "metrics").ended(2).error
+    assert (error["message"], error["hint"]) == (
+        "prometheus_client is not installed",
+        "pip install 'tormagd[metrics]'",
+    )
 
 
 def test_what_is_not_known_has_no_sample(fake_daemon: Any, ctl: Any) -> None:

@@ -3,6 +3,7 @@
 import math
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from hypothesis import given, strategies as st
 from rich.console import Console
 
 from tormagd.ctl.top_screen import CURVES, EIGHTHS, Seen, columns, screen, span, sparkline
-from tormagd_client.messages import Explained, Status
+from tormagd_client.messages import Explained, FollowingReport, Status
 
 SIZES = ((80, 24), (160, 50))
 RATE = Explained("RATE", "the force was asked to change faster than the carriages travel", "ask for slower changes")
@@ -82,9 +83,24 @@ def test_a_fault_and_its_remedy_come_before_the_limits(seen: Seen, width: int, h
     assert "gap - mm" in text
 
 
-@pytest.mark.parametrize(("width", "height"), [(20, 5), (79, 23), (400, 120)])
+@pytest.mark.parametrize(("width", "height"), [(20, 5), (40, 24), (79, 23), (400, 120)])
 def test_any_size_can_be_drawn_on(seen: Seen, width: int, height: int) -> None:
-    assert all(len(line) <= width for line in drawn(seen, width, height))
+    lines = drawn(seen, width, height)
+    assert all(len(line) <= width for line in lines)
+    if width == 40:
+        asked = next(line for line in lines if line.startswith(" asked"))
+        assert re.match(r" asked +\d\.\d{3} N +[▁▂▃▄▅▆▇█]{8}", asked)
+
+
+def test_what_was_not_granted_and_how_the_force_is_followed_is_said(seen: Seen) -> None:
+    known = msgspec.structs.replace(
+        seen.status,
+        not_granted=("realtime.fifo_priority = 50: not permitted", "realtime.lock_memory: no"),
+        following=FollowingReport(rms_N=0.136, aligned_rms_N=0.044, delay_ms=180.0),
+    )
+    text = "\n".join(drawn(seen._replace(status=known), 120, 40))
+    assert "kernel     did not grant realtime.fifo_priority, realtime.lock_memory; next: tormagctl doctor" in text
+    assert "followed   to 136 mN RMS, 44 mN with a delay of 180 ms taken out" in text
 
 
 def test_before_the_first_snapshot_and_after_the_last_it_says_so(seen: Seen) -> None:

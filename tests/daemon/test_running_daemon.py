@@ -35,6 +35,7 @@ from tormagd_client.endpoints import in_folder
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, Description, Motion, Verdict
 from tormagd_client.wire import Pending
 
+NOT_GRANTED, CONFIG_FILE = ("realtime.lock_memory: no",), "/etc/tormag/a.toml"
 PATIENCE_TICKS = 20_000
 "Longer than anything takes; only a failure waits for it."
 LOOK_TICKS = 50
@@ -151,7 +152,7 @@ class Running:
 
     async def _begun(self, rates: Rates) -> None:
         config = Config(endpoints=in_folder(self.folder), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
-        self.daemon = Daemon(config, self.core, self.port.open, [])
+        self.daemon = Daemon(config, self.core, self.port.open, list(NOT_GRANTED), config_file=CONFIG_FILE)
         self.planner = FailingPlanner(self.daemon._inference.planner)
         self.daemon._inference.planner = self.planner  # type: ignore[assignment]
         # what was bound before the clock was made
@@ -301,6 +302,7 @@ def test_a_daemon_describes_what_it_runs(alone: Running) -> None:
     assert described.configuration["realtime"]["watchdog_ms"] == WATCHDOG_MS
     assert (described.model, described.build) == (alone.core.model, str(settle()))
     assert (described.firmware, described.serial_number) == (None, None)
+    assert (described.configuration_file, alone.command("status")["not_granted"]) == (CONFIG_FILE, [*NOT_GRANTED])
     # a device that has shown nothing yet is the model, at the gap speed of the configuration
     shown, told = alone.core.portrait, described.portrait
     assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
@@ -410,10 +412,13 @@ def test_a_homing_that_is_over_shows_as_one_that_succeeded(running: Running) -> 
 
 
 def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(armed: Running) -> None:
+    assert armed.command("status")["following"] is None
     for force_N in (1.0, 1.6):
         armed.ask(force_N)
         status = armed.until(lambda status, asked=force_N: abs(status["measured_cf"] - asked) < 0.06, f"{force_N} N")  # type: ignore[misc]
     assert (status["operating_state"], status["setpoint_cf"]) == ("ENABLED", 1.6)
+    followed = armed.until(lambda status: status["following"] is not None, "it was followed for a while")["following"]
+    assert followed["aligned_rms_N"] <= followed["rms_N"] < 0.1
     assert abs(status["skew_mm"]) < 0.05
     armed.ask(0.1)
     status = armed.until(lambda status: abs(status["governed_cf"] - status["least_N"]) < 5e-3, "the least force")

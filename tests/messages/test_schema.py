@@ -17,6 +17,7 @@ from tormagd_client.messages import (
     DeviceReport,
     ExecReport,
     Explained,
+    FollowingReport,
     LatenessReport,
     LinkReport,
     Motion,
@@ -54,7 +55,8 @@ V1: dict[type[msgspec.Struct], str] = {
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver roller_radius_mm uptime_s least_N "
     "most_N trim device profile least_gap_mm link setpoints peers "
     "rates phases_us late_ticks_by fault_details limit_details newest_stall not_granted way "
-    "black_box output next_commands is_open",
+    "black_box output next_commands is_open following",
+    FollowingReport: "rms_N aligned_rms_N delay_ms",
     OutputReport: "rate slew not_finite range",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
     "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock unsent refused "
@@ -84,7 +86,7 @@ V1: dict[type[msgspec.Struct], str] = {
     "device_temperature_C left_current_A right_current_A supply_V reference_gap_mm measured_cf left_mm right_mm "
     "handle_mm handle_rate_mm_s operating_state limits step_limits faults drive_mode left_duty right_duty request "
     "request_number lateness_us exec_us tick search_age_s",
-    Description: "version build configuration scene model profile firmware serial_number portrait",
+    Description: "version build configuration scene model profile firmware serial_number portrait configuration_file",
     PortraitReport: "force_N rate_N_s",
 }
 "The keys of `v: 1`, each with the meaning and the unit that docs/messages.md gives it."

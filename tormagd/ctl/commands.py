@@ -356,7 +356,7 @@ COMMANDS = {
     "doctor": Command(
         "what on this machine would hurt real time or access, each with its remedy",
         "doctor.doctor",
-        ("config", "config_file"),
+        ("config", "config_file", "endpoints", "wait_s"),
         (option("--measure", action="store_true", help="also which rates it holds, measured in about 6 s"),),
     ),
     "completion": Command(

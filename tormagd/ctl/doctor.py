@@ -1,8 +1,9 @@
 """`tormagctl doctor`: what on this machine would hurt real time or access, each with its remedy.
 
 Each check is a small function of the machine (and the configuration) that returns one finding; with `--measure` some
-more judge what was measured (`headroom.py`). None of them changes anything. A *fail* keeps tormagd from doing what it
-is configured to do; a *warn* costs timing.
+more judge what was measured (`headroom.py`). A daemon that runs here is asked by which configuration, and what it was
+granted; without one, what would be granted is that of whoever calls. None of them changes anything. A *fail* keeps
+tormagd from doing what it is configured to do; a *warn* costs timing.
 """
 
 import os
@@ -11,6 +12,7 @@ import sys
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -18,7 +20,12 @@ from firmware_protocol.build import COST, REMEDY, settle
 from tormagd.config import Config
 from tormagd.ctl.headroom import MOST_STOLEN, MOST_USED, MOST_WAITED, Headroom, Rate, measured, rates
 from tormagd.ctl.machine import Machine
-from tormagd.ctl.outcome import Colour, Exit, Outcome
+from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
+from tormagd.ctl.status import refused
+from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
+from tormagd_client.errors import ClientError, not_understood
+from tormagd_client.messages import Status
 
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
 DEFAULT_SLACK_NS = 50_000
@@ -32,6 +39,21 @@ MISSED_SHARE = 0.001
 "Of its beats that a bare timer may miss."
 STOP_OTHERS = "stop what else runs here; top shows it"
 BY_UNIT = "run tormagd by its systemd unit, or add "
+HERE = r"ipc://|tcp://(127\.|localhost:)"
+"An address of this machine."
+LIMITS_D = "to /etc/security/limits.d/tormag.conf where it is started by hand; then start it again"
+ASKED = (
+    ("sched_fifo", "fifo_priority", "50", f"add LimitRTPRIO=90 to its unit, or '@tormag - rtprio 90' {LIMITS_D}"),
+    (
+        "memlock",
+        "lock_memory",
+        "true",
+        f"add LimitMEMLOCK=infinity to its unit, or '@tormag - memlock unlimited' {LIMITS_D}",
+    ),
+    ("processors", "cpus", "", "name processors that are online and left to it: taskset -pc $(pidof tormagd)"),
+    ("keep awake", "keep_awake", "", "install systemd/udev/60-tormag.rules, and start it again"),
+)
+"What a daemon may ask the kernel for: the finding, the key of `realtime`, its usual value, and what helps."
 
 
 class Verdict(StrEnum):
@@ -51,15 +73,49 @@ class Finding(msgspec.Struct, frozen=True):
     remedy: str = ""
 
 
-def doctor(config: Config, config_file: Path | None, measure: bool) -> Outcome:
-    """Run every check on this machine, those of what can be measured too. The exit code is REFUSED where one failed."""
+class Running(NamedTuple):
+    """A daemon on this machine: how it stands, and its configuration with the file that this is from."""
+
+    status: Status
+    config: Config
+    file: Path | None
+
+
+def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_s: float, measure: bool) -> Outcome:
+    """Run every check on this machine, those of what can be measured too. The exit code is REFUSED where one failed.
+
+    The configuration is that of the daemon that answers, else that of `config_file`.
+    """
     machine = Machine(Path("/"))
-    return judged(config, machine, measured(config_file, machine) if measure else None)
+    known: Running | ClientError = running(endpoints, wait_s)
+    if isinstance(known, Running):
+        config, config_file = known.config, known.file
+    return judged(config, machine, measured(config_file, machine) if measure else None, known)
 
 
-def judged(config: Config, machine: Machine, found: Headroom | None = None) -> Outcome:
-    """The same of any machine."""
-    findings = examine(config, machine)
+def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
+    """The daemon that answers at the control endpoint, or why none does."""
+    if not re.match(HERE, endpoints.control):
+        return ClientError("elsewhere", f"{endpoints.control} is another machine's", "run tormagctl doctor there")
+    try:
+        with Client(endpoints, wait_s) as client:
+            status, known = client.status(), client.describe()
+        config = msgspec.convert(known.configuration, Config)
+    except ClientError as error:
+        return error
+    except ValueError as error:
+        return not_understood("configuration", error)
+    return Running(status, config, None if known.configuration_file is None else Path(known.configuration_file))
+
+
+def judged(
+    config: Config, machine: Machine, found: Headroom | None = None, known: Running | ClientError | None = None
+) -> Outcome:
+    """The same of any machine, and of what is known of a daemon on it."""
+    if isinstance(known, Running):
+        findings = (*of_daemon(known), *(check(_in_force(known), machine) for check in OF_MACHINE))
+    else:
+        findings = (*nobody(known), *examine(config, machine))
     if found is not None:
         findings += examine_headroom(config, found)
     count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
@@ -72,7 +128,7 @@ def judged(config: Config, machine: Machine, found: Headroom | None = None) -> O
         table = tuple(rates(config, found))
         result["measured"] = msgspec.to_builtins(found) | {"rates": [msgspec.to_builtins(row) for row in table]}
         text += "\n" + _table(table)
-    return Outcome(result, text, Exit.REFUSED if count[Verdict.FAIL] else Exit.DONE)
+    return Outcome(result, folded(text), Exit.REFUSED if count[Verdict.FAIL] else Exit.DONE)
 
 
 def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Verdict = Verdict.WARN) -> Finding:
@@ -83,6 +139,46 @@ def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Verdi
 def examine(config: Config, machine: Machine) -> tuple[Finding, ...]:
     """Every check's finding, in the order of the report."""
     return tuple(check(config, machine) for check in CHECKS)
+
+
+def nobody(why: ClientError | None) -> tuple[Finding, ...]:
+    """That no daemon could be asked, and why; nothing where none was."""
+    if why is None:
+        return ()
+    found = f"none was asked ({why.message}); what it would be granted is judged by who calls this"
+    return (Finding("daemon", Verdict.WARN, found, why.hint),)
+
+
+def of_daemon(known: Running) -> tuple[Finding, ...]:
+    """What a daemon says of itself: its configuration, its build, what the kernel granted it, and its device."""
+    status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
+    link, lacking = status.link, refused(status.not_granted)
+    findings = [
+        Finding("daemon", Verdict.OK, f"tormagd {status.version} runs by {known.file or 'its defaults'}"),
+        _finding("build", status.build == "compiled", status.build or "not told by a daemon this old", REMEDY),
+    ]
+    for name, key, usual, remedy in ASKED:
+        if (why := lacking.get(f"realtime.{key}")) is not None:
+            findings.append(Finding(name, Verdict.FAIL, f"refused: {why}", remedy))
+        elif value := getattr(realtime, key):
+            findings.append(
+                Finding(name, Verdict.OK, f"granted: realtime.{key} = {msgspec.json.encode(value).decode()}")
+            )
+        elif usual:
+            to_do = f"set realtime.{key} = {usual} in {file} and start it again"
+            findings.append(Finding(name, Verdict.WARN, f"realtime.{key} is not set", to_do))
+    device = f"{link.port}: {link.state}{link.cause and f': {link.cause}'}"
+    is_there = link.state == "RUNNING"
+    findings.append(_finding("device port", is_there, device, link.remedy or "tormagctl firmware", Verdict.FAIL))
+    return tuple(findings)
+
+
+def _in_force(known: Running) -> Config:
+    """A daemon's configuration, without a lock of its memory that was refused."""
+    config = known.config
+    if "realtime.lock_memory" not in refused(known.status.not_granted):
+        return config
+    return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, lock_memory=False))
 
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
@@ -251,7 +347,7 @@ def swap(config: Config, machine: Machine) -> Finding:
         return Finding("swap", Verdict.OK, "off")
     is_locked = config.realtime.lock_memory
     found = f"on ({lines[0].split()[0]}){', but realtime.lock_memory keeps the daemon in' if is_locked else ''}"
-    return _finding("swap", is_locked, found, "set realtime.lock_memory = true, or sudo swapoff -a")
+    return _finding("swap", is_locked, found, "see memlock above, or sudo swapoff -a")
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
@@ -352,23 +448,21 @@ def build(config: Config, machine: Machine) -> Finding:
     return _finding("build", runs.is_compiled, str(runs) if runs.is_compiled else f"{runs}; {COST}", REMEDY)
 
 
-CHECKS: tuple[Callable[[Config, Machine], Finding], ...] = (
-    build,
+Check = Callable[[Config, Machine], Finding]
+OF_CALLER: tuple[Check, ...] = (build, scheduling, memory_lock, timer_slack, run_directory, port)
+"What whoever calls has and may do, which stands for a daemon that he starts."
+OF_MACHINE: tuple[Check, ...] = (
     preemption,
     governor,
-    scheduling,
-    memory_lock,
     cores,
     load,
-    timer_slack,
     clock_source,
     swap,
     huge_pages,
-    run_directory,
-    port,
     port_holder,
     usb_latency,
 )
+CHECKS = (*OF_CALLER, *OF_MACHINE)
 
 
 def _table(table: tuple[Rate, ...]) -> str:

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 
+import msgspec
 from prometheus_client import CollectorRegistry, generate_latest, start_http_server
 from prometheus_client.core import (
     CounterMetricFamily,
@@ -16,6 +17,7 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.ctl.status import refused
 from tormagd.interrupt import interrupted_by
 from tormagd.output import write_line
 from tormagd_client.blocking import Client
@@ -104,7 +106,8 @@ def _family(
 
 
 def _families(status: Status) -> Iterator[Metric]:
-    link, setpoints, rates = status.link, status.setpoints, status.rates
+    link, setpoints, rates, followed = status.link, status.setpoints, status.rates, status.following
+    error_N, aligned_N, delay_ms = (None, None, None) if followed is None else msgspec.structs.astuple(followed)
     sources, trip_us = setpoints.by_source, status.link.round_trip_us
     for name, text, value, unit in (
         ("homed", "Whether the positions are known", float(status.is_homed), 1.0),
@@ -112,6 +115,9 @@ def _families(status: Status) -> Iterator[Metric]:
         ("force_asked_newtons", "Newest setpoint", status.setpoint_cf, 1.0),
         ("force_governed_newtons", "What the governor makes of it", status.governed_cf, 1.0),
         ("force_measured_newtons", "What the force sensor reads", status.measured_cf, 1.0),
+        ("following_rms_newtons", "Measured less asked, while it could be followed", error_N, 1.0),
+        ("following_aligned_rms_newtons", "The same, delay taken out", aligned_N, 1.0),
+        ("following_delay_seconds", "That delay", delay_ms, MILLI),
         ("force_least_newtons", "Least force of this device", status.least_N, 1.0),
         ("force_most_newtons", "Greatest force of this device", status.most_N, 1.0),
         ("gap_meters", "Measured gap between the magnets", status.gap_mm, MILLI),
@@ -138,6 +144,13 @@ def _families(status: Status) -> Iterator[Metric]:
     for kind, name, text, label, values in (
         (GAUGE, "fault", "Latched faults, 1 for each that is there", "code", dict.fromkeys(status.faults, 1.0)),
         (GAUGE, "limit", "Limits, 1 for each that holds the force back now", "code", dict.fromkeys(status.limits, 1.0)),
+        (
+            GAUGE,
+            "not_granted",
+            "Settings that the kernel refused, 1 for each",
+            "setting",
+            dict.fromkeys(refused(status.not_granted), 1.0),
+        ),
         (
             COUNTER,
             "source_lost",

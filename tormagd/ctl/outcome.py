@@ -1,7 +1,10 @@
 """How a command ends: exit codes, the errors that stand for them, and what is printed."""
 
 import os
+import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -13,6 +16,10 @@ import msgspec
 from tormagd.output import write_line
 from tormagd_client.errors import ClientError, InFaultError, SettingError, UnreachableError
 from tormagd_client.printable import printable
+
+NARROWEST = 20
+LABEL = re.compile(r"\S{0,24} +")
+"What a line begins with: its label and the space behind it."
 
 
 class Exit(IntEnum):
@@ -64,17 +71,19 @@ class Outcome(msgspec.Struct, frozen=True):
     exit_code: Exit = Exit.DONE
 
 
-def print_outcome(command: str, outcome: Outcome, as_json: bool) -> None:
-    """On stdout: one JSON object `{command, ok, result, error}`, or the text."""
+def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
+    """On stdout: one JSON object `{command, ok, result, error}`, or the text. What `tormagctl` ends with: REFUSED where
+    all was done, and the answer could not be written."""
     is_done = outcome.exit_code is Exit.DONE
-    _print(command, _object(command, is_done, outcome.result, None) if as_json else outcome.text)
+    is_written = _print(command, _object(command, is_done, outcome.result, None) if as_json else outcome.text)
+    return outcome.exit_code if is_written or not is_done else Exit.REFUSED
 
 
 def print_error(command: str, error: ClientError, as_json: bool) -> None:
     """The error and its remedy on stderr, and with `--json` the object on stdout as well."""
     colour = Colour(sys.stderr)
     said, hint = colour.red(printable(error.message)), printable(error.hint)
-    write_line(f"tormagctl {command}: {said}\n  next: {hint}", sys.stderr)
+    write_line(f"{f'tormagctl {command}'.rstrip()}: {said}\n  next: {hint}", sys.stderr)
     if as_json:
         told = {"code": error.code, "message": error.message, "hint": error.hint}
         _print(command, _object(command, False, None, told))
@@ -84,11 +93,26 @@ def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[s
     return msgspec.json.encode({"command": command, "ok": ok, "result": result, "error": error}).decode()
 
 
-def _print(command: str, text: str) -> None:
+def _print(command: str, text: str) -> bool:
     lost = write_line(text, sys.stdout)
     # a reader that stopped reading meant to; a disk that is full did not
-    if lost is not None and not isinstance(lost, BrokenPipeError):
-        write_line(f"tormagctl {command}: the answer could not be written: {lost.strerror}", sys.stderr)
+    if lost is None or isinstance(lost, BrokenPipeError):
+        return True
+    write_line(f"tormagctl {command}: the answer could not be written: {lost.strerror}", sys.stderr)
+    return False
+
+
+def folded(text: str) -> str:
+    """`text` for a person: on a terminal, what is longer than a line of it goes on under its own words."""
+    if not is_terminal(sys.stdout):
+        return text
+    width = max(shutil.get_terminal_size().columns, NARROWEST)
+    lines: list[str] = []
+    for line in text.splitlines():
+        label = LABEL.match(line)
+        under = " " * min(0 if label is None else label.end(), width // 3)
+        lines += textwrap.wrap(line, width, subsequent_indent=under) if len(line) > width else [line]
+    return "\n".join(lines)
 
 
 def is_terminal(stream: TextIO | None) -> bool:

@@ -15,7 +15,7 @@ import msgspec
 
 from tormagd.config import Config
 from tormagd.ctl.machine import Machine
-from tormagd.ctl.outcome import Colour, Outcome
+from tormagd.ctl.outcome import Colour, Outcome, folded
 from tormagd_client.printable import printable
 
 DETECTION_S = 2.0
@@ -72,7 +72,7 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
     asked = sorted(set(can.VALID_INTERFACES) - set(NOT_ASKED))
     channels = can.detect_available_configs(asked, timeout=DETECTION_S)
     found = survey(config, Machine(root), comports(), channels)
-    return Outcome(msgspec.to_builtins(found), _text(found, config, Colour(sys.stdout)))
+    return Outcome(msgspec.to_builtins(found), folded(_text(found, config, Colour(sys.stdout))))
 
 
 def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:

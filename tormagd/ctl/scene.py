@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from tormagd.config import Config
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, folded, usage_error
 from tormagd.ctl.process import answer_of
 from tormagd.scenes.measured import Measured, MeasuredScene, Share, Tried, Way, measured
 from tormagd.scenes.scene import Force, Scene, load_scene, shipped_scenes
@@ -54,7 +54,7 @@ def list_scenes() -> Outcome:
     width = max(len(scene.name) for scene in scenes)
     return Outcome(
         {"scenes": [{"name": scene.name, "description": scene.description} for scene in scenes]},
-        "\n".join(f"{scene.name:<{width}}  {scene.description}" for scene in scenes),
+        folded("\n".join(f"{scene.name:<{width}}  {scene.description}" for scene in scenes)),
     )
 
 
@@ -136,7 +136,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
         "core_share": share and share.daemon,
         "core_share_allowed": scene.budget.core_share,
     } | derived
-    return Outcome(result, "\n".join(lines))
+    return Outcome(result, folded("\n".join(lines)))
 
 
 def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
@@ -176,7 +176,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
         f"Shares: the daemon's processes, live on the simulated device, beside a machine_us of {file.machine_us:g}.",
     ]
     result = msgspec.to_builtins(found) | {"shares": msgspec.to_builtins(file.shares), "derived": derived}
-    return Outcome(result, "\n".join(lines))
+    return Outcome(result, folded("\n".join(lines)))
 
 
 def _tried(tried: Tried, share: Share | None, chosen: Way, runs: Way) -> str:

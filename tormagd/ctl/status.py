@@ -1,15 +1,17 @@
 """`tormagctl status` and `firmware`: the daemon's own snapshot, and its link's report, as they are or as text."""
 
+import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from firmware_protocol.build import COST, REMEDY
-from tormagd.ctl.outcome import Colour, Exit, Outcome
+from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd_client.blocking import Client
 from tormagd_client.messages import (
     BeliefReport,
     ClockReport,
     Explained,
+    FollowingReport,
     LinkReport,
     PeersReport,
     RateReport,
@@ -22,6 +24,8 @@ from tormagd_client.messages import (
 from tormagd_client.wire import understood
 
 UNKNOWN = "-"
+OLD_MS = 1_000.0
+"An older setpoint may be valid still, and is not of now."
 SURE_WINDOWS = 20
 "A drift is shown once it is that of ten seconds."
 SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
@@ -34,7 +38,7 @@ def status(client: Client) -> Outcome:
     result = client.request("status")
     known = understood(result, Status)
     code = Exit.FAULT if known.operating_state == "FAULT" else Exit.DONE
-    return Outcome(result, status_text(known, Colour(sys.stdout)), code)
+    return Outcome(result, folded(status_text(known, Colour(sys.stdout))), code)
 
 
 def status_text(known: Status, colour: Colour) -> str:
@@ -53,8 +57,10 @@ def status_text(known: Status, colour: Colour) -> str:
         # without a device none of them is taken: the link says what comes first
         *([f"next      {', '.join(known.next_commands)}"] if known.next_commands and is_running else []),
         *_codes(known.limits, known.limit_details, "held by", colour.yellow),
-        f"force     asked {_number(known.setpoint_cf, 'N')}, governed {_number(known.governed_cf, 'N')}, "
-        f"measured {_number(known.measured_cf, 'N')}{torque(known.measured_cf, known.roller_radius_mm)}",
+        f"force     asked {_number(known.setpoint_cf, 'N')}{_long_ago(known)}, "
+        f"governed {_number(known.governed_cf, 'N')}, measured {_number(known.measured_cf, 'N')}"
+        f"{torque(known.measured_cf, known.roller_radius_mm)}",
+        *_said("followed  ", followed(known.following), str),
         f"gap       {_number(known.gap_mm, 'mm', 2)}, wanted {_number(known.gap_setpoint_mm, 'mm', 2)}, "
         f"skew {_number(known.skew_mm, 'mm', 3)}",
         f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
@@ -64,6 +70,8 @@ def status_text(known: Status, colour: Colour) -> str:
         *_device(known, colour),
         f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",
         *_explained(known.link.cause, known.link.remedy, colour.yellow),
+        *(line for each in known.not_granted for line in _said("kernel    ", f"did not grant {each}", colour.yellow)),
+        *_explained("", "tormagctl doctor" if known.not_granted else "", str),
         *(_rate(name, group, colour) for name, group in known.rates.items()),
         *([f"field     of a search {known.search_age_ms:.0f} ms ago"] if known.search_age_ms else []),
         *_late_ticks(known.late_ticks_by),
@@ -102,6 +110,27 @@ def _device(known: Status, colour: Colour) -> list[str]:
         *_said("believed  ", believed(known.belief, ("scale", "offset", "sensor_zero")), str),
         *_explained(refusal, refusal and "tormagctl calibrate --device, which keeps a new profile", colour.yellow),
     ]
+
+
+def _long_ago(known: Status) -> str:
+    """When a setpoint came that is valid for long; nothing for one of now."""
+    age_ms = known.setpoint_age_ms
+    return "" if known.setpoint_cf is None or age_ms is None or age_ms < OLD_MS else f" {age_ms * 1e-3:.0f} s ago"
+
+
+def followed(report: FollowingReport | None) -> str:
+    """How well the force was followed lately; nothing where that is not known."""
+    if report is None:
+        return ""
+    return (
+        f"to {report.rms_N * 1e3:.0f} mN RMS, {report.aligned_rms_N * 1e3:.0f} mN "
+        f"with a delay of {report.delay_ms:.0f} ms taken out"
+    )
+
+
+def refused(not_granted: Iterable[str]) -> dict[str, str]:
+    """What the kernel refused, with the reason, by the key of the configuration that asks for it."""
+    return {re.split("[ :]", each, maxsplit=1)[0]: each for each in not_granted}
 
 
 def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
@@ -217,7 +246,7 @@ def firmware(client: Client) -> Outcome:
     """The daemon's report on its link: the keys of `--json` are those of `link` in the status."""
     result = client.request("status")
     known = understood(result, Status).link
-    return Outcome(result["link"], firmware_text(known, Colour(sys.stdout)))
+    return Outcome(result["link"], folded(firmware_text(known, Colour(sys.stdout))))
 
 
 def firmware_text(link: LinkReport, colour: Colour) -> str:

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from tormagd.ctl.status import believed, torque
+from tormagd.ctl.status import believed, followed, refused, torque
 from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 
@@ -21,6 +21,8 @@ STANDARD_ROWS = 24
 "A terminal of so many rows has sparklines of one row; what it has more, they share."
 LABEL, VALUE, ENDS = 10, 10, 12
 "Characters of a row's name, of its newest value with the unit, and of the ends of its scale."
+NARROW = 60
+"On fewer characters the scales' ends are left out."
 SILENT_S = 0.5
 EIGHTHS = " ▁▂▃▄▅▆▇█"
 STATE_STYLES = {"ENABLED": "black on green", "PAUSED": "black on yellow", "FAULT": "bold white on red"}
@@ -94,14 +96,15 @@ def _head(seen: Seen, width: int) -> Text:
         else f"{60.0 * minutes:.0f} s"
     )
     about = f"{status.scene} · up {up} · tormagd {status.version} · q ends"
-    head.append(about.rjust(width - head.cell_len), "dim")
+    head.append(f"  {about}".rjust(width - head.cell_len), "dim")
     return head
 
 
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
     """Each curve with its name, newest value, course and the ends of its scale."""
-    count = max(width - LABEL - VALUE - ENDS - 3, 8)
-    table = _grid(LABEL, VALUE, count, ENDS)
+    ends_wide = ENDS if width >= NARROW else 0
+    count = max(width - LABEL - VALUE - ends_wide - 3, 8)
+    table = _grid(LABEL, VALUE, count, *([ends_wide] if ends_wide else []))
     times_ns = [each.t_ns for each in seen.telemetry]
     courses = [
         columns(times_ns, [curve.value(it) for it in seen.telemetry], count, COLUMN_NS, curve.of_column)
@@ -116,12 +119,13 @@ def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
         shown = "-" if newest is None else f"{newest:.{curve.digits}f}"
         digits = min(curve.digits, 2)
         ends = [f"{high:.{digits}f}", *[""] * (rows - 2), f"{low:.{digits}f}"]
-        table.add_row(
+        cells = (
             Text(curve.label, "bold"),
             Text(f"{shown:>7} {curve.unit}"),
             Text("\n".join(sparkline(course, low, high, rows)), curve.style),
             Text("\n".join(ends) if rows > 1 else "..".join(reversed(ends)), "dim"),
         )
+        table.add_row(*cells[: len(table.columns)])
         if is_apart and curve is not CURVES[-1]:
             table.add_row()
     return table
@@ -156,7 +160,14 @@ def _timing(status: Status, width: int) -> Table:
     )
     heard = f"from {setpoints.newest_source!r}" if setpoints.accepted else "none yet"
     table.add_row(Text("setpoints", "bold"), f"{heard}, {setpoints.accepted} accepted, {setpoints.refused} refused")
-    table.add_row(Text("believed", "bold"), Text(printable(believed(status.belief)) or "nothing that acts"))
+    if status.not_granted:
+        lacking = f"did not grant {', '.join(map(printable, refused(status.not_granted)))}; next: tormagctl doctor"
+        table.add_row(Text("kernel", "bold"), Text(lacking, "yellow"))
+    if how := followed(status.following):
+        table.add_row(Text("followed", "bold"), how)
+    table.add_row(
+        Text("believed", "bold"), Text(printable(believed(status.belief)).replace("±", "+-") or "nothing that acts")
+    )
     return table
 
 

@@ -59,9 +59,10 @@ class Daemon:
         box: BlackBox | None = None,
         read_again: Callable[[], Config] = Config,
         beside: SearchProcess | None = None,
+        config_file: str | None = None,
     ) -> None:
         """`box` is one whose process runs already; without it none is kept. `beside` is there where the core's search
-        runs beside the plans."""
+        runs beside the plans. `config_file` is where `config` is from, None for the defaults."""
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
@@ -102,6 +103,7 @@ class Daemon:
             self._causes,
             self._box,
             refused,
+            config_file,
         )
         self._box.begin(self._control.stepper, self._inference.planner, self._connection)
         admission, telemetry = self._endpoint.admission, self._telemetry

@@ -34,10 +34,13 @@ def start(options: argparse.Namespace) -> int:
     except ConfigError as error:
         raise ConfigError(placed(options.config, str(error))) from error
     if options.check:
-        _print_resolved(config, core, backend.options)
-        return 0
+        lost = _print_resolved(config, core, backend.options)
+        if lost is None or isinstance(lost, BrokenPipeError):
+            return 0
+        write_line(f"tormagd: the answer could not be written: {lost.strerror}", sys.stderr)
+        return 1
     try:
-        uvloop.run(_run(config, core, backend.open, keys, partial(_configured, options)))
+        uvloop.run(_run(config, core, backend.open, keys, options))
     except (ConfigError, OSError) as error:
         write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return 1
@@ -57,17 +60,18 @@ async def _run(
     core: Core,
     open_backend: Callable[[], Backend],
     keys: KeyRing | None,
-    read_again: Callable[[], Config],
+    options: argparse.Namespace,
 ) -> None:
     # before this thread is a real-time one: the process that is started keeps off its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     box = BlackBox(folder, {} if folder is None else header(config, core), config.rates.control_hz)
     beside = SearchProcess(core) if core.element.is_beside else None
     refused = prepare(config.realtime)
-    await Daemon(config, core, open_backend, refused, keys, box, read_again, beside).run()
+    file = None if options.config is None else str(options.config.absolute())
+    await Daemon(config, core, open_backend, refused, keys, box, partial(_configured, options), beside, file).run()
 
 
-def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> None:
+def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> OSError | None:
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
         "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),
@@ -89,4 +93,4 @@ def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> None
         },
         "backends": {name: reason or "loads" for name, reason in installed().items()},
     }
-    write_line(msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode(), sys.stdout)
+    return write_line(msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode(), sys.stdout)

@@ -22,6 +22,7 @@ from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.following import Following
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import Histogram, RateGroup
@@ -59,7 +60,7 @@ log = logging.getLogger(__name__)
 class TelemetryLoop:
     """Tells everybody else what the control and inference loops do: a phase of every beat, and three slices.
 
-    `not_granted` is what the kernel refused at the start.
+    `not_granted` is what the kernel refused at the start, `config_file` where `config` is from.
     """
 
     def __init__(
@@ -75,10 +76,11 @@ class TelemetryLoop:
         causes: Causes,
         box: BlackBox,
         not_granted: list[str],
+        config_file: str | None,
     ) -> None:
         self.config = config
         "Another one may take its place, of which only what a loop looks at each time may differ."
-        self._core, self._not_granted = core, tuple(not_granted)
+        self._core, self._not_granted, self._config_file = core, tuple(not_granted), config_file
         self._control, self._inference, self._profiles = control, inference, profiles
         self._connection, self._endpoint = connection, endpoint
         self._phases, self._causes, self._box = phases, causes, box
@@ -90,6 +92,7 @@ class TelemetryLoop:
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
         self._way = Way()
+        self._following = Following(1.0 / config.rates.telemetry_hz, core.scene.force.tolerance_rms_N)
         self.topics = Topics(config, core, control, inference, endpoint)
         self._service = Service()
         self._status: msgspec.Raw | None = None
@@ -128,6 +131,7 @@ class TelemetryLoop:
         self._left = max(self._left + self._beats_per_snapshot, 1)
         start_ns = time.monotonic_ns()
         endpoint, connections = self._endpoint, self._endpoint.admission.connections()
+        self._following.look(self._ticks[-1])
         # with this very snapshot those are answered who wait now; who asks later waits for the next
         self._status, self._answers = None, min(endpoint.requests.count, REQUESTS)
         # nothing is packed for nobody
@@ -270,6 +274,7 @@ class TelemetryLoop:
                 force_N=tuple(round(device.force_N(force_N), 4) for force_N in portrait.force_N[::PORTRAIT_STEP]),
                 rate_N_s=tuple(round(scaled_mm_s * slope, 4) for slope in portrait.slope_N_mm[::PORTRAIT_STEP]),
             ),
+            configuration_file=self._config_file,
         )
         return msgspec.to_builtins(description)
 
@@ -360,6 +365,7 @@ class TelemetryLoop:
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, is_homed_))),
             is_open=self.is_open(),
+            following=self._following.report(),
         )
 
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:

@@ -405,6 +405,15 @@ class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
     range: int = 0
 
 
+class FollowingReport(msgspec.Struct, frozen=True, kw_only=True):
+    """How well the force was followed in the last seconds in which it could be: the RMS of measured less asked, as it
+    is, and with `delay_ms` taken out, the delay that explains most of it."""
+
+    rms_N: float
+    aligned_rms_N: float
+    delay_ms: float
+
+
 class Status(Telemetry, frozen=True, kw_only=True):
     """Answer to the command `status`: the newest telemetry, and all else that is told only on demand."""
 
@@ -437,6 +446,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     output: OutputReport = OutputReport()
     next_commands: tuple[str, ...] = ()
     is_open: bool | None = None
+    following: FollowingReport | None = None
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -448,7 +458,10 @@ class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Description(msgspec.Struct, frozen=True, kw_only=True):
-    """Answer to the command `describe`: what a recording is of. What is not known is null."""
+    """Answer to the command `describe`: what a recording is of. What is not known is null.
+
+    `configuration_file` is null where the daemon runs on its defaults.
+    """
 
     version: str
     build: str
@@ -459,6 +472,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
     firmware: str | None
     serial_number: int | None
     portrait: PortraitReport | None = None
+    configuration_file: str | None = None
 
 
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):

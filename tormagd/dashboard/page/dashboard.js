@@ -8,7 +8,7 @@ const PATH_S = 2;
 
 const at = (id) => document.getElementById(id);
 const kept = {t_s: [], ...Object.fromEntries(CURVES.map((name) => [name, []]))};
-let about, explained = {}, portrait = null, charts = {};
+let about, explained = {}, portrait = null, charts = {}, notGranted = [];
 
 // ---- charts
 
@@ -149,6 +149,7 @@ function showCodes(frame) {
     ...frame.faults.map((name) => code(name, "fault", "fault")),
     ...frame.held.map((limit) => code(limit.code, `${percent(limit.share)} of the time shown`,
       limit.is_now ? "now" : "before")),
+    ...notGranted.map((each) => element("div", `The kernel did not grant ${each}. Next: tormagctl doctor`, "now")),
   ];
   at("codes").replaceChildren(...codes.length ? codes : [element("div", "No fault, and nothing holds the force back.")]);
 }
@@ -209,9 +210,12 @@ function live() {
   });
   on("status", ({status, explained: newest}) => {
     explained = newest;
+    notGranted = status.not_granted;
     const lever = status.roller_radius_mm === null ? "" : `, 1 N is ${status.roller_radius_mm} mNm of the handle`;
     at("scene").textContent = `scene ${status.scene}${lever}${status.is_homed ? "" : ", not homed"}`;
     at("source").textContent = `tormagd ${status.version}, device ${status.link.state} on ${status.link.port}`;
+    const how = status.following, mN = (force_N) => (1e3 * force_N).toFixed(0);
+    at("followed").textContent = how ? `${mN(how.rms_N)} (${mN(how.aligned_rms_N)} less ${how.delay_ms.toFixed(0)} ms)` : "–";
     const {control} = status.rates, late = control?.lateness_us;
     at("rates").textContent = "Of every twentieth tick of 20 s, bars as logarithms. " + (control ? `Of all: ${control.hz.toFixed(0)} Hz, `
       + `p50 ${late.p50.toFixed(0)}, p99 ${late.p99.toFixed(0)}, longest ${late.max.toFixed(0)} µs; ${control.stalls} stalls.` : "");

@@ -1,0 +1,64 @@
+"""How well the force is followed: what counts, and which delay explains the most of it."""
+
+import math
+from collections.abc import Iterable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tormagd.daemon.following import Following
+
+HZ = 50
+FOLLOWED: dict[str, Any] = {"operating_state": "ENABLED", "plan_limits": (), "handle_rate_mm_s": 20.0}
+
+
+def pulse_N(at_s: float) -> float:
+    return 1.5 + 0.12 * math.sin(math.tau * 1.2 * at_s)
+
+
+def ticks(lasts_s: float, late_s: float = 0.0, **changes: Any) -> Iterator[Any]:
+    """What a device does that is so late."""
+    for k in range(round(lasts_s * HZ)):
+        told = {"setpoint_cf": pulse_N(k / HZ), "measured_cf": pulse_N(k / HZ - late_s)}
+        yield SimpleNamespace(**FOLLOWED | told | changes)
+
+
+def reported(*runs: Iterable[Any]) -> Any:
+    following = Following(1.0 / HZ, 0.05)
+    for run in runs:
+        for tick in run:
+            following.look(tick)
+    return following.report()
+
+
+def test_a_delay_is_told_from_what_is_wrong_besides() -> None:
+    found = reported(ticks(10.0, 0.18))
+    assert (found.delay_ms, found.aligned_rms_N) == (180.0, pytest.approx(0.0, abs=1e-3))
+    assert found.rms_N == pytest.approx(0.12 * math.sqrt(2.0) * math.sin(math.tau * 1.2 * 0.09), rel=0.05)
+    assert reported(ticks(10.0)).rms_N == 0.0
+
+
+@pytest.mark.parametrize(
+    "uncounted",
+    [
+        {"measured_cf": 0.5},  # on the way to the first force
+        {"setpoint_cf": None},  # it decays
+        {"operating_state": "PAUSED"},
+        {"measured_cf": None},
+        {"measured_cf": 0.2, "handle_rate_mm_s": 0.3},  # the handle sticks
+        {"plan_limits": ("F_MIN",), "setpoint_cf": 0.1},
+        {"plan_limits": ("TAKEOVER",)},
+    ],
+    ids=str,
+)
+def test_what_could_not_be_followed_does_not_count(uncounted: dict[str, Any]) -> None:
+    assert reported(ticks(10.0, **uncounted)) is None
+    assert reported(ticks(2.0, **uncounted), ticks(5.0)).rms_N == 0.0
+
+
+def test_it_is_forgotten_some_seconds_after_the_last_and_without_a_handle_all_counts() -> None:
+    after = {"setpoint_cf": None}
+    assert reported(ticks(10.0), ticks(3.0, **after)).rms_N == 0.0
+    assert reported(ticks(10.0), ticks(10.0, **after)) is None
+    assert reported(ticks(5.0, handle_rate_mm_s=None)).rms_N == 0.0

@@ -1,0 +1,71 @@
+"""How well the force is followed: measured less asked, as it is, and with the delay taken out that explains most of it.
+
+Counted are the moments at which the force could be followed: ENABLED, with a setpoint that a device can give, and a
+handle that slides. Neither the way to the first force counts, nor the decay after the last.
+"""
+
+import math
+from collections import deque
+from typing import Final
+
+from tormagd.daemon.verdict import HOLDING
+from tormagd.safety.codes import Limit
+from tormagd.safety.operating_state import OperatingState
+from tormagd_client.messages import FollowingReport, TickRecord
+
+MOST_DELAY_S: Final = 0.4
+"What a delay may be that is taken out: the budget of the whole way."
+FORGETS_S: Final = 5.0
+"So long ago what is remembered counts a third."
+LEAST_S: Final = 1.0
+"Of fewer moments than in this time no figure is told: some seconds after the last none is."
+SLIDES_MM_S: Final = 1.0
+"A slower handle sticks: it feels less than the brake would give."
+NOT_FOLLOWED: Final = HOLDING | {Limit.TAKEOVER}
+
+
+class Following:
+    """Takes ticks at an even spacing; remembers the forces asked for in the last MOST_DELAY_S, and a sum for each."""
+
+    def __init__(self, period_s: float, tolerance_N: float) -> None:
+        """`tolerance_N` is the scene's: so near, the first force of a setpoint has arrived."""
+        self._period_s, self._tolerance_N = period_s, tolerance_N
+        self._kept = math.exp(-period_s / FORGETS_S)
+        count = round(MOST_DELAY_S / period_s) + 1
+        self._asked_N: deque[float] = deque(maxlen=count)
+        self._squares, self._weight = [0.0] * count, 0.0
+        self._has_arrived = False
+
+    def look(self, tick: TickRecord) -> None:
+        """One more moment."""
+        asked_N, measured_N, kept = tick.setpoint_cf, tick.measured_cf, self._kept
+        self._weight *= kept
+        self._squares = [kept * known for known in self._squares]
+        if tick.operating_state != OperatingState.ENABLED or asked_N is None:
+            self._asked_N.clear()
+            self._has_arrived = False
+            return
+        self._asked_N.appendleft(asked_N)
+        rate_mm_s = tick.handle_rate_mm_s
+        is_still = rate_mm_s is not None and abs(rate_mm_s) < SLIDES_MM_S
+        if measured_N is None or is_still or not NOT_FOLLOWED.isdisjoint(tick.plan_limits):
+            return
+        self._has_arrived = self._has_arrived or abs(measured_N - asked_N) <= self._tolerance_N
+        if not self._has_arrived:
+            self._asked_N.clear()
+        elif len(self._asked_N) == len(self._squares):
+            self._weight += 1.0
+            self._squares = [
+                known + (measured_N - then_N) ** 2 for known, then_N in zip(self._squares, self._asked_N, strict=True)
+            ]
+
+    def report(self) -> FollowingReport | None:
+        """The figures of the last seconds in which it was followed; None until there were enough."""
+        if self._weight * self._period_s < LEAST_S:
+            return None
+        least = min(self._squares)
+        return FollowingReport(
+            rms_N=round(math.sqrt(self._squares[0] / self._weight), 4),
+            aligned_rms_N=round(math.sqrt(least / self._weight), 4),
+            delay_ms=round(1e3 * self._period_s * self._squares.index(least), 1),
+        )
