@@ -4,14 +4,38 @@ A terminal obeys what is printed to it. So words of a file, a device or another 
 come in. Whatever else is not printable is escaped where it goes out, all but line ends and our own colours.
 """
 
+import codecs
+import io
+import json
 import os
 import re
+import sys
 from typing import TextIO
 
 from tormagd_client.printable import printable
 
 _OURS = re.compile("(\n|\t|\x1b\\[(?:0|1|31|32|33)m)")
 "What a line may hold besides printable characters: its end, a tabulator, and the colours of `ctl.outcome.Colour`."
+_ALIKE = {"±": "+-", "·": "-", "…": "~"} | dict(zip("▁▂▃▄▅▆▇█", ".,:;+=*#", strict=True))
+"What stands for our own characters on a terminal that has no others than ASCII's."
+
+
+def _alike(error: UnicodeError) -> tuple[str, int]:
+    """What a stream writes for characters that its encoding lacks: what is alike, or JSON's escapes."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end]
+    return "".join(_ALIKE.get(each) or json.dumps(each)[1:-1] for each in lacking), error.end
+
+
+codecs.register_error("alike", _alike)
+
+
+def write_in_any_encoding() -> None:
+    """From here on stdout and stderr take any text, whatever their encoding is."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="alike")
 
 
 def write_line(text: str, stream: TextIO | None) -> OSError | None:

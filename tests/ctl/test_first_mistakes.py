@@ -1,6 +1,6 @@
 """What is done wrong first, without a daemon: each gets one sentence with its remedy, and the documented exit code."""
 
-import re
+import json
 import shlex
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from tormagd.scenes.scene import scene_path
 from tormagd_client.errors import unreachable
 
 COMMANDS = {"tormagctl": ctl.main, "tormagd": daemon.main}
-USAGE = re.compile(r"^usage:.*?(?=^\S.*: error:)", re.MULTILINE | re.DOTALL)
 SCENE = """name = "mine"
 description = "a task"
 [force]
@@ -29,114 +28,164 @@ KEYED = OPEN + '[endpoints.curve]\nserver_secret = "server.key_secret"\n'
 CORONARY, BRAIN = (Path(scene_path(name)).read_text(encoding="utf-8") for name in ("coronary", "brain"))
 
 
-@pytest.mark.parametrize(
-    ("command", "code", "says", "files"),
-    [
-        ("tormagctl stauts", 2, "invalid choice: 'stauts' (choose from", {}),
-        ("tormagctl --endpoint ipc:///nowhere/control status", 3, "start the daemon", {}),
-        (
-            "tormagd --check --config misspelt.toml",
-            2,
-            "unknown field `prot` - at `$.device`; did you mean `port`? (line 2)",
-            {"misspelt.toml": '[device]\nprot = "/dev/ttyACM0"\n'},
-        ),
-        (  # a byte order mark is no mistake: what is wrong behind it is found
-            "tormagd --check --config bom.toml",
-            2,
-            "`int` >= 83 - at `$.rates.control_hz` (it is 1) (line 2)",
-            {"bom.toml": "\ufeff[rates]\ncontrol_hz = 1\n"},
-        ),
-        ("tormagctl send nan.csv", 2, "row 2, force_N = 'nan'", {"nan.csv": "t_s,force_N\n0,nan\n"}),
-        (
-            "tormagd --check --config scene.toml",
-            2,
-            "did you mean `coronary`? (line 1)",
-            {"scene.toml": 'scene = "coronry"\n'},
-        ),
-        (
-            "tormagd --check --scene mine.toml",
-            2,
-            "cut.safetensors: damaged or not a model file",
-            {"mine.toml": SCENE, "cut.safetensors": "cut"},
-        ),
-        ("tormagd --check --config open.toml", 2, "others need CURVE keys in [endpoints.curve]", {"open.toml": OPEN}),
-        (
-            "tormagd --check --config keyed.toml",
-            2,
-            "endpoints.curve.server_secret is missing",
-            {"keyed.toml": KEYED.replace("server_secret", "client_secret"), "server.key_secret": "secret"},
-        ),
-        (
-            "tormagd --check --config keyed.toml",
-            2,
-            ("server.key_secret can be read by others (mode 0644)", "chmod 600 server.key_secret"),
-            {"keyed.toml": KEYED, "server.key_secret": "secret"},
-        ),
-        (
-            "tormagctl plot empty.mcap -o empty.png",
-            2,
-            "next: give a file that tormagctl record has made",
-            {"empty.mcap": ""},
-        ),
-        ("tormagctl --endpoint tcp://192.0.2.1:5555 status", 2, "CURVE", {}),
-        ("tormagctl --endpoint carrier-pigeon status", 2, "carrier-pigeon", {}),
-        (f"tormagctl --endpoint ipc://{'x' * 200} status", 2, "107", {}),
-        ("tormagctl --config /nowhere/tormagd.toml status", 2, "/nowhere/tormagd.toml", {}),
-        ("tormagctl send sawtooth", 2, "step, sine, ramp, pulse", {}),
-        ("tormagctl send step --to-N -1", 2, "--to-N = -1", {}),
-        ("tormagctl send step --rate 5", 2, "at least one period, 200 ms", {}),
-        ("tormagctl send /nowhere/a.csv", 2, "/nowhere/a.csv: No such file", {}),
-        ("tormagctl plot /nowhere/a.mcap -o a.png", 2, "/nowhere/a.mcap", {}),
-        ("tormagctl dashboard /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
-        ("tormagctl scene show unheard-of", 2, "coronary", {}),
-        (f"tormagctl scene show {'x' * 300}", 2, "File name too long", {}),
-        ("tormagctl scene new a.toml", 2, "allowed is a new file in a folder that exists", {"a.toml": ""}),
-        ("tormagctl scene new vein.toml", 2, "nobody to ask", {}),
-        ("tormagctl scene check fast.toml", 1, "N/s at", {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")}),
-        (
-            "tormagctl --json scene check poor.toml",
-            1,
-            ('"code":"budget"', "budget.core_share = 1e-06"),
-            {"poor.toml": f"{BRAIN}\n[budget]\ncore_share = 1e-6\n"},
-        ),
-        (
-            "tormagctl --json scene explain other.toml",
-            1,
-            ('"code":"not_measured"', "docs/guides/scene.md"),
-            {"other.toml": CORONARY.replace("most_N = 2.0", "most_N = 1.9")},
-        ),
-        ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
-        ("tormagctl scene check pulse --tolerance 0.0001", 1, "allowed is at least", {}),
-        ("tormagctl scene explain pulse --share 0.5", 2, "tormagctl scene check NAME with one of", {}),
-        (
-            "tormagctl scene check pulse --share 0.5 --out a.toml",
-            2,
-            "File exists: allowed is a new file",
-            {"a.toml": ""},
-        ),
-        (
-            "tormagctl --config unfit.toml --json doctor --measure",
-            1,
-            ('"code":"not_measured"', "nowhere"),
-            {"unfit.toml": 'scene = "nowhere"\n'},
-        ),
-    ],
-)
+MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
+    ("tormagctl", 2, "the following arguments are required: COMMAND", {}),
+    ("tormagctl stauts", 2, "COMMAND: 'stauts'; did you mean `status`?", {}),
+    ("tormagctl clear_fault", 2, "did you mean `clear-fault`?", {}),
+    ("tormagctl fly", 2, "COMMAND: 'fly': allowed are status, top, ", {}),
+    ("tormagctl status --jsn", 2, "unrecognized arguments: --jsn; did you mean `--json`?", {}),
+    ("tormagctl status now", 2, "unrecognized arguments: now", {}),
+    ("tormagctl --wait nan status", 2, "--wait: 'nan': allowed is a finite number", {}),
+    ("tormagctl --wait 0 status", 2, "--wait: 0: allowed is 0.001..1e+06", {}),
+    ("tormagctl --config", 2, "--config: expected one argument", {}),
+    ("tormagctl home --timeout 0", 2, "--timeout: 0: allowed is", {}),
+    ("tormagctl send", 2, "the following arguments are required: {step|sine|ramp|pulse|FILE.csv}", {}),
+    ("tormagctl send sawtooth", 2, "step, sine, ramp, pulse", {}),
+    ("tormagctl send pules", 2, "did you mean `pulse`?", {}),
+    ("tormagctl send step --rate nan", 2, "--rate: 'nan': allowed is a finite number", {}),
+    ("tormagctl send step --rate 0", 2, "--rate: 0: allowed is 1..4000 Hz", {}),
+    ("tormagctl send step --valid-for-ms -1", 2, "allowed is 0.25..60000 ms", {}),
+    ("tormagctl send step --source ''", 2, "allowed are 1..64 printable characters", {}),
+    ("tormagctl send step --to-N -1", 2, "--to-N = -1", {}),
+    ("tormagctl send step --rate 5", 2, "at least one period, 200 ms", {}),
+    ("tormagctl send step --rate 4000 --preview-ms 900", 2, "allowed are 256", {}),
+    ("tormagctl send /nowhere/a.csv", 2, "/nowhere/a.csv: No such file", {}),
+    ("tormagctl send nan.csv", 2, "row 2, force_N = 'nan'", {"nan.csv": "t_s,force_N\n0,nan\n"}),
+    ("tormagctl send newtons.csv", 2, "force_N", {"newtons.csv": "t_s,newtons\n0,1\n"}),
+    ("tormagctl send empty.csv", 2, "empty.csv", {"empty.csv": ""}),
+    ("tormagctl take", 2, "the following arguments are required: SOURCE", {}),
+    ("tormagctl confirm handle", 2, "what: 'handle': allowed are device, sensor", {}),
+    ("tormagctl plot a.mcap", 2, "the following arguments are required: -o/--output", {}),
+    ("tormagctl plot /nowhere/a.mcap -o a.png", 2, "/nowhere/a.mcap", {}),
+    (
+        "tormagctl plot empty.mcap -o a.png",
+        2,
+        "next: give a file that tormagctl record has made",
+        {"empty.mcap": ""},
+    ),
+    ("tormagctl replay /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
+    ("tormagctl dashboard /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
+    ("tormagctl dashboard --port 70000", 2, "--port: 70000: allowed is 0..65535", {}),
+    ("tormagctl metrics --port http", 2, "--port: 'http': allowed is a finite number", {}),
+    ("tormagctl completion fish", 2, "shell: 'fish': allowed are bash, zsh", {}),
+    ("tormagctl calibrate", 2, "give one of --insert NAME, --motors and --device", {}),
+    ("tormagctl calibrate --insert MRE-50-40 --rates 1", 2, "--rates: '1': allowed are 3..60 rates", {}),
+    ("tormagctl keys generate", 2, "the following arguments are required: DIR|FILE", {}),
+    ("tormagctl keys show /nowhere/a.key", 2, "/nowhere/a.key", {}),
+    ("tormagctl keys show a.key", 2, "a.key", {"a.key": "no key"}),
+    ("tormagctl top", 2, "next: tormagctl status", {}),
+    ("tormagctl --endpoint ipc:///nowhere/control status", 3, "start the daemon", {}),
+    ("tormagctl --endpoint tcp://192.0.2.1:5555 status", 2, "CURVE", {}),
+    ("tormagctl --endpoint carrier-pigeon status", 2, "carrier-pigeon", {}),
+    (f"tormagctl --endpoint ipc://{'x' * 200} status", 2, "107", {}),
+    ("tormagctl --key /nowhere/a.key_secret status", 2, "--server-key FILE", {}),
+    ("tormagctl --config /nowhere/tormagd.toml status", 2, "/nowhere/tormagd.toml", {}),
+    ("tormagctl scene burn", 2, "action: 'burn': allowed are list, show", {}),
+    ("tormagctl scene sohw", 2, "did you mean `show`?", {}),
+    ("tormagctl scene show unheard-of", 2, "coronary", {}),
+    ("tormagctl scene show coronry", 2, "did you mean `coronary`?", {}),
+    (f"tormagctl scene show {'x' * 300}", 2, "File name too long", {}),
+    ("tormagctl scene new", 2, "the file to write is missing", {}),
+    ("tormagctl scene new a.toml", 2, "allowed is a new file in a folder that exists", {"a.toml": ""}),
+    ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
+    ("tormagctl scene check pulse --tolerance 0.001", 1, "allowed is at least", {}),
+    ("tormagctl scene explain pulse --share 0.5", 2, "tormagctl scene check NAME with one of", {}),
+    ("tormagctl scene check pulse --share 0.5 --out a.toml", 2, "File exists: allowed is a new file", {"a.toml": ""}),
+    ("tormagctl scene new vein.toml", 2, "nobody to ask", {}),
+    ("tormagctl scene check fast.toml", 1, "N/s at", {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")}),
+    (
+        "tormagctl scene check poor.toml",
+        1,
+        "budget.core_share = 1e-06",
+        {"poor.toml": f"{BRAIN}\n[budget]\ncore_share = 1e-6\n"},
+    ),
+    (
+        "tormagctl scene explain other.toml",
+        1,
+        "docs/guides/scene.md",
+        {"other.toml": CORONARY.replace("most_N = 2.0", "most_N = 1.9")},
+    ),
+    ("tormagctl --config unfit.toml doctor --measure", 1, "nowhere", {"unfit.toml": 'scene = "nowhere"\n'}),
+    (
+        "tormagd --check --config misspelt.toml",
+        2,
+        "unknown field `prot` - at `$.device`; did you mean `port`? (line 2)",
+        {"misspelt.toml": '[device]\nprot = "/dev/ttyACM0"\n'},
+    ),
+    (  # a byte order mark is no mistake: what is wrong behind it is found
+        "tormagd --check --config bom.toml",
+        2,
+        "`int` >= 83 - at `$.rates.control_hz` (it is 1) (line 2)",
+        {"bom.toml": "\ufeff[rates]\ncontrol_hz = 1\n"},
+    ),
+    (
+        "tormagd --check --config scene.toml",
+        2,
+        "did you mean `coronary`? (line 1)",
+        {"scene.toml": 'scene = "coronry"\n'},
+    ),
+    (
+        "tormagd --check --scene mine.toml",
+        2,
+        "cut.safetensors: damaged or not a model file",
+        {"mine.toml": SCENE, "cut.safetensors": "cut"},
+    ),
+    ("tormagd --check --config open.toml", 2, "others need CURVE keys in [endpoints.curve]", {"open.toml": OPEN}),
+    (
+        "tormagd --check --config keyed.toml",
+        2,
+        "endpoints.curve.server_secret is missing",
+        {"keyed.toml": KEYED.replace("server_secret", "client_secret"), "server.key_secret": "secret"},
+    ),
+    (
+        "tormagd --check --config keyed.toml",
+        2,
+        ("server.key_secret can be read by others (mode 0644)", "chmod 600 server.key_secret"),
+        {"keyed.toml": KEYED, "server.key_secret": "secret"},
+    ),
+]
+
+
+def ended(command: str, files: dict[str, str]) -> int:
+    """Runs it beside these files; its exit code."""
+    for file, text in files.items():
+        Path(file).write_text(text, encoding="utf-8")
+        Path(file).chmod(0o644)
+    name, *arguments = shlex.split(command)
+    return COMMANDS[name](arguments)
+
+
+@pytest.mark.parametrize(("command", "code", "says", "files"), MISTAKES, ids=[row[0][:60] for row in MISTAKES])
 def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-        (tmp_path / name).chmod(0o644)
-    name, *arguments = shlex.split(command)
-    try:
-        ended = COMMANDS[name](arguments)
-    except SystemExit as caught:
-        ended = int(str(caught.code))
-    said = USAGE.sub("", "".join(capsys.readouterr())).strip()
-    assert ended == code
+    assert ended(command, files) == code
+    said = "".join(capsys.readouterr()).strip()
     assert [words for words in ((says,) if isinstance(says, str) else says) if words not in said] == []
     assert "Traceback" not in said
-    assert len([line for line in said.splitlines() if not line.startswith(" ")]) <= 2
+    sentence, *more = said.splitlines()
+    assert sentence.startswith(f"{command.split()[0]}")
+    # a sentence, and what to do next
+    assert [line for line in more if not line.startswith("  ")] == []
+    assert ("  next: " in said) == command.startswith("tormagctl")
+
+
+JSON = [row for row in MISTAKES if row[0].startswith("tormagctl") and "--measure" not in row[0]]
+
+
+def test_with_json_each_of_them_is_one_object(tmp_path, monkeypatch, capsys):
+    """Of those that are wrong in the command line itself, too."""
+    monkeypatch.chdir(tmp_path)
+    for command, code, says, files in JSON:
+        capsys.readouterr()
+        assert (ended(f"{command} --json", files), command) == (code, command)
+        out, err = capsys.readouterr()
+        told = json.loads(out)
+        assert (list(told), told["ok"], told["result"]) == (["command", "ok", "result", "error"], False, None)
+        assert told["command"] in command
+        assert told["error"]["message"] in err
+        assert str(says) in f"{told['error']['message']} next: {told['error']['hint']}"
+        for file in files:
+            Path(file).unlink()
 
 
 def test_who_may_not_enter_the_sockets_folder_is_told_the_group(monkeypatch):

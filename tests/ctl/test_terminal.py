@@ -52,6 +52,37 @@ def test_whatever_is_written_is_printable_and_json_stays_json(text: str) -> None
     assert json.loads(as_json.getvalue()) == {"said": text}
 
 
+@pytest.mark.parametrize(
+    "arguments", [["status"], ["--json", "status"], ["take", "\u00b5"], ["send", "\u2581"], ["-h"]]
+)
+def test_a_terminal_that_has_ascii_only_gets_all_of_it(fake_daemon, status_with, arguments):
+    scale = {"value": 0.75, "sd": 0.01, "unit": "\u00b5", "acts": True}
+    fake_daemon.says(belief={"lag": scale}, limits=["\u0394"])
+    fake_daemon.answers["take"] = lambda: {"ok": True, "result": {"source": "\u00b5", "instead_of": None}}
+    told = subprocess.run(
+        [sys.executable, "-m", *CTL, *fake_daemon.at, "--wait", "5", *arguments],
+        capture_output=True,
+        env=os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"},
+        check=False,
+    )
+    said = (told.stdout + told.stderr).decode("ascii")
+    assert (told.returncode in (0, 2), "Traceback" in said) == (True, False)
+    if arguments == ["status"]:
+        assert "lag 0.75 +- 0.01 \\u00b5" in said
+    if "--json" in arguments:
+        assert json.loads(said)["result"]["limits"] == ["\u0394"]
+
+
+def test_a_narrow_terminal_gets_lines_that_go_on_under_their_own_words(fake_daemon, ctl, monkeypatch):
+    monkeypatch.setattr("tormagd.ctl.outcome.is_terminal", lambda stream: True)
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("NO_COLOR", "1")
+    for arguments in (["status"], ["firmware"], ["doctor"], ["scene", "list"], ["scene", "check", "coronary"]):
+        lines = ctl(*fake_daemon.at, *arguments).out.splitlines()
+        assert max(map(len, lines)) <= 40, arguments
+    assert "\naorta_1         Aorta cannulation, use\n             case 1 of table" in f"\n{ctl('scene', 'list').out}"
+
+
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
@@ -159,11 +190,20 @@ def run(redirected: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
     )
 
 
-@pytest.mark.parametrize(("redirected", "said"), [("> /dev/full", LOST), (">&-", ""), (">&- 2>&-", "")])
+@pytest.mark.parametrize(
+    ("redirected", "code", "said"), [("> /dev/full", 1, LOST), (">&-", 0, ""), (">&- 2>&-", 0, "")]
+)
 @pytest.mark.parametrize("form", [(), ("--json",)])
-def test_an_answer_that_nobody_gets_does_not_change_the_exit_code(redirected, said, form):
+def test_an_answer_that_cannot_be_written_is_told_and_one_that_nobody_wants_is_not(redirected, code, said, form):
     ran = run(redirected, *LIST, *form)
-    assert (ran.returncode, ran.stderr.removeprefix("tormagctl scene: ").strip()) == (0, said)
+    assert (ran.returncode, ran.stderr.removeprefix("tormagctl scene: ").strip()) == (code, said)
+
+
+@pytest.mark.parametrize("command", [(*CTL, "--help"), (*CTL, "--version"), ("tormagd.daemon.main", "--check")])
+def test_so_is_what_is_no_answer_of_a_command(command):
+    ran = run("> /dev/full", *command)
+    assert (ran.returncode, "written: No space left on device" in ran.stderr) == (1, True)
+    assert "Exception" not in ran.stderr
 
 
 def test_a_refusal_without_stderr_leaves_the_object_alone_on_stdout(tmp_path: Path):

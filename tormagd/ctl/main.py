@@ -9,17 +9,29 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 import msgspec
 
 from tormagd import __version__
 from tormagd.config import Config, load_config
 from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL, Option
-from tormagd.ctl.outcome import Outcome, as_usage_error, exit_code, print_error, print_outcome, usage_error
-from tormagd.output import write_line
+from tormagd.ctl.outcome import (
+    CommandError,
+    Exit,
+    Outcome,
+    as_usage_error,
+    exit_code,
+    print_error,
+    print_outcome,
+    usage_error,
+)
+from tormagd.named_file import did_you_mean
+from tormagd.output import write_in_any_encoding, write_line
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.errors import ClientError
+from tormagd_client.printable import in_short
 
 EXTRAS = {
     "mcap": "record",
@@ -27,15 +39,27 @@ EXTRAS = {
     "matplotlib": "plot",
     "rich": "top",
     "aiohttp": "dashboard",
+    "prometheus_client": "metrics",
     "tqdm": "lab",
 }
+LONGEST = 300
+"Characters of a refusal that quotes what was given."
+UNKNOWN_OPTION = "unrecognized arguments: "
+SERVICE_CONFIG = Path("/etc/tormag/tormagd.toml")
+"What the service reads, and `doctor` where no other is named."
 EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,
 4 device in FAULT. With --json stdout carries one object: {command, ok, result, error}."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
-    options = parser().parse_args(arguments)
+    write_in_any_encoding()
+    given = sys.argv[1:] if arguments is None else arguments
+    try:
+        options = parser().parse_args(given)
+    except CommandError as error:
+        print_error(next((each for each in given if each in COMMANDS), ""), error, "--json" in given)
+        return error.exit_code
     try:
         outcome = _run(options)
     except ClientError as error:
@@ -51,19 +75,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         write_line(f"tormagctl {options.command}: interrupted; the daemon goes on", sys.stderr)
         return 130
-    print_outcome(options.command, outcome, options.json)
-    return outcome.exit_code
+    return print_outcome(options.command, outcome, options.json)
+
+
+class Parser(argparse.ArgumentParser):
+    """Refuses as the commands do: by a CommandError (USAGE) of one sentence with the next step."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise it, with what an unknown option may have meant."""
+        if message.startswith(UNKNOWN_OPTION):
+            known = (*SHARED, *(each for command in COMMANDS.values() for each in command.options))
+            names = [name for names, _ in known for name in names]
+            message += did_you_mean(message.removeprefix(UNKNOWN_OPTION).split()[0], names)
+        raise usage_error(message.removeprefix("argument ")[:LONGEST], f"{self.prog} --help")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            near = did_you_mean(value, action.choices) or f": allowed are {', '.join(action.choices)}"
+            raise argparse.ArgumentError(action, f"{in_short(value)}{near}")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        lost = write_line(message.rstrip(), file)
+        if lost is not None and not isinstance(lost, BrokenPipeError):
+            raise CommandError(Exit.REFUSED, "not_written", f"not written: {lost.strerror}", "make room on the disk")
 
 
 def _run(options: argparse.Namespace) -> Outcome:
     command = COMMANDS[options.command]
-    known: dict[str, Any] = {"command": options.command, "config_file": options.config, "wait_s": options.wait}
+    file = options.config
+    if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
+        file = SERVICE_CONFIG
+    known: dict[str, Any] = {"command": options.command, "config_file": file, "wait_s": options.wait}
     with contextlib.ExitStack() as stack:
         if command.has_daemon:
             with as_usage_error(
                 ConfigError, hint="correct the file; tormagd --check --config FILE shows what is in force"
             ):
-                known["config"] = load_config(options.config)
+                known["config"] = load_config(file)
             known["endpoints"] = _endpoints(known["config"].endpoints, options)
         else:
             known["parser"] = parser()
@@ -106,11 +154,9 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
 def parser() -> argparse.ArgumentParser:
     """What `tormagctl` understands; completions and man pages are made from it, too."""
     # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
-    shared = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    shared = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     _add(shared, SHARED)
-    made = argparse.ArgumentParser(
-        prog="tormagctl", description="Operate the tormagd haptic controller.", epilog=EXIT_TEXT
-    )
+    made = Parser(prog="tormagctl", description="Operate the tormagd haptic controller.", epilog=EXIT_TEXT)
     _add(made, SHARED)
     made.set_defaults(**USUAL)
     made.add_argument("--version", action="version", version=f"tormagctl {__version__}")

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tormagd.force_file import OPTIONAL_COLUMNS, read_forces
+from tormagd.named_file import did_you_mean
 from tormagd_client.messages import MAX_FORCE_N
+from tormagd_client.printable import in_short
 
 
 class WaveformError(ValueError):
@@ -69,7 +71,8 @@ def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s
         if not 0.0 <= value <= MAX_FORCE_N:
             raise WaveformError(f"--{label} = {value:g}: allowed is 0..{MAX_FORCE_N:g} N")
     if name not in SHAPES:
-        raise WaveformError(f"{name!r}: allowed are {', '.join(SHAPES)} or a file ending in .csv")
+        near = did_you_mean(name, SHAPES)
+        raise WaveformError(f"{in_short(name)}: allowed are {', '.join(SHAPES)} or a file ending in .csv{near}")
     if name in ("step", "ramp") and not math.isfinite(duration_s):
         raise WaveformError(f"--duration = {duration_s:g}: allowed for a {name} is a finite time")
 

@@ -9,7 +9,7 @@ from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import load_config
 from tormagd.daemon.log import log_to_stderr
-from tormagd.output import write_line
+from tormagd.output import write_in_any_encoding, write_line
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import printable
 
@@ -29,6 +29,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the daemon; returns the exit code: 0 ended on request, 1 could not run, 2 configuration refused."""
+    write_in_any_encoding()
     options = parser().parse_args(arguments)
     log_to_stderr()
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
