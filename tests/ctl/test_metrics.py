@@ -16,10 +16,12 @@ from typing import Any
 from urllib.request import urlopen
 
 import pytest
+import yaml
 from prometheus_client.metrics_core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from tormagd.ctl.main import main
+from tormagd.safety.codes import Fault, Limit
 
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "examples/grafana.json"
@@ -154,6 +156,65 @@ def test_a_scrape_asks_anew_and_says_when_the_daemon_has_gone(full: Any, capsys:
     scraper.join()
     assert [value(families, "tormag_up") for families in scraped] == [1.0, 1.0, 0.0]
     assert (scraped[2].keys(), full.commands) == ({"tormag_up"}, ["status"] * 3)
+
+
+RULES = [
+    rule
+    for group in yaml.safe_load((ROOT / "examples/prometheus_rules.yml").read_text(encoding="utf-8"))["groups"]
+    for rule in group["rules"]
+]
+EXPRESSION = re.compile(
+    r"(abs\()?(?:(?P<over>increase|delta)\()?(?P<name>tormag_\w+)"
+    r"(?:{(?P<label>\w+)(?P<how>=~|!~|=)\"(?P<wanted>.+)\"})?(?:\[\w+\]\)+)? (?P<compare>==|>) (?P<limit>.+)"
+)
+"All that the rules are made of."
+OF_USE = {"NO_SETPOINT", "STANDBY", "F_MIN", "TAKEOVER"}
+"Limits that nobody is to be called for."
+
+
+def fired(then: str, now: str) -> set[tuple[str, ...]]:
+    """Each alert of the rules that two scrapes make true, with the code or setting that it is about."""
+    found = set()
+    before = {(each.name, *each.labels.values()): each.value for it in read(then).values() for each in it.samples}
+    for rule in RULES:
+        parts = EXPRESSION.fullmatch(rule["expr"]).groupdict()
+        limit, wanted, is_not = float(parts["limit"]), parts["wanted"] or "", parts["how"] == "!~"
+        for sample in (each for it in read(now).values() for each in it.samples if each.name == parts["name"]):
+            if bool(re.fullmatch(wanted, sample.labels.get(parts["label"], ""))) == is_not:
+                continue
+            value = abs(sample.value - (before[sample.name, *sample.labels.values()] if parts["over"] else 0.0))
+            if value == limit if parts["compare"] == "==" else value > limit:
+                about = {name: each for name, each in sample.labels.items() if name in ("code", "setting")}
+                found.add((rule["alert"], *about.values()))
+    return found
+
+
+def test_each_fault_and_limit_and_whatever_else_is_to_be_seen_to_fires_its_rule(
+    fake_daemon: Any, ctl: Any, status_with: Any
+) -> None:
+    usual = status_with()
+
+    def scrape(**changes: Any) -> str:
+        fake_daemon.says(**changes)
+        return printed(ctl, fake_daemon.control)
+
+    before = scrape()
+    assert fired(before, before) == set()
+    everything = fired(before, scrape(faults=[*Fault], limits=[*Limit]))
+    assert {code for alert, code in everything if alert == "TormagFault"} == {*Fault}
+    told = [code for alert, code in everything if alert in ("TormagLimit", "TormagHeldBack")]
+    assert (sorted(told), len(told)) == (sorted({*Limit} - OF_USE), len({*told}))
+    stalls = usual["rates"] | {"control": usual["rates"]["control"] | {"stalls": 9}}
+    for changes, alert in (
+        ({"link": usual["link"] | {"state": "BACK_OFF"}}, ("TormagDeviceLost",)),
+        ({"not_granted": ["realtime.cpus = [9]: no"]}, ("TormagNotGranted", "realtime.cpus")),
+        ({"rates": stalls}, ("TormagStalls",)),
+        ({"setpoints": usual["setpoints"] | {"refused": 500}}, ("TormagRefusing",)),
+        ({"following": {"rms_N": 0.3, "aligned_rms_N": 0.2, "delay_ms": 20.0}}, ("TormagNotFollowed",)),
+        ({"device": usual["device"] | {"scale": 0.85}}, ("TormagDrift",)),
+    ):
+        assert fired(before, scrape(**changes)) == {alert}
+    assert fired(before, "# TYPE tormag_up gauge\ntormag_up 0.0\n") == {("TormagSilent",)}
 
 
 def test_the_board_asks_for_what_there_is(full: Any, ctl: Any) -> None:
