@@ -142,6 +142,14 @@ def test_without_a_daemon_every_command_ends_with_3(run_dir, ctl, arguments, mon
     assert list(run_dir.iterdir()) == []
 
 
+def test_guides_are_listed_and_printed_as_they_are(ctl):
+    listed = ctl("--json", "guide").result["guides"]
+    assert (listed["recover"], listed["troubleshooting"]) == ("Recover from a fault", "Troubleshooting")
+    for name in listed:
+        (page,) = (Path(__file__).parents[2] / "docs").glob(f"**/{name}.md")
+        assert ctl("guide", name).ended(0).out == page.read_text(encoding="utf-8").rstrip() + "\n"
+
+
 def test_scenes_are_listed_and_shown(ctl):
     listed = ctl("--json", "scene", "list").result["scenes"]
     assert {"coronary", "pulse", "brain"} <= {scene["name"] for scene in listed}

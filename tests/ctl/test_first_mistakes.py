@@ -68,6 +68,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl dashboard --port 70000", 2, "--port: 70000: allowed is 0..65535", {}),
     ("tormagctl metrics --port http", 2, "--port: 'http': allowed is a finite number", {}),
     ("tormagctl completion fish", 2, "shell: 'fish': allowed are bash, zsh", {}),
+    ("tormagctl guide recovery", 2, "no such guide; did you mean `recover`?", {}),
     ("tormagctl calibrate", 2, "give one of --insert NAME, --motors and --device", {}),
     ("tormagctl calibrate --insert MRE-50-40 --rates 1", 2, "--rates: '1': allowed are 3..60 rates", {}),
     ("tormagctl keys generate", 2, "the following arguments are required: DIR|FILE", {}),

@@ -359,6 +359,13 @@ COMMANDS = {
         ("config", "config_file", "endpoints", "wait_s"),
         (option("--measure", action="store_true", help="also which rates it holds, measured in about 6 s"),),
     ),
+    "guide": Command(
+        "print a guide, or list them: the documentation comes with the package",
+        "guide.guide",
+        (),
+        (option("name", nargs="?", metavar="NAME"),),
+        has_daemon=False,
+    ),
     "completion": Command(
         "print what a shell needs to complete commands, options and files",
         "completion.completion",

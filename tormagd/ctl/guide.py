@@ -1,0 +1,26 @@
+"""`tormagctl guide`: the pages of the documentation, which come with the package."""
+
+from importlib.resources import files
+
+from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.named_file import did_you_mean, shipped
+
+FOLDERS = ("guides", "reference", ".")
+"Of the pages, in the order in which they are listed."
+
+
+def guide(name: str | None) -> Outcome:
+    """The text of one page, or without a name a list of all. Raises CommandError (USAGE) for one that is not there."""
+    folders = [files("tormagd") / "docs" / folder for folder in FOLDERS]
+    pages = {
+        page: (folder / f"{page}.md").read_text(encoding="utf-8")
+        for folder in folders
+        for page in shipped(folder, ".md")
+    }
+    if name is None:
+        titles = {page: text.partition("\n")[0].lstrip("# ") for page, text in pages.items()}
+        return Outcome({"guides": titles}, "\n".join(f"{page:<16}{title}" for page, title in titles.items()))
+    if name not in pages:
+        near = did_you_mean(name, pages)
+        raise usage_error(f"{name[:80]!r}: no such guide{near}", "tormagctl guide lists them")
+    return Outcome({"name": name, "text": pages[name]}, pages[name].rstrip())
