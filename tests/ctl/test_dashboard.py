@@ -376,7 +376,9 @@ async def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Pa
             following={"rms_N": 0.136, "aligned_rms_N": 0.044, "delay_ms": 180.0},
         )
         await page.until("document.querySelector('#codes').textContent.includes('did not grant realtime.lock_memory')")
-        assert await page.ask("document.querySelector('#followed').textContent") == "136 (44 less 180 ms)"
+        assert await page.ask("document.querySelector('#following').textContent") == (
+            "136 mN RMS off, 44 with a delay of 180 ms taken out"
+        )
         fake_daemon.is_silent = True
         await page.until("document.querySelector('#silence').textContent.startsWith('nothing heard for')")
 

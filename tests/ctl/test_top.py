@@ -141,10 +141,10 @@ def test_a_column_stays_what_it_is_while_time_goes_on() -> None:
     assert columns([], [], 2, 10, max) == [None, None]
 
 
-def in_terminal(control: str, end: bytes | signal.Signals) -> tuple[int, str]:
+def in_terminal(control: str, end: bytes | signal.Signals, **settings: str) -> tuple[int, str]:
     """`top` in a terminal of its own until it has drawn, then ended by a key or a signal: exit code, what was drawn."""
     far, near = pty.openpty()
-    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}
+    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"} | settings
     command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", control, "--wait", "5", "top"]
     process = subprocess.Popen(command, stdin=near, stdout=near, stderr=near, env=environment)
     os.close(near)
@@ -160,6 +160,15 @@ def in_terminal(control: str, end: bytes | signal.Signals) -> tuple[int, str]:
         process.kill()
         process.wait()
         os.close(far)
+
+
+def test_a_narrow_terminal_without_colours_and_with_ascii_alone_is_drawn_on(fake_daemon: Any) -> None:
+    settings = {"COLUMNS": "40", "NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
+    code, text = in_terminal(fake_daemon.control, b"q", **settings)
+    assert (code, text.isascii(), "Traceback" in text) == (0, True, False)
+    assert "pulse - up 5 s" in text
+    assert EIGHTHS.encode("ascii", "alike") == b" .,:;+=*#"
+    assert not re.search(r"\x1b\[[\d;]*[34]\d", text)
 
 
 @pytest.mark.parametrize("end", [b"q", signal.SIGINT, signal.SIGTERM], ids=["q", "Ctrl-C", "SIGTERM"])

@@ -20,7 +20,7 @@ def pulse_N(at_s: float) -> float:
 def ticks(lasts_s: float, late_s: float = 0.0, **changes: Any) -> Iterator[Any]:
     """What a device does that is so late."""
     for k in range(round(lasts_s * HZ)):
-        told = {"setpoint_cf": pulse_N(k / HZ), "measured_cf": pulse_N(k / HZ - late_s)}
+        told = {"setpoint_cf": pulse_N(k / HZ), "measured_cf": pulse_N(k / HZ - late_s), "handle_mm": 20.0 * k / HZ}
         yield SimpleNamespace(**FOLLOWED | told | changes)
 
 
@@ -46,7 +46,7 @@ def test_a_delay_is_told_from_what_is_wrong_besides() -> None:
         {"setpoint_cf": None},  # it decays
         {"operating_state": "PAUSED"},
         {"measured_cf": None},
-        {"measured_cf": 0.2, "handle_rate_mm_s": 0.3},  # the handle sticks
+        {"measured_cf": 0.2, "handle_rate_mm_s": 0.3, "handle_mm": 7.0},  # the handle sticks
         {"plan_limits": ("F_MIN",), "setpoint_cf": 0.1},
         {"plan_limits": ("TAKEOVER",)},
     ],
@@ -62,3 +62,8 @@ def test_it_is_forgotten_some_seconds_after_the_last_and_without_a_handle_all_co
     assert reported(ticks(10.0), ticks(3.0, **after)).rms_N == 0.0
     assert reported(ticks(10.0), ticks(10.0, **after)) is None
     assert reported(ticks(5.0, handle_rate_mm_s=None)).rms_N == 0.0
+
+
+def test_a_handle_that_has_just_turned_feels_no_whole_force_and_does_not_count() -> None:
+    turned = [tick for way in (-20.0, 20.0) * 9 for tick in ticks(0.08, handle_rate_mm_s=way, measured_cf=0.2)]
+    assert reported(ticks(5.0), turned, ticks(2.0)).rms_N == 0.0

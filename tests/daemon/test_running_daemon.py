@@ -417,8 +417,10 @@ def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(armed: Runnin
         armed.ask(force_N)
         status = armed.until(lambda status, asked=force_N: abs(status["measured_cf"] - asked) < 0.06, f"{force_N} N")  # type: ignore[misc]
     assert (status["operating_state"], status["setpoint_cf"]) == ("ENABLED", 1.6)
-    followed = armed.until(lambda status: status["following"] is not None, "it was followed for a while")["following"]
-    assert followed["aligned_rms_N"] <= followed["rms_N"] < 0.1
+    followed = armed.until(
+        lambda status: status["following"] is not None and status["following"]["rms_N"] < 0.05, "it is followed"
+    )
+    assert followed["following"]["aligned_rms_N"] <= followed["following"]["rms_N"]
     assert abs(status["skew_mm"]) < 0.05
     armed.ask(0.1)
     status = armed.until(lambda status: abs(status["governed_cf"] - status["least_N"]) < 5e-3, "the least force")

@@ -217,6 +217,7 @@ def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(presen
     published = telemetry(MEASUREMENT, SafetyState(present))
     assert bool(limits_held(SafetyState(present), OUTPUT, PLAN)) == is_driven
     assert (published.governed_cf, published.setpoint_cf) == (1.4 if is_driven else None, 1.5)
+    assert (published.field_mT is None) == (not is_driven)
 
 
 # -- codes, each with what a person needs to know about it -------------------------------------------------------------

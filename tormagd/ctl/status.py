@@ -122,10 +122,8 @@ def followed(report: FollowingReport | None) -> str:
     """How well the force was followed lately; nothing where that is not known."""
     if report is None:
         return ""
-    return (
-        f"to {report.rms_N * 1e3:.0f} mN RMS, {report.aligned_rms_N * 1e3:.0f} mN "
-        f"with a delay of {report.delay_ms:.0f} ms taken out"
-    )
+    aligned = f"{report.aligned_rms_N * 1e3:.0f} mN with a delay of {report.delay_ms:.0f} ms taken out"
+    return f"to {report.rms_N * 1e3:.0f} mN RMS, {aligned if report.delay_ms else 'without a delay'}"
 
 
 def refused(not_granted: Iterable[str]) -> dict[str, str]:

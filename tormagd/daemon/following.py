@@ -11,7 +11,7 @@ from typing import Final
 from tormagd.daemon.verdict import HOLDING
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import OperatingState
-from tormagd_client.messages import FollowingReport, TickRecord
+from tormagd_client.messages import MAX_DISPLACEMENT_MM, FollowingReport, TickRecord
 
 MOST_DELAY_S: Final = 0.4
 "What a delay may be that is taken out: the budget of the whole way."
@@ -20,7 +20,8 @@ FORGETS_S: Final = 5.0
 LEAST_S: Final = 1.0
 "Of fewer moments than in this time no figure is told: some seconds after the last none is."
 SLIDES_MM_S: Final = 1.0
-"A slower handle sticks: it feels less than the brake would give."
+SLID_MM: Final = MAX_DISPLACEMENT_MM
+"A slower handle sticks, and one that has turned feels all of the brake's force only so much further."
 NOT_FOLLOWED: Final = HOLDING | {Limit.TAKEOVER}
 
 
@@ -35,6 +36,7 @@ class Following:
         self._asked_N: deque[float] = deque(maxlen=count)
         self._squares, self._weight = [0.0] * count, 0.0
         self._has_arrived = False
+        self._rate_mm_s = self._turned_mm = 0.0
 
     def look(self, tick: TickRecord) -> None:
         """One more moment."""
@@ -46,9 +48,8 @@ class Following:
             self._has_arrived = False
             return
         self._asked_N.appendleft(asked_N)
-        rate_mm_s = tick.handle_rate_mm_s
-        is_still = rate_mm_s is not None and abs(rate_mm_s) < SLIDES_MM_S
-        if measured_N is None or is_still or not NOT_FOLLOWED.isdisjoint(tick.plan_limits):
+        slides = self._slides(tick.handle_rate_mm_s, tick.handle_mm)
+        if not slides or measured_N is None or not NOT_FOLLOWED.isdisjoint(tick.plan_limits):
             return
         self._has_arrived = self._has_arrived or abs(measured_N - asked_N) <= self._tolerance_N
         if not self._has_arrived:
@@ -58,6 +59,15 @@ class Following:
             self._squares = [
                 known + (measured_N - then_N) ** 2 for known, then_N in zip(self._squares, self._asked_N, strict=True)
             ]
+
+    def _slides(self, rate_mm_s: float | None, place_mm: float | None) -> bool:
+        """Whether the handle does so in one way for SLID_MM; so does one that is not measured."""
+        if rate_mm_s is None or place_mm is None:
+            return True
+        if rate_mm_s * self._rate_mm_s < SLIDES_MM_S**2:
+            self._turned_mm = place_mm
+        self._rate_mm_s = rate_mm_s
+        return abs(place_mm - self._turned_mm) >= SLID_MM
 
     def report(self) -> FollowingReport | None:
         """The figures of the last seconds in which it was followed; None until there were enough."""

@@ -128,7 +128,8 @@ def snapshot(
         governed_cf=tick.governed_cf,
         measured_cf=tick.measured_cf,
         predicted_cf=tick.predicted_cf,
-        field_mT=tick.field_mT,
+        # of a gap that is open, or on its way there, nobody plans the field
+        field_mT=None if tick.governed_cf is None else tick.field_mT,
         gap_mm=left + right if known else None,
         gap_setpoint_mm=tick.reference_gap_mm,
         measured_jp=(left, right) if known else None,

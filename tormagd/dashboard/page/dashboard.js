@@ -215,7 +215,12 @@ function live() {
     at("scene").textContent = `scene ${status.scene}${lever}${status.is_homed ? "" : ", not homed"}`;
     at("source").textContent = `tormagd ${status.version}, device ${status.link.state} on ${status.link.port}`;
     const how = status.following, mN = (force_N) => (1e3 * force_N).toFixed(0);
-    at("followed").textContent = how ? `${mN(how.rms_N)} (${mN(how.aligned_rms_N)} less ${how.delay_ms.toFixed(0)} ms)` : "–";
+    at("following").hidden = !how;
+    if (how) {
+      at("followed").textContent = mN(how.rms_N);
+      at("aligned").textContent = how.delay_ms
+        ? `${mN(how.aligned_rms_N)} with a delay of ${how.delay_ms.toFixed(0)} ms taken out` : "without a delay";
+    }
     const {control} = status.rates, late = control?.lateness_us;
     at("rates").textContent = "Of every twentieth tick of 20 s, bars as logarithms. " + (control ? `Of all: ${control.hz.toFixed(0)} Hz, `
       + `p50 ${late.p50.toFixed(0)}, p99 ${late.p99.toFixed(0)}, longest ${late.max.toFixed(0)} µs; ${control.stalls} stalls.` : "");
