@@ -126,6 +126,10 @@ def real_time_is_granted_to_the_daemon_alone(console) -> None:
     assert (control.pop(main), set(control.values())) == ("50", {"49"})
     assert found
     assert not any(found.values())
+    # what says so asks the daemon, and not whoever calls
+    said = machine.run("tormagctl", "doctor", check=False)
+    assert "runs by /etc/tormag/tormagd.toml" in said
+    assert "granted: realtime.fifo_priority = 50" in said
 
 
 def what_can_change_does_and_what_cannot_is_named(console) -> None:
