@@ -28,7 +28,6 @@ from tormagd_client.errors import ClientError, not_understood
 from tormagd_client.messages import Status
 
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
-DEFAULT_SLACK_NS = 50_000
 MEMORY_TO_LOCK_BYTES = 1_000_000_000
 "What the daemon occupies with its models loaded and locked, rounded up."
 GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
@@ -318,17 +317,6 @@ def load(config: Config, machine: Machine) -> Finding:
     return _finding("load", average <= 0.8 * count, f"{average:.2f} over one minute on {count} cores", STOP_OTHERS)
 
 
-def timer_slack(config: Config, machine: Machine) -> Finding:
-    """By how much the kernel may delay this user's timers to bundle them; SCHED_FIFO threads have none."""
-    slack_ns = machine.number("/proc/self/timerslack_ns")
-    return _finding(
-        "timer slack",
-        slack_ns is None or slack_ns <= DEFAULT_SLACK_NS,
-        "the kernel does not say" if slack_ns is None else f"{slack_ns / 1e3:g} us",
-        "remove TimerSlackNSec= from what starts this session",
-    )
-
-
 def clock_source(config: Config, machine: Machine) -> Finding:
     """Whether reading the time is fast and even."""
     name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
@@ -449,7 +437,7 @@ def build(config: Config, machine: Machine) -> Finding:
 
 
 Check = Callable[[Config, Machine], Finding]
-OF_CALLER: tuple[Check, ...] = (build, scheduling, memory_lock, timer_slack, run_directory, port)
+OF_CALLER: tuple[Check, ...] = (build, scheduling, memory_lock, run_directory, port)
 "What whoever calls has and may do, which stands for a daemon that he starts."
 OF_MACHINE: tuple[Check, ...] = (
     preemption,
