@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "config": {"toml_file"},
     "messages": set(),
     "output": set(),
+    "command_line": {"named_file", "output"},
     "exact": set(),
     "keeping": set(),
     "slices": set(),
@@ -39,12 +40,25 @@ MAY_IMPORT = {
     "assembly": DECIDES | {"messages", "exact", "keeping", "control"},
     "daemon": LOWEST
     | FILES
-    | {"output", "keys", "keeping", "slices", "inverse", "scenes", "safety", "hardware", "control", "assembly"},
+    | {"command_line", "output", "keys", "keeping", "slices"}
+    | {"inverse", "scenes", "safety", "hardware", "control", "assembly"},
     "recording": FILES | {"messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "messages", "output", "recording", "safety"},
     "ctl": FILES
-    | {"dashboard", "force_file", "client", "config", "messages", "output", "interrupt", "keys", "scenes", "recording"},
+    | {
+        "command_line",
+        "dashboard",
+        "force_file",
+        "client",
+        "config",
+        "messages",
+        "output",
+        "interrupt",
+        "keys",
+        "scenes",
+        "recording",
+    },
     "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices", "interrupt"},
     "headroom": {"config", "output", "daemon", "control", "assembly", "simulation", "closed_loop"},
     "replay": LOWEST

@@ -371,6 +371,8 @@ def test_status_text_shows_each_source_and_the_way(status_with, source_with):
     assert lines[at + 5] == (
         "way       16.1 ms of 400 ms, stamp to duty 1.2 ms (p50) 3.4 ms (p99), device 0.4 ms, carriages 12.3 ms"
     )
+    silent = msgspec.structs.replace(known, setpoint_cf=None)
+    assert "way  " not in status_text(silent, Colour(sys.stderr)), "nothing is on its way any more"
     late = way | {"to_duty_us": delay_us | {"p99": 420e3}, "total_ms": 432.7}
     text = status_text(msgspec.convert(status_with(way=late), Status), Colour(sys.stderr))
     assert "the force comes too late\n          next: most is from the stamp to the duty" in text

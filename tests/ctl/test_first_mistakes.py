@@ -107,6 +107,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
         {"other.toml": CORONARY.replace("most_N = 2.0", "most_N = 1.9")},
     ),
     ("tormagctl --config unfit.toml doctor --measure", 1, "nowhere", {"unfit.toml": 'scene = "nowhere"\n'}),
+    ("tormagd --chek", 2, "unrecognized arguments: --chek; did you mean `--check`?", {}),
     (
         "tormagd --check --config misspelt.toml",
         2,
@@ -167,7 +168,7 @@ def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_pat
     assert sentence.startswith(f"{command.split()[0]}")
     # a sentence, and what to do next
     assert [line for line in more if not line.startswith("  ")] == []
-    assert ("  next: " in said) == command.startswith("tormagctl")
+    assert "  next: " in said or command.startswith("tormagd --check")
 
 
 JSON = [row for row in MISTAKES if row[0].startswith("tormagctl") and "--measure" not in row[0]]

@@ -174,7 +174,7 @@ def test_the_log_has_a_line_for_each_record_and_a_traceback_its_own() -> None:
 # -- streams: closed or full, or without a reader, they change neither what was done nor the exit code -----------------
 
 
-CTL = ("tormagd.ctl.main",)
+CTL, DAEMON = ("tormagd.ctl.main",), "tormagd.daemon.main"
 LIST = (*CTL, "scene", "list")
 LOST = "the answer could not be written: No space left on device"
 
@@ -199,7 +199,7 @@ def test_an_answer_that_cannot_be_written_is_told_and_one_that_nobody_wants_is_n
     assert (ran.returncode, ran.stderr.removeprefix("tormagctl scene: ").strip()) == (code, said)
 
 
-@pytest.mark.parametrize("command", [(*CTL, "--help"), (*CTL, "--version"), ("tormagd.daemon.main", "--check")])
+@pytest.mark.parametrize("command", [(*CTL, "--help"), (DAEMON, "--version"), (DAEMON, "--check")])
 def test_so_is_what_is_no_answer_of_a_command(command):
     ran = run("> /dev/full", *command)
     assert (ran.returncode, "written: No space left on device" in ran.stderr) == (1, True)
@@ -215,7 +215,7 @@ def test_a_refusal_without_stderr_leaves_the_object_alone_on_stdout(tmp_path: Pa
     ("arguments", "code", "said"),
     [
         (LIST, 0, ""),
-        (("tormagd.daemon.main", "--check"), 0, ""),
+        ((DAEMON, "--check"), 0, ""),
         # a device whose address nobody learns is of no use
         (("tormagd.simulation", "--pty"), 1, "could not be written to stdout"),
     ],

@@ -90,6 +90,7 @@ print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
 ROOMS = {
     "assembly",
     "bounded_file",
+    "command_line",
     "config",
     "control",
     "daemon",

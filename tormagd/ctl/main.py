@@ -10,16 +10,15 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import msgspec
 
 from tormagd import __version__
+from tormagd.command_line import Parser, UsageError
 from tormagd.config import Config, load_config
 from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL, Option
 from tormagd.ctl.outcome import (
-    CommandError,
-    Exit,
     Outcome,
     as_usage_error,
     exit_code,
@@ -27,11 +26,9 @@ from tormagd.ctl.outcome import (
     print_outcome,
     usage_error,
 )
-from tormagd.named_file import did_you_mean
 from tormagd.output import write_in_any_encoding, write_line
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.errors import ClientError
-from tormagd_client.printable import in_short
 
 EXTRAS = {
     "mcap": "record",
@@ -42,9 +39,6 @@ EXTRAS = {
     "prometheus_client": "metrics",
     "tqdm": "lab",
 }
-LONGEST = 300
-"Characters of a refusal that quotes what was given."
-UNKNOWN_OPTION = "unrecognized arguments: "
 SERVICE_CONFIG = Path("/etc/tormag/tormagd.toml")
 "What the service reads, and `doctor` where no other is named."
 EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,
@@ -57,9 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     try:
         options = parser().parse_args(given)
-    except CommandError as error:
-        print_error(next((each for each in given if each in COMMANDS), ""), error, "--json" in given)
-        return error.exit_code
+    except UsageError as error:
+        refused = usage_error(error.message, error.hint)
+        print_error(next((each for each in given if each in COMMANDS), ""), refused, "--json" in given)
+        return refused.exit_code
     try:
         outcome = _run(options)
     except ClientError as error:
@@ -76,28 +71,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_line(f"tormagctl {options.command}: interrupted; the daemon goes on", sys.stderr)
         return 130
     return print_outcome(options.command, outcome, options.json)
-
-
-class Parser(argparse.ArgumentParser):
-    """Refuses as the commands do: by a CommandError (USAGE) of one sentence with the next step."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise it, with what an unknown option may have meant."""
-        if message.startswith(UNKNOWN_OPTION):
-            known = (*SHARED, *(each for command in COMMANDS.values() for each in command.options))
-            names = [name for names, _ in known for name in names]
-            message += did_you_mean(message.removeprefix(UNKNOWN_OPTION).split()[0], names)
-        raise usage_error(message.removeprefix("argument ")[:LONGEST], f"{self.prog} --help")
-
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        if action.choices is not None and value not in action.choices:
-            near = did_you_mean(value, action.choices) or f": allowed are {', '.join(action.choices)}"
-            raise argparse.ArgumentError(action, f"{in_short(value)}{near}")
-
-    def _print_message(self, message: str, file: Any = None) -> None:
-        lost = write_line(message.rstrip(), file)
-        if lost is not None and not isinstance(lost, BrokenPipeError):
-            raise CommandError(Exit.REFUSED, "not_written", f"not written: {lost.strerror}", "make room on the disk")
 
 
 def _run(options: argparse.Namespace) -> Outcome:
@@ -158,6 +131,8 @@ def parser() -> argparse.ArgumentParser:
     _add(shared, SHARED)
     made = Parser(prog="tormagctl", description="Operate the tormagd haptic controller.", epilog=EXIT_TEXT)
     _add(made, SHARED)
+    of_commands = (each for command in COMMANDS.values() for each in command.options)
+    made.options = tuple(name for names, _ in (*SHARED, *of_commands) for name in names)
     made.set_defaults(**USUAL)
     made.add_argument("--version", action="version", version=f"tormagctl {__version__}")
     # its own name is given, or argparse would lay a usage out to find it

@@ -65,7 +65,7 @@ def status_text(known: Status, colour: Colour) -> str:
         f"skew {_number(known.skew_mm, 'mm', 3)}",
         f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
         *(line for name, source in known.setpoints.by_source.items() for line in _source(name, source, colour)),
-        *_way(known.way, colour),
+        *_way(None if known.setpoint_cf is None else known.way, colour),
         *_peers(known.peers, colour),
         *_device(known, colour),
         f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",

@@ -1,12 +1,12 @@
 """`tormagd`: understands its command line, and starts the daemon."""
 
-import argparse
 import signal
 import sys
 from pathlib import Path
 
 from firmware_protocol.build import settle
 from tormagd import __version__
+from tormagd.command_line import Parser, UsageError
 from tormagd.config import load_config
 from tormagd.daemon.log import log_to_stderr
 from tormagd.output import write_in_any_encoding, write_line
@@ -17,9 +17,9 @@ EXIT_TEXT = """exit codes: 0 ended on request, 1 could not run, 2 configuration 
 SIGHUP reads keys and configuration again."""
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """What `tormagd` understands; its man page is made from it, too."""
-    made = argparse.ArgumentParser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
+    made = Parser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
     made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
     made.add_argument("--scene", metavar="NAME", help="this scene, or scene file, in place of the configuration's")
     made.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
@@ -30,7 +30,11 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the daemon; returns the exit code: 0 ended on request, 1 could not run, 2 configuration refused."""
     write_in_any_encoding()
-    options = parser().parse_args(arguments)
+    try:
+        options = parser().parse_args(arguments)
+    except UsageError as error:
+        write_line(f"tormagd: {error.message}\n  next: {error.hint}", sys.stderr)
+        return 2
     log_to_stderr()
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
