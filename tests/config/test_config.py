@@ -317,12 +317,10 @@ def test_a_scene_beyond_what_the_device_reaches_is_refused(
         assert "allowed is 0.65..5.43" in refused
 
 
-def test_version_and_usage(capsys) -> None:
+def test_the_version_says_which_build_runs(capsys) -> None:
     with pytest.raises(SystemExit, match=r"^0$"):
         main(["--version"])
     assert capsys.readouterr().out.split() == ["tormagd", f"{__version__},", *str(settle()).split()]
-    with pytest.raises(SystemExit, match=r"^2$"):
-        main(["--chekc"])
 
 
 @pytest.mark.parametrize(

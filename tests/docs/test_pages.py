@@ -14,6 +14,7 @@ import reference_pages
 from PIL import Image
 
 from firmware_protocol.conformance import __main__ as conformance
+from tormagd.command_line import UsageError
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
 from tormagd.ctl.commands import COMMANDS
@@ -124,8 +125,8 @@ def test_every_command_in_a_block_is_understood(page, capsys):
     for words, parser, arguments in parsed(blocks(page.read_text(encoding="utf-8"))):
         try:
             parser.parse_args(arguments)
-        except SystemExit:
-            pytest.fail(f"{' '.join(words)}: {capsys.readouterr().err}")
+        except (SystemExit, UsageError) as error:
+            pytest.fail(f"{' '.join(words)}: {error} {capsys.readouterr().err}")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)

@@ -34,6 +34,8 @@ CapabilityBoundingSet=CAP_SYS_NICE
 PrivateUsers=no
 """
 "What gives the daemon real time where nobody may raise LimitRTPRIO, as in a container without CAP_SYS_RESOURCE."
+ASKS = "\n[realtime]\nfifo_priority = 50\nlock_memory = true\n"
+NOT_ALLOWED = "[Service]\nLimitRTPRIO=0\nLimitMEMLOCK=8M\n"
 DROP_INS = "/etc/systemd/system/{unit}.service.d"
 OTHERS = ("/var/lib/dpkg", "/run/systemd")
 "What the package manager and systemd write for themselves."
@@ -160,7 +162,8 @@ def another_console_stands_beside_it(console, left) -> None:
     """As the guide has it, with a publisher's address that takes a drop-in, and a recorder."""
     machine = console.machine
     text = re.sub(r'port = ".*"', 'port = "/dev/left"', shown("Several consoles"))
-    put(machine, "/etc/tormag/left.toml", re.sub('setpoint = ".*"', 'setpoint = "tcp://127.0.0.1:5555"', text))
+    put(machine, "/etc/tormag/left.toml", re.sub('setpoint = ".*"', 'setpoint = "tcp://127.0.0.1:5555"', text) + ASKS)
+    put(machine, f"{DROP_INS.format(unit=left.unit)}/test.conf", NOT_ALLOWED)
     machine.run(
         "install", "-D", "-m", "644", "-t", DROP_INS.format(unit=left.unit), "/usr/share/tormagd/drop-ins/tcp.conf"
     )
@@ -168,6 +171,11 @@ def another_console_stands_beside_it(console, left) -> None:
     machine.run("systemctl", "start", "simulator@left", "tormagd@left", "tormag-record@left")
     machine.until(left.is_ready, "the other device is identified")
     machine.run("bash", "-c", ": < /dev/tcp/127.0.0.1/5555")
+    # what the kernel does not grant to it is said wherever somebody looks, and of the first console nowhere
+    for command in ("status", "metrics", "doctor"):
+        said = machine.run("tormagctl", "--endpoint", "ipc:///run/tormag-left/control", command, check=False)
+        assert ("realtime.fifo_priority" in said, "realtime.lock_memory" in said) == (True, True), said
+    assert "did not grant realtime.fifo_priority" not in machine.run("tormagctl", "status")
     recording = "/var/lib/tormag/left/recordings/*.mcap"
     machine.until(lambda: machine.run("sh", "-c", f"ls {recording}", check=False), "its recorder writes")
 
