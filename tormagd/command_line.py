@@ -5,7 +5,7 @@ import sys
 from typing import Any, NoReturn
 
 from tormagd.named_file import did_you_mean
-from tormagd.output import write_line
+from tormagd.output import write_answer
 from tormagd_client.printable import in_short, printable
 
 LONGEST = 300
@@ -39,7 +39,5 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"{in_short(value)}{near}")
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        lost = write_line(message.rstrip(), file)
-        if lost is not None and not isinstance(lost, BrokenPipeError):
-            write_line(f"{self.prog}: not written: {lost.strerror}", sys.stderr)
+        if not write_answer(message.rstrip(), self.prog):
             sys.exit(1)

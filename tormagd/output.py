@@ -57,6 +57,16 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
     return None
 
 
+def write_answer(text: str, program: str) -> bool:
+    """Write to stdout what `program` was asked for; False where that could not be, which stderr is told."""
+    lost = write_line(text, sys.stdout)
+    # a reader that stopped reading meant to; a disk that is full did not
+    if lost is None or isinstance(lost, BrokenPipeError):
+        return True
+    write_line(f"{program}: the answer could not be written: {lost.strerror}", sys.stderr)
+    return False
+
+
 def escaped(text: str) -> str:
     """Return `text` with each unprintable character escaped, but for line ends, tabulators and our own colours."""
     parts = _OURS.split(text)

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 import msgspec
 
-from tormagd.output import write_line
+from tormagd.output import write_answer, write_line
 from tormagd_client.errors import ClientError, InFaultError, SettingError, UnreachableError
 from tormagd_client.printable import printable
 
@@ -75,7 +75,8 @@ def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
     """On stdout: one JSON object `{command, ok, result, error}`, or the text. What `tormagctl` ends with: REFUSED where
     all was done, and the answer could not be written."""
     is_done = outcome.exit_code is Exit.DONE
-    is_written = _print(command, _object(command, is_done, outcome.result, None) if as_json else outcome.text)
+    text = _object(command, is_done, outcome.result, None) if as_json else outcome.text
+    is_written = write_answer(text, f"tormagctl {command}")
     return outcome.exit_code if is_written or not is_done else Exit.REFUSED
 
 
@@ -86,20 +87,11 @@ def print_error(command: str, error: ClientError, as_json: bool) -> None:
     write_line(f"{f'tormagctl {command}'.rstrip()}: {said}\n  next: {hint}", sys.stderr)
     if as_json:
         told = {"code": error.code, "message": error.message, "hint": error.hint}
-        _print(command, _object(command, False, None, told))
+        write_answer(_object(command, False, None, told), f"tormagctl {command}".rstrip())
 
 
 def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> str:
     return msgspec.json.encode({"command": command, "ok": ok, "result": result, "error": error}).decode()
-
-
-def _print(command: str, text: str) -> bool:
-    lost = write_line(text, sys.stdout)
-    # a reader that stopped reading meant to; a disk that is full did not
-    if lost is None or isinstance(lost, BrokenPipeError):
-        return True
-    write_line(f"tormagctl {command}: the answer could not be written: {lost.strerror}", sys.stderr)
-    return False
 
 
 def folded(text: str) -> str:

@@ -17,7 +17,7 @@ from tormagd.daemon.realtime import prepare
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.hardware.backend import Backend, choose, installed
 from tormagd.keys import KeyRing
-from tormagd.output import write_line
+from tormagd.output import write_answer, write_line
 from tormagd.scenes.scene import load_scene
 from tormagd.toml_file import placed
 from tormagd_client.endpoints import ENDPOINTS, ConfigError
@@ -34,11 +34,7 @@ def start(options: argparse.Namespace) -> int:
     except ConfigError as error:
         raise ConfigError(placed(options.config, str(error))) from error
     if options.check:
-        lost = _print_resolved(config, core, backend.options)
-        if lost is None or isinstance(lost, BrokenPipeError):
-            return 0
-        write_line(f"tormagd: the answer could not be written: {lost.strerror}", sys.stderr)
-        return 1
+        return 0 if write_answer(_resolved(config, core, backend.options), "tormagd") else 1
     try:
         uvloop.run(_run(config, core, backend.open, keys, options))
     except (ConfigError, OSError) as error:
@@ -71,7 +67,7 @@ async def _run(
     await Daemon(config, core, open_backend, refused, keys, box, partial(_configured, options), beside, file).run()
 
 
-def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> OSError | None:
+def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
         "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),
@@ -93,4 +89,4 @@ def _print_resolved(config: Config, core: Core, options: msgspec.Struct) -> OSEr
         },
         "backends": {name: reason or "loads" for name, reason in installed().items()},
     }
-    return write_line(msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode(), sys.stdout)
+    return msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode()

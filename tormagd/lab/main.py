@@ -14,13 +14,14 @@ from typing import Any, NamedTuple
 from tormagd.force_file import ForceFileError
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.told import lines
-from tormagd.output import write_line
+from tormagd.named_file import did_you_mean
+from tormagd.output import write_answer, write_in_any_encoding, write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.parameters import PlantError
 from tormagd_client.endpoints import ConfigError
-from tormagd_client.printable import printable
+from tormagd_client.printable import in_short, printable
 
-USAGE = 2
+NOT_TOLD, USAGE = 1, 2
 REFUSALS = (LabError, ConfigError, ForceFileError, DomainError, PlantError)
 "Errors with which the laboratory's rooms refuse input."
 
@@ -53,12 +54,14 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that the first argument names and return its exit code; 2 for usage and input that is refused."""
+    write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)
     name = given[0] if given else "--help"
     if name in COMMANDS:
         return run(name, given[1:])
     wanted = name in ("-h", "--help")
-    head = ["usage: tormag-lab NAME [--help] ...", ""] if wanted else [f"tormag-lab: no command {name!r}. There are:"]
+    refused = f"tormag-lab: no command {in_short(name)}{did_you_mean(name, COMMANDS) or '; there are:'}"
+    head = ["usage: tormag-lab NAME [--help] ...", ""] if wanted else [refused]
     commands = (f"  {each:20}{summary}" for each, (_, summary) in COMMANDS.items())
     write_line("\n".join([*head, *commands]), sys.stdout if wanted else sys.stderr)
     return 0 if wanted else USAGE
@@ -90,8 +93,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
             raise
         return _refuse(name, str(error))
     told = lines(found.figures) if found.lines is None else found.lines
-    write_line(json.dumps(found.figures) if options.json else "\n".join(told), sys.stdout)
-    return found.exit_code
+    is_told = write_answer(json.dumps(found.figures) if options.json else "\n".join(told), f"tormag-lab {name}")
+    return found.exit_code if is_told else found.exit_code or NOT_TOLD
 
 
 def _refuse(name: str, reason: str) -> int:
