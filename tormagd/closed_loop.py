@@ -172,7 +172,6 @@ class ClosedLoop:
         self._inference_s = 1.0 / config.rates.inference_hz
         self._ticks = 0
         self._output: Duty | None = None
-        self._setpoint: TimedSetpoint | None = None
         self._asked: Question | None = None
         self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
         self.connection = Connection(config.device, self._port.open, self._lose_link)
@@ -226,7 +225,7 @@ class ClosedLoop:
         self.connection.exchange(
             now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
-        self._output, self._setpoint = output, setpoint
+        self._output = output
         measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
         return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
 
@@ -243,21 +242,10 @@ class ClosedLoop:
         self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
-        """Return the conditions on which commands are taken or refused, as of now.
-
-        Without a planner the device's F_min counts as 0 N.
-        """
-        believe = None if self.planner is None else self.planner.believe
-        return conditions(
-            self.now_s,
-            self._config,
-            self.connection,
-            self.stepper,
-            self._output,
-            self._setpoint,
-            0.0 if believe is None else believe.min_N,
-            sensor_doubted=believe is not None and believe.sensor.is_doubted,
-        )
+        """Return the conditions on which commands are taken or refused, as of now."""
+        doubted = self.planner is not None and self.planner.believe.sensor.is_doubted
+        connection, stepper = self.connection, self.stepper
+        return conditions(self.now_s, self._config, connection, stepper, self._output, sensor_doubted=doubted)
 
     def run(
         self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
@@ -301,7 +289,7 @@ class ClosedLoop:
         is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
         if is_new or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
             self._search(planner, now_s)
-            planner.plan(now_s, setpoint, self.stepper.measured)
+            planner.plan(now_s, setpoint, self.stepper.measured, self.stepper.is_followed)
             planner.foresee()
             self._asked = self._asked or planner.question
 

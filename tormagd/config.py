@@ -184,8 +184,6 @@ class Limits(Strict, frozen=True):
     "For how long, before it is the fault `FOLLOWING_ERROR`."
     low_confidence: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
     "Below it the limit `LOW_CONFIDENCE` says that the model was asked outside its training."
-    neutral_margin_N: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
-    "So much above the least force a setpoint may be when the device is enabled: nothing jumps."
 
 
 class BlackBox(Strict, frozen=True):

@@ -30,6 +30,8 @@ _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place that one of msgspec's ends with."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
+GONE = {"neutral_margin_N": "; delete it: `enable` goes to any setpoint along a ramp now"}
+"Keys of earlier versions, and what to do about them."
 _NOTHING = object()
 "No value of a table: TOML's and JSON's may be None."
 
@@ -120,8 +122,8 @@ def table_in(kind: Any) -> type[msgspec.Struct] | None:
 
 def _known_key(kind: Any, message: str) -> str:
     """The known key that is nearest to an unknown one of msgspec's message."""
-    if (unknown := _UNKNOWN.search(message)) is None:
-        return ""
+    if (unknown := _UNKNOWN.search(message)) is None or unknown[1] in GONE:
+        return GONE[unknown[1]] if unknown else ""
     table = table_in(kind)
     for name in _key_in(message)[:-1]:
         fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}

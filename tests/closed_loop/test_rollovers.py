@@ -17,7 +17,7 @@ SENT_HZ = 137.3
 "Setpoints a second: not in step with the forecast's grid, where the last digit of a stamp would decide."
 SAME_DUTY = 1e-4
 "A step of the wire: what a clock of coarser floats may change."
-READY = Conditions(True, True, True, False, False, None, 0.5)
+READY = Conditions(True, True, True, False, False)
 
 
 def swinging(now_s: float) -> TimedSetpoint:

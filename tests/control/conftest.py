@@ -23,9 +23,7 @@ from tormagd.scenes.scene import Scene
 
 MeasurementMaker = Callable[..., Measurement]
 PERIOD_S, PLAN_PERIOD_S = 1e-3, 4e-3
-READY = Conditions(
-    connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
-)
+READY = Conditions(connected=True, fresh=True, homed=True, busy=False, device_latched=False)
 
 
 @pytest.fixture(scope="session")

@@ -105,7 +105,7 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
             if rng.random() < 0.3:
                 setpoint = None if rng.random() < 0.1 else setpoint_at(rng, now_s)
                 try:
-                    planner.plan(now_s, setpoint, stepper.measured)
+                    planner.plan(now_s, setpoint, stepper.measured, rng.random() < 0.8)
                     seen.see(planner)
                     planner.foresee()
                 except (ValueError, OverflowError) as error:  # of what is not finite, and no wire brings
@@ -199,8 +199,6 @@ def conditions(rng: random.Random) -> Conditions:
         homed=good[2],
         busy=rng.random() < 0.05,
         device_latched=rng.random() < 0.05,
-        requested_N=rng.choice([None, 0.0, 0.0, 1.5]),
-        neutral_N=0.65,
     )
 
 

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable
 from itertools import repeat
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -121,20 +122,51 @@ def test_late_answers_do_not_hold_a_call_nor_are_they_taken_for_its_own(fake_dae
         assert client.answer(given_up) is None
 
 
-def test_arming_waits_for_what_goes_away_by_itself_and_for_nothing_else(client, fake_daemon):
-    codes = iter(["busy", "not_fresh"])
+def arming(*reports):
+    """Answers to `status` one after the other, of an `arm` that comes so far."""
+    left = list(reports)
 
-    def enable() -> dict[str, Any]:
-        code = next(codes, None)
-        error = {"code": code, "message": "not yet", "hint": ""}
-        return {"ok": True, "result": {}} if code is None else {"ok": False, "error": error}
+    def answer():
+        return {"ok": True, "result": {"arm": left.pop(0) if len(left) > 1 else left[0]}}
 
-    fake_daemon.answers["enable"] = enable
-    client.arm()
-    assert fake_daemon.commands == ["home", "enable", "enable", "enable"]
-    fake_daemon.refuse("enable", "not_neutral")
-    with pytest.raises(RefusedError, match="cannot enable"):
+    return answer
+
+
+SKEWED = {"code": "skewed", "cause": "they are apart", "remedy": "home"}
+UNDER_WAY = {"given": ["home"], "is_over": False, "error": None}
+
+
+def test_arming_tells_each_command_and_ends_when_the_daemon_has(client, fake_daemon):
+    done = {"given": ["home", "enable"], "is_over": True, "error": None}
+    fake_daemon.answers["status"] = arming(UNDER_WAY, UNDER_WAY, done)
+    told = []
+    assert client.arm(told=told.append) == ("home", "enable")
+    assert (told, fake_daemon.commands) == (["home", "enable"], ["arm", *["status"] * 3])
+
+
+@pytest.mark.parametrize(
+    ("report", "kind", "words"),
+    [
+        (UNDER_WAY | {"is_over": True, "error": SKEWED}, RefusedError, "they are apart"),
+        (UNDER_WAY | {"is_over": True, "error": SKEWED | {"code": "fault"}}, InFaultError, "they are apart"),
+        (None, RefusedError, "started anew"),
+    ],
+)
+def test_an_arming_that_the_daemon_ended_says_why(client, fake_daemon, report, kind, words):
+    fake_daemon.answers["status"] = arming(report)
+    with pytest.raises(kind, match=words):
         client.arm()
+    assert fake_daemon.commands == ["arm", "status"]
+
+
+def test_who_stops_waiting_for_an_arming_takes_the_word_back(client, fake_daemon):
+    fake_daemon.answers["status"] = arming(UNDER_WAY)
+    with pytest.raises(RefusedError, match=r"not armed within 0\.1 s"):
+        client.arm(0.1)
+    assert fake_daemon.commands[-1] == "disable"
+    with pytest.raises(KeyboardInterrupt):
+        client.arm(told=Mock(side_effect=KeyboardInterrupt))
+    assert fake_daemon.commands[-1] == "disable"
 
 
 def test_setpoints_are_numbered_stamped_and_checked(client, fake_daemon):

@@ -31,6 +31,8 @@ NOT_UNDERSTOOD: list[Row] = [
     ({"version": "0.0.9", key: value}, {}, 3, ['"code":"unintelligible"', "tormagd 0.0.9", key])
     for key, value in (("is_homed", None), ("link", 3), ("rates", {"control": {}}), ("limits", None))
 ]
+ARMED = {"given": ["home", "enable"], "is_over": True, "error": None}
+A_FAULT = {"code": "fault", "cause": "it came back", "remedy": "tormagctl status"}
 ANSWERS: dict[str, list[Row]] = {
     # what is shown is the daemon's own
     "status": [
@@ -75,6 +77,12 @@ ANSWERS: dict[str, list[Row]] = {
     "--json clear-fault": [
         (IN_FAULT, {"operating_state": "DISABLED"}, 4, ['"code":"fault"', "came back: SUPPLY: supply voltage low"]),
         *UNDONE,
+    ],
+    "arm": [
+        ({"arm": ARMED}, {}, 0, ["tormagctl arm: home\n", "the force goes to 1.50 N along the scene's ramp"]),
+        ({"arm": ARMED | {"given": []}}, {}, 0, ["it was armed already"]),
+        ({"arm": ARMED, "operating_state": "PAUSED"}, {}, 1, ["it was armed, and is PAUSED"]),
+        (IN_FAULT | {"arm": ARMED | {"error": A_FAULT}}, {}, 4, ["tormagctl arm: home\n", "it came back"]),
     ],
     "--json home": [
         (IN_FAULT | {"is_busy": True}, {}, 4, ['"code":"fault"', '"hint":"check the power supply"']),
@@ -127,7 +135,7 @@ def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_d
 
     fake_daemon.answers["clear-fault"] = clear
     fake_daemon.says(operating_state="FAULT", faults=["STOPPED"])
-    assert "fault cleared. tormagctl home, then enable" in ctl(*fake_daemon.at, "clear-fault").ended(0).out
+    assert "fault cleared. next: tormagctl arm" in ctl(*fake_daemon.at, "clear-fault").ended(0).out
     assert (fake_daemon.commands[:2], set(fake_daemon.commands[2:])) == (["status", "clear-fault"], {"status"})
 
 
@@ -287,7 +295,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
     "nothing of a profile where none was to be": ({"profile": ANOTHERS | {"folder": ""}}, (), ("another serial",)),
     "what to do next": (
         {"next_commands": ("clear-fault", "home", "enable")},
-        ("next      clear-fault, home, enable",),
+        ("next      tormagctl arm: clear-fault, home, enable",),
         (),
     ),
     "nothing to do next": ({}, (), ("next  ",)),
@@ -334,7 +342,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
             ("          there is no such port\n          next: plug the device in", *shown),
             () if shown else ("next  ",),
         )
-        for state, shown in (("RUNNING", ("next      home, enable",)), ("BACK_OFF", ()), ("REFUSED", ()))
+        for state, shown in (("RUNNING", ("next      tormagctl arm: home, enable",)), ("BACK_OFF", ()), ("REFUSED", ()))
     },
 }
 

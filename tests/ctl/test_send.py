@@ -215,10 +215,10 @@ def test_what_is_taken_while_enabled_is_rendered_and_when_sending_is_over_the_ne
 @pytest.mark.parametrize(
     ("source", "changes", "code", "exit_code", "said", "hint"),
     [
-        ({}, {"operating_state": "DISABLED"}, "disabled", 1, "the device is DISABLED", "tormagctl enable"),
-        ({}, {"operating_state": "DISABLED", "is_homed": False}, "disabled", 1, "DISABLED", "tormagctl home, then"),
+        ({}, {"operating_state": "DISABLED"}, "disabled", 1, "the device is DISABLED", "tormagctl arm"),
+        ({}, {"operating_state": "DISABLED", "is_homed": False}, "disabled", 1, "DISABLED", "tormagctl arm"),
         ({}, {"operating_state": "PAUSED"}, "paused", 1, "PAUSED", "tormagctl resume"),
-        ({}, {"operating_state": "FAULT", "faults": ["SKEW"]}, "fault", 4, "in FAULT: SKEW", "clear-fault"),
+        ({}, {"operating_state": "FAULT", "faults": ["SKEW"]}, "fault", 4, "in FAULT: SKEW", "tormagctl arm"),
         (None, {}, "not_heard", 1, "nothing of 'me': too much", "status"),
         ({"state": "refused"}, {}, "other_source", 1, "'robot' holds the brake", "do this"),
         ({"state": "refused"}, {"limit_details": []}, "other_source", 1, "'robot' holds", "tormagctl take me"),
@@ -278,7 +278,7 @@ def test_what_is_not_rendered_is_no_success(fake_daemon, sent, changes, expected
 
 
 def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, sent, status_with):
-    """`enable` wants a neutral setpoint, so that a publisher is there before."""
+    """A publisher may be there before the brake is armed."""
 
     def states(*names: str) -> Any:
         each = chain(names, repeat(names[-1]))

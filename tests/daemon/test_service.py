@@ -105,7 +105,7 @@ def line(**changes: Any) -> str:
 
 def test_the_status_line_says_how_it_stands_and_what_is_next():
     assert line(state="ENABLED") == "ENABLED, scene coronary"
-    assert line(is_homed=False) == "DISABLED, scene coronary; next: tormagctl home"
+    assert line(is_homed=False) == "DISABLED, scene coronary; next: tormagctl arm"
     assert line(state="FAULT", faults=["SKEW", "STOPPED"]) == "FAULT: SKEW, STOPPED; next: tormagctl status"
 
 

@@ -13,7 +13,7 @@ from tormagd.model.features import FEATURES
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import OperatingState
 
-CARRIAGES = Carriages(gap_speed_mm_s=40.0, lag_s=0.01, tolerance_N=0.05)
+CARRIAGES = Carriages(gap_speed_mm_s=40.0, lag_s=0.01, tolerance_N=0.05, release_N_s=2.0)
 STRONG = DeviceFit(scale=1.25)
 NOTHING: tuple[Limit, ...] = ()
 
@@ -57,6 +57,8 @@ def test_it_arrives_when_the_gap_has_gone_there_and_the_carriages_have_come(core
     judgement = found(core, plan(1.5), 1.0)
     assert judgement == (ARRIVES, pytest.approx(1e3 * (way_mm / 40.0 + 0.01), abs=0.051), ())
     assert found(core, plan(1.0), 1.5).arrives_ms == judgement.arrives_ms
+    on_its_way = plan(1.5, (Limit.TAKEOVER,)).replaced(governed_N=0.5)
+    assert found(core, on_its_way, 0.5).arrives_ms == pytest.approx(1e3 * (1.0 / 2.0 + 0.01))
 
 
 @pytest.mark.parametrize(

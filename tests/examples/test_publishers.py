@@ -22,7 +22,9 @@ from tormagd_client.messages import Setpoint, Telemetry, decode
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 ROWS = ((0.0, 0.6), (0.01, 0.7), (0.02, 1.0))
-BUSY, NOT_NEUTRAL = ("busy", "homing"), ("not_neutral", "the setpoint is 1.40 N")
+BUSY, SKEWED = ("busy", "homing"), ("skewed", "the carriages are 1.4 mm apart")
+ASKED = (["home", "enable", "enable"], ["arm", "status", "status"])
+"By those without our client, and by the others."
 PATIENCE_MS = 30_000
 
 
@@ -65,8 +67,18 @@ def publisher(request):
     return request.getfixturevalue(request.param)
 
 
+def answer(command, refusal):
+    """What the daemon says to `enable`, or of an `arm` when it is asked for its status."""
+    if command == "enable":
+        error = refusal and {"code": refusal[0], "message": refusal[1], "hint": "home"}
+        return {"ok": False, "error": error} if refusal else {}
+    ended = refusal and refusal != BUSY and {"code": refusal[0], "cause": refusal[1], "remedy": "home"}
+    arm = {"given": ["home"], "is_over": refusal != BUSY, "error": ended or None}
+    return {"result": {"arm": arm}}
+
+
 def played(publisher, tmp_path, refusals):
-    """What it asked, what it published, and how it ended, where `enable` is answered with the refusals, one by one."""
+    """What it asked, what it published, and how it ended, where arming meets the refusals, one by one."""
     profile = tmp_path / "profile.csv"
     profile.write_text("t_s,force_N\n" + "".join(f"{t},{force}\n" for t, force in ROWS))
     asked: list[Any] = []
@@ -80,17 +92,16 @@ def played(publisher, tmp_path, refusals):
         setpoints.bind(f"ipc://{folder}/setpoint")
         playing = subprocess.Popen([*publisher, folder, str(profile)], stderr=subprocess.PIPE, text=True)
         try:
-            for _ in range(2 + len(refusals) - (NOT_NEUTRAL in refusals)):
+            for _ in range(2 + len(refusals) - (SKEWED in refusals)):
                 assert control.poll(PATIENCE_MS)
                 *envelope, data = control.recv_multipart()
                 request = msgpack.unpackb(data)
                 asked.append(request["command"])
                 reply = {"v": 1, "id": request["id"], "ok": True, "result": {}}
-                if asked[-1] == "enable" and left:
-                    code, message = left.pop(0)
-                    reply |= {"ok": False, "error": {"code": code, "message": message, "hint": "lower it"}}
+                if asked[-1] in ("enable", "status"):
+                    reply |= answer(asked[-1], left.pop(0) if left else None)
                 control.send_multipart([*envelope, msgpack.packb(reply)])
-            while NOT_NEUTRAL not in refusals and len(heard) < len(ROWS):
+            while SKEWED not in refusals and len(heard) < len(ROWS):
                 assert setpoints.poll(PATIENCE_MS)
                 heard.append(decode(setpoints.recv(), Setpoint))
             _, said = playing.communicate(timeout=PATIENCE_MS / 1e3)
@@ -104,7 +115,7 @@ def played(publisher, tmp_path, refusals):
 
 def test_it_waits_for_the_end_of_homing_and_publishes_every_row(publisher, tmp_path):
     asked, heard, code, said = played(publisher, tmp_path, [BUSY])
-    assert (asked, code, said) == (["home", "enable", "enable"], 0, "")
+    assert (asked in ASKED, code, said) == (True, 0, "")
     assert [(setpoint.seq, setpoint.servo_cf) for setpoint in heard] == list(enumerate(force for _, force in ROWS))
     assert len({(setpoint.source, setpoint.session) for setpoint in heard}) == 1
     assert heard[0].session is not None
@@ -112,12 +123,9 @@ def test_it_waits_for_the_end_of_homing_and_publishes_every_row(publisher, tmp_p
 
 
 def test_it_publishes_nothing_when_it_is_refused(publisher, tmp_path):
-    asked, _, code, said = played(publisher, tmp_path, [BUSY, NOT_NEUTRAL])
-    assert (asked, code, said) == (
-        ["home", "enable", "enable"],
-        1,
-        "enable: the setpoint is 1.40 N; lower it\n",
-    )
+    asked, _, code, said = played(publisher, tmp_path, [BUSY, SKEWED])
+    last = "arm" if asked[0] == "arm" else "enable"
+    assert (asked in ASKED, code, said) == (True, 1, f"{last}: the carriages are 1.4 mm apart; home\n")
 
 
 def test_the_one_in_python_is_the_readmes():

@@ -27,9 +27,7 @@ from tormagd.safety.operating_state import (
     reason,
 )
 
-READY = Conditions(
-    connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
-)
+READY = Conditions(connected=True, fresh=True, homed=True, busy=False, device_latched=False)
 DISABLED, ENABLED, PAUSED, FAULT = OperatingState
 FAULTED = latch(SafetyState(), (Fault.DEVICE_OVERCURRENT,))
 
@@ -40,8 +38,6 @@ conditions = st.builds(
     homed=st.sampled_from([True, True, True, False]),
     busy=st.sampled_from([False, False, False, True]),
     device_latched=st.sampled_from([False, False, False, True]),
-    requested_N=st.none() | st.floats(0.0, 2.0),
-    neutral_N=st.floats(0.1, 1.0),
 )
 faults = st.lists(st.sampled_from(Fault), max_size=3, unique=True).map(tuple)
 
@@ -67,8 +63,6 @@ def test_starts_disabled_and_asks_nothing() -> None:
         ("enable", {"busy": True}, "busy"),
         ("enable", {"homed": False}, "not_homed"),
         ("enable", {"fresh": False}, "not_fresh"),
-        ("enable", {"requested_N": 0.501}, "not_neutral"),
-        ("enable", {"requested_N": float("nan")}, "not_neutral"),
         ("enable", {"sensor_doubted": True}, "sensor_doubted"),
         ("enable", {"apart_mm": 1.01, "most_apart_mm": 1.0}, "skewed"),
         ("enable", {"apart_mm": float("nan"), "most_apart_mm": 1.0}, "skewed"),
@@ -84,11 +78,7 @@ def test_starts_disabled_and_asks_nothing() -> None:
 def test_what_a_command_wants_and_has_not_is_said(name: str, changes: dict[str, bool | float], code: str) -> None:
     refused = refusal(SafetyState(), name, READY.replaced(**changes))
     assert refused.code == code
-    assert code != "device_latched" or refused.hint.split(",")[0] == "tormagctl clear-fault"
-
-
-def test_a_neutral_setpoint_may_be_enabled_on() -> None:
-    assert command(SafetyState(), "enable", 0.0, READY.replaced(requested_N=0.5)).operating_state is ENABLED
+    assert code != "device_latched" or refused.hint in ("tormagctl clear-fault", "tormagctl arm")
 
 
 OPENED = (DISABLED, DeviceRequest.RETRACT)
@@ -96,10 +86,10 @@ STOPPED = (FAULT, DeviceRequest.RETRACT)
 CLEAR = "tormagctl clear-fault"
 TAKEN: dict[str, tuple[OperatingState | tuple[OperatingState, DeviceRequest] | str, ...]] = {
     # in DISABLED, ENABLED, PAUSED, FAULT
-    "enable": (ENABLED, "nothing to do", "tormagctl resume", CLEAR),
+    "enable": (ENABLED, "nothing to do", "tormagctl resume", "tormagctl arm"),
     "disable": (OPENED, OPENED, OPENED, CLEAR),
-    "pause": ("tormagctl enable", PAUSED, "nothing to do", CLEAR),
-    "resume": ("tormagctl enable", "nothing to do", ENABLED, CLEAR),
+    "pause": ("tormagctl arm", PAUSED, "nothing to do", CLEAR),
+    "resume": ("tormagctl arm", "nothing to do", ENABLED, CLEAR),
     "home": ((DISABLED, DeviceRequest.HOME), "tormagctl disable", "tormagctl disable", CLEAR),
     "stop": (STOPPED, STOPPED, STOPPED, STOPPED),
     "clear-fault": (DISABLED, ENABLED, PAUSED, DISABLED),
@@ -163,7 +153,7 @@ def test_an_encoder_fault_takes_homing_away_until_the_device_has_homed_again(fau
     """The device knows nothing of it, and calls itself homed all the time."""
     cleared = command(latch(SafetyState(), (Fault.STOPPED, fault)), "clear-fault", 2.0, READY)
     refused = refusal(homed_again(cleared, is_homed=True), "enable")
-    assert (refused.code, refused.hint) == ("not_homed", "tormagctl home")
+    assert (refused.code, refused.hint) == ("not_homed", "tormagctl arm")
     asked = command(cleared, "home", 2.0, READY)
     assert refusal(asked, "enable").code == "not_homed"
     homing = homed_again(asked, is_homed=False)
@@ -262,7 +252,6 @@ class Operating(RuleBasedStateMachine):
             has = present.connected, present.fresh, present.homed, present.busy, present.device_latched
             assert has == (True, True, True, False, False)
             assert (before.operating_state, self.is_position_lost) == (DISABLED, False)
-            assert present.requested_N is None or present.requested_N <= present.neutral_N
         if before.operating_state is ENABLED and self.state.operating_state in (DISABLED, FAULT):
             assert (self.state.request, self.state.request_number) == (DeviceRequest.RETRACT, before.request_number + 1)
 

@@ -125,9 +125,8 @@ def test_a_fault_is_one_sentence_with_cause_and_remedy(fault):
 )
 def test_a_homing_that_came_to_nothing_is_the_hosts_only_where_it_stood_still(code, host, verdict, monkeypatch):
     ended = CommandError(Exit.REFUSED, code, "homing ended, but the device is not homed", "tormagctl status")
-    monkeypatch.setattr(show, "home", Mock(side_effect=ended))
     with pytest.raises(show.ShowError) as caught:
-        show.arm(SimpleNamespace(request=lambda _command: {"faults": []}))
+        show.arm(SimpleNamespace(request=lambda _command: {"faults": []}, arm=Mock(side_effect=ended)))
     found, sentence = demo.judge(SCENE, show.Aborted(caught.value, host, 1e-3))
     assert found is verdict
     assert "homing ended" in sentence

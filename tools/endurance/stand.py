@@ -107,15 +107,12 @@ class Stand:
         self.client.publish(force_N, LASTS_MS)
 
     def arm(self) -> None:
-        """Clears, homes and enables, whatever was before, at a neutral force. Raises TimeoutError."""
+        """Clears, homes and enables, whatever was before, at a low force. Raises TimeoutError."""
 
         def is_armed(status: dict[str, Any]) -> bool:
-            if status["operating_state"] == "ENABLED":
-                return True
-            command = "clear-fault" if status["faults"] else "enable" if status["is_homed"] else "home"
-            if is_at_rest(status):
-                self.is_done(command)
-            return False
+            if status["operating_state"] != "ENABLED":
+                self.is_done("arm")
+            return bool(status["operating_state"] == "ENABLED")
 
         self.ask(NEUTRAL_N)
         self.until(is_armed, "enabled")

@@ -75,7 +75,7 @@ BEGINS_S = 9.9
 "A stage that begins at a time, just before the first step."
 CONFIG = Config(scene="coronary")
 BOUNDS = device_bounds(CONFIG.trim)
-READY = Conditions(True, True, True, False, False, None, 0.5)
+READY = Conditions(True, True, True, False, False)
 OWN, MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
     "",
     "Stepper, of measurements",
@@ -518,7 +518,6 @@ def clock(stage: DeviceClock, draw: Draw) -> object:
 
 def safety(stages: list[SafetyState], draw: Draw) -> object:
     some = READY.replaced(
-        requested_N=abs(draw(0.5)),
         round_trip_s=abs(draw(2e-3)),
         clock_drift=draw(0.0),
         apart_mm=abs(draw(0.0)),
@@ -527,7 +526,7 @@ def safety(stages: list[SafetyState], draw: Draw) -> object:
         most_clock_drift=0.1,
     )
     stages[0] = command(SafetyState(), "enable", draw.step(PERIOD_S), some)
-    return [some.requested_N, some.round_trip_s, some.clock_drift, some.apart_mm]
+    return [some.round_trip_s, some.clock_drift, some.apart_mm]
 
 
 def inbox(_: object, draw: Draw) -> object:

@@ -1,23 +1,19 @@
 """What leads out of a fault: the commands that the daemon's own table names, before its cause has gone and after.
 
-An operator does no more: looks which commands lead back, gives each as soon as the device neither homes nor opens,
-with the publisher silent, and lets it publish once the brake is enabled. Before the cause has gone that must come to
+An operator does no more than to say `arm`, beside a publisher that goes on. Before the cause has gone that must come to
 nothing, or the fault be named all the while; afterwards the force has to be followed again.
 """
 
 from fault_matrix.cases import Injection
 from fault_matrix.rig import Rig
 from fault_matrix.watch import MOST_OFF_N, MOST_OVER_N, Cell
-from tormagd.safety.operating_state import Event, OperatingState, RefusedError, next_commands
+from tormagd.daemon.arming import Arming
+from tormagd.safety.operating_state import OperatingState, next_commands
 
 MENDED_S = 1.5
 "A device that was silent is asked once a second who it is, and one that was reset is told so."
-SILENT_S = 0.2
-"A setpoint is too old by then to be in the way of `enable`."
-CLEARED_S = 0.6
-"A fault that has not come back by then is cleared: `tormagctl clear-fault` waits as long."
 PATIENCE_S = 12.0
-"A command is given again for so long: homing may take 10 s, and a clock is judged over some."
+"It is said again for so long: a clock is judged over some seconds."
 FOLLOWED_S = 4.0
 JUDGED_S = 1.0
 "The end of it, in which the force is to be what is asked and nothing to be told any more."
@@ -32,7 +28,7 @@ def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
     mended_s = rig.loop.now_s
     rig.rest(MENDED_S)
     commands = next_commands(rig.safety, rig.is_homed)
-    trouble = _obeyed(rig, commands, PATIENCE_S)
+    trouble = armed(rig, PATIENCE_S)
     back_s = rig.loop.now_s - mended_s
     is_held, told = _follow(rig)
     is_back = not trouble and not rig.safety.faults and is_held and not _named(injection, told)
@@ -47,7 +43,7 @@ def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
 def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:
     """What the recovery comes to while the cause lasts, and whether it is as it should be."""
     commands = next_commands(rig.safety, rig.is_homed)
-    trouble = _obeyed(rig, commands, 0.0)
+    trouble = armed(rig, 0.0)
     if trouble:
         return trouble, True
     _, told = _follow(rig)
@@ -75,46 +71,22 @@ def _follow(rig: Rig) -> tuple[bool, set[str]]:
     return rig.safety.operating_state is OperatingState.ENABLED and is_held, told
 
 
-def _obeyed(rig: Rig, commands: tuple[Event, ...], patience_s: float) -> str:
-    """Gives the commands, and has the force published again; those that were taken and what came in the way then, empty
-    where nothing did."""
-    if not commands:
-        return ""
-    rig.publisher.is_silent = True
-    rig.rest(SILENT_S)
-    taken: list[str] = []
-    for event in commands:
-        _rest_until_ready(rig)
-        if event is not Event.CLEAR_FAULT and rig.safety.faults:
-            return ", ".join((*taken, f"{rig.safety.faults[0]} again"))
-        refusal = _given(rig, event, patience_s)
-        if refusal:
-            return ", ".join((*taken, f"{event} refused: {refusal}"))
-        taken.append(str(event))
-        rig.rest(CLEARED_S if event is Event.CLEAR_FAULT else 0.0)
-    rig.publisher.is_silent = False
-    return ""
-
-
-def _given(rig: Rig, event: Event, patience_s: float) -> str:
-    """The code of the refusal that is left after so long."""
+def armed(rig: Rig, patience_s: float) -> str:
+    """Says `arm`, again and again for so long; the commands that were taken and what came in the way of the last one,
+    empty where nothing did."""
     until_s = rig.loop.now_s + patience_s
     while True:
-        try:
-            rig.loop.command(str(event))
-        except RefusedError as error:
-            if rig.loop.now_s >= until_s:
-                return error.code
-        else:
+        commands, arming = next_commands(rig.safety, rig.is_homed), Arming(rig.loop.now_s, rig.safety.faults)
+        while not arming.is_over:
+            arming.advance(rig.loop.now_s, rig.safety, rig.loop.conditions(), rig.loop.command)
+            rig.tick()
+        why = arming.refusal
+        if why is None:
             return ""
-        rig.tick()
-
-
-def _rest_until_ready(rig: Rig) -> None:
-    """Until the device neither homes nor opens, or nobody would wait any longer."""
-    until_s = rig.loop.now_s + PATIENCE_S
-    while rig.loop.conditions().busy and rig.loop.now_s < until_s:
-        rig.tick()
+        if why.code == "fault":
+            return ", ".join((*arming.given, f"{rig.safety.faults[0]} again"))
+        if rig.loop.now_s >= until_s:
+            return ", ".join((*arming.given, f"{commands[len(arming.given)]} refused: {why.code}"))
 
 
 def _named(injection: Injection, told: set[str]) -> str:

@@ -25,7 +25,6 @@ from machines.wire import carried
 
 from rendering.following import RATE_HZ, Tracking, tracking
 from rendering.signals import with_approach
-from tormagd.ctl.operate import home, operate
 from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.recording.reader import Columns, RecordingError, read_recording
@@ -310,18 +309,7 @@ def ended(name: str) -> ShowError:
 def arm(client: Client) -> None:
     """Homes and enables. Raises ShowError."""
     try:
-        home(client, PATIENCE_S, True)
-        print("homed; enabling")
-        until_s = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                operate(client, "enable")
-                return
-            except ClientError as error:
-                # a busy machine may find the newest measurement a little old for a moment
-                if error.code not in ("not_fresh", "busy") or time.monotonic() > until_s:
-                    raise
-                time.sleep(0.05)
+        client.arm(PATIENCE_S, lambda step: print(f"arm: {step}"))
     except ClientError as error:
         raise_fault(status(client))
         is_late = isinstance(error, UnreachableError) or error.code in OUT_OF_TIME

@@ -3,7 +3,7 @@
 from tormagd.config import Config
 from tormagd.control.core import Stepper
 from tormagd.control.move.watch import SENSE_FAULT_S, STATUS_FAULT_S
-from tormagd.control.records import Duty, Measured, TimedSetpoint
+from tormagd.control.records import Duty, Measured
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import Conditions, DeviceRequest
@@ -38,18 +38,11 @@ def conditions(
     connection: Connection,
     stepper: Stepper,
     output: Duty | None,
-    setpoint: TimedSetpoint | None,
-    least_N: float,
     *,
     sensor_doubted: bool,
 ) -> Conditions:
-    """Return the conditions at `now_s`.
-
-    `output` is the newest step's, None before the first. `setpoint` is the newest, None without a publisher; one that
-    is older than its validity does not count. `least_N` is F_min of this device.
-    """
+    """Return the conditions at `now_s`. `output` is the newest step's, None before the first."""
     measurement = connection.measurement
-    is_current = setpoint is not None and now_s - setpoint.stamp_s <= setpoint.valid_for_s
     old = "" if measurement is None else _old(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
     return Conditions(
         connected=measurement is not None,
@@ -57,8 +50,6 @@ def conditions(
         homed=is_homed(measurement, stepper.measured),
         busy=is_busy(measurement, connection.pending, stepper, output),
         device_latched=measurement is not None and measurement.is_latched,
-        requested_N=setpoint.force_N if setpoint is not None and is_current else None,
-        neutral_N=least_N + config.limits.neutral_margin_N,
         sensor_doubted=sensor_doubted,
         cause=old or connection.cause,
         remedy=connection.remedy,

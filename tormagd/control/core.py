@@ -18,6 +18,7 @@ from tormagd.control.ask.way import Way
 from tormagd.control.believe.believe import Believe, Learned
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.sensor import Disputed
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.measure import Measure
 from tormagd.control.move.actuator import Actuator
 from tormagd.control.move.carriages import Carriages
@@ -34,6 +35,7 @@ from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
 from tormagd.scenes.scene import Scene
 
+_ENABLED: Final = OperatingState.ENABLED
 _PAUSED: Final = OperatingState.PAUSED
 
 
@@ -48,16 +50,20 @@ class Planner:
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
         self.believe = Believe(config, scene, element.nominal, followed, element.portrait.min_N)
         gap_speed_mm_s = config.position.gap_speed_mm_s
+        self._portrait: Final = element.portrait
         self.way = Way(config.handle.push_sign)
         self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
         self.aim = Aim(config, scene, element)
         self.planned = self.aim.begin(now_s, 0, 0.0)
         "The newest plan."
 
-    def plan(self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None) -> Plan:
+    def plan(
+        self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None, is_followed: bool = True
+    ) -> Plan:
         """Make the next plan, keep it in `planned`, and return it. All planning stages take one update.
 
         `setpoint` is None without a publisher. `measured` is None while the device is silent: nothing is learned of it.
+        Where the gap does not follow the plans (`is_followed`), they begin where it is.
         Raises DomainError for a number that is not finite, a field that no gap gives, or a search's answer that is too
         old. The stages are then half updated: call `afresh`.
         """
@@ -65,12 +71,24 @@ class Planner:
             require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
         travel = self.way.update(measured, is_sensor_believed=belief.sensor_doubted_s == 0.0)
-        ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s, travel)
+        held_N = None if is_followed else self._held_N(measured, belief.device)
+        ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s, travel, held_N)
         plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
         # how late the carriages are is learned from this plan's gap, and acts in the next one
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan
         return plan
+
+    def _held_N(self, measured: Measured | None, device: DeviceFit) -> float:
+        """The force of the measured gap; of the open one where it is not known."""
+        portrait, planned = self._portrait, self.planned
+        if measured is None or not measured.is_homed:
+            return device.force_N(portrait.min_N)
+        # by as much the newest plan's gap differs from the portrait's: the element's memory, and the handle's rate
+        beside_mm = planned.gap_mm - portrait.gap_mm_at(device.model_N(planned.governed_N))
+        if Limit.CEILING in planned.limits:
+            beside_mm = 0.0
+        return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
 
     def foresee(self) -> bool:
         """Forecast the force for the next plans, and return whether a forecast was due.
@@ -132,6 +150,11 @@ class Stepper:
         """What was measured at the newest step; None while the device has said nothing."""
         return self.measure.measured
 
+    @property
+    def is_followed(self) -> bool:
+        """Whether the gap follows the plans."""
+        return self.safety.operating_state is _ENABLED
+
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
         """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties.
 
@@ -175,8 +198,7 @@ class Stepper:
         """
         measured, before = self.measured, self.safety
         self.safety = command(before, name, now_s, self.watch.command_conditions(conditions, measured))
-        is_enabled = self.safety.operating_state is OperatingState.ENABLED
-        if is_enabled and before.operating_state is OperatingState.DISABLED:
+        if self.is_followed and before.operating_state is OperatingState.DISABLED:
             assert measured is not None, "nothing is fresh without one"
             self.move.begin(measured.gap_mm)
             self.watch.begin(now_s)

@@ -127,11 +127,17 @@ COMMANDS = {
         "who is at the other end of the wire, and how well the wire carries", "status.firmware", ("client",)
     ),
     "ports": Command("where a device could be connected, and who holds what is there", "ports.ports", ("config",)),
-    "enable": _operate("start rendering force (homed, fresh measurements and a neutral setpoint needed)"),
+    "arm": Command(
+        "clear faults, home and enable, whatever is needed, each said; the force begins along a ramp",
+        "operate.arm",
+        ("client",),
+        _waiting(30.0)[:1],
+    ),
+    "enable": _operate("start rendering force along a ramp (homed and fresh measurements needed)"),
     "disable": _open_gap("open the gap, then drives off; waits until it is open"),
     "pause": _operate("hold the gap where it is"),
     "resume": _operate("go on after pause"),
-    "stop": _open_gap("open the gap and latch; waits until it is open; needs clear-fault"),
+    "stop": _open_gap("open the gap and latch; waits until it is open; latched until arm"),
     "clear-fault": _operate("forget latched faults; stays disabled"),
     "take": Command(
         "give the brake to another source; the force goes to its setpoints along a ramp",

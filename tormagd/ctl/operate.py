@@ -1,11 +1,12 @@
-"""The commands that change what the device does: enable, disable, pause, resume, stop, clear-fault, take, confirm,
-home."""
+"""The commands that change what the device does: arm, enable, disable, pause, resume, stop, clear-fault, take,
+confirm, home."""
 
 import sys
 import time
 from collections.abc import Iterator
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
+from tormagd.output import write_line
 from tormagd_client.blocking import Client
 from tormagd_client.messages import Explained, Status
 
@@ -18,9 +19,9 @@ DONE: dict[str, tuple[str, tuple[str, ...]]] = {
     "disable": ("disabled; the gap opens", ("DISABLED",)),
     "pause": ("paused; the gap is held", ("PAUSED",)),
     "resume": ("resumed", ("ENABLED",)),
-    "stop": ("stopped and latched; the gap opens. tormagctl clear-fault when it is safe to go on", ("FAULT",)),
+    "stop": ("stopped and latched; the gap opens. tormagctl arm when it is safe to go on", ("FAULT",)),
     # while nothing is latched there is nothing to clear
-    "clear-fault": ("fault cleared. tormagctl home, then enable", ("DISABLED", "ENABLED", "PAUSED")),
+    "clear-fault": ("fault cleared. next: tormagctl arm", ("DISABLED", "ENABLED", "PAUSED")),
 }
 "What a command has done, and the operating states after it was."
 STOPPED_WITHOUT_DEVICE = (
@@ -29,12 +30,29 @@ STOPPED_WITHOUT_DEVICE = (
 )
 IS_OPEN = {
     "disable": "disabled; the gap is open",
-    "stop": "stopped and latched; the gap is open. tormagctl clear-fault when it is safe to go on",
+    "stop": "stopped and latched; the gap is open. tormagctl arm when it is safe to go on",
 }
 STAYED_SHUT = ("NOT_OPENING", "DEVICE_RETRACT_FAILED")
 "The faults that say of a gap that it does not open."
 COMES_BACK_S = 0.6
 "So long the daemon waits for the device to say that a fault is gone (CLEARING_S), and then calls it a fault again."
+
+
+def arm(client: Client, timeout_s: float) -> Outcome:
+    """Have the daemon clear, home and enable, as far as that is needed, and say each step on stderr.
+
+    Raises CommandError as `operate` does. Ctrl-C takes the word back: the gap opens.
+    """
+    begun_s = time.monotonic()
+    given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
+    known = client.status()
+    if known.operating_state != "ENABLED":
+        raise _not_done(f"it was armed, and is {known.operating_state}")
+    seconds = round(time.monotonic() - begun_s, 2)
+    to = "F_min, and to a publisher's" if known.setpoint_cf is None else f"{known.setpoint_cf:.2f} N"
+    text = f"armed in {seconds:.1f} s; the force goes to {to} along the scene's ramp"
+    result = {"operating_state": known.operating_state, "given": list(given), "seconds": seconds}
+    return Outcome(result, text if given else "it was armed already")
 
 
 def operate(client: Client, command: str) -> Outcome:
@@ -171,5 +189,5 @@ def require_no_fault(state: Status, what: str) -> None:
         Exit.FAULT,
         "fault",
         f"{what}: {', '.join(state.faults) or first.code}: {first.cause}",
-        first.remedy or "tormagctl clear-fault, then home",
+        first.remedy or "tormagctl arm",
     )

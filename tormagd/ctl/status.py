@@ -55,7 +55,7 @@ def status_text(known: Status, colour: Colour) -> str:
         f"state     {paint(state)}, {', '.join(flags)}",
         *_codes(known.faults, known.fault_details, "fault", colour.red),
         # without a device none of them is taken: the link says what comes first
-        *([f"next      {', '.join(known.next_commands)}"] if known.next_commands and is_running else []),
+        *([f"next      tormagctl arm: {', '.join(known.next_commands)}"] if known.next_commands and is_running else []),
         *_codes(known.limits, known.limit_details, "held by", colour.yellow),
         f"force     asked {_number(known.setpoint_cf, 'N')}{_long_ago(known)}, "
         f"governed {_number(known.governed_cf, 'N')}, measured {_number(known.measured_cf, 'N')}"

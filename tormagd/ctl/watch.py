@@ -64,12 +64,11 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
     """
     require_no_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
-        enable = f"{'' if status.is_homed else 'tormagctl home, then '}tormagctl enable"
         return CommandError(
             Exit.REFUSED,
             status.operating_state.lower(),
             f"the device is {status.operating_state}",
-            "tormagctl resume" if status.operating_state == "PAUSED" else enable,
+            "tormagctl resume" if status.operating_state == "PAUSED" else "tormagctl arm",
         )
     report = status.setpoints.by_source.get(source)
     why = {each.code: each for each in status.limit_details}

@@ -6,6 +6,7 @@ import time
 from tormagd.assembly.journal import Journal
 from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
+from tormagd.daemon.arming import Arming
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
@@ -26,6 +27,8 @@ class ControlLoop:
         self.measurement: Measurement | None = None
         "What the last step was given, as `used`; None before the first."
         self.timing = RateGroup("control", period_ns)
+        self.arming: Arming | None = None
+        "What the newest `arm` has done; None before the first."
         self._known_faults: tuple[Fault, ...] = ()
 
     def drive(self, beat: Beat, plan: Plan) -> None:
@@ -41,7 +44,29 @@ class ControlLoop:
         self.timing.record(beat.due_ns, beat.start_ns, time.monotonic_ns(), beat.merged)
 
     def command(self, name: str, conditions: Conditions) -> None:
-        """An operator's command. Raises RefusedError."""
+        """An operator's command, which ends an arming that is under way. Raises RefusedError."""
+        if self.arming is not None:
+            self.arming.end(RefusedError("overtaken", f"{name} came before it was armed", "tormagctl arm"))
+        self._give(name, conditions)
+
+    def arm(self, conditions: Conditions) -> None:
+        """Begins to arm, unless that is under way. Raises RefusedError where it ends at once."""
+        if self.arming is None or self.arming.is_over:
+            self.arming = Arming(time.monotonic(), self.stepper.safety.faults)
+        self.go_on_arming(conditions)
+        if self.arming.refusal is not None:
+            raise self.arming.refusal
+
+    def go_on_arming(self, conditions: Conditions) -> None:
+        """Gives the next command of an arming that is under way, if its time has come."""
+        arming = self.arming
+        if arming is None or arming.is_over:
+            return
+        arming.advance(time.monotonic(), self.stepper.safety, conditions, lambda name: self._give(name, conditions))
+        if arming.refusal is not None:
+            log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
+
+    def _give(self, name: str, conditions: Conditions) -> None:
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
             self.stepper.command(name, now_s, conditions)

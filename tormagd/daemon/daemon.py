@@ -171,7 +171,8 @@ class Daemon:
     def _plan(self, beat: Beat) -> None:
         # before the step: a setpoint is driven in the beat that takes it
         is_asked = self._endpoint.take_setpoints()
-        self._inference.plan(beat, self._control.stepper.measured, is_asked=is_asked)
+        stepper = self._control.stepper
+        self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
 
     def _drive(self, beat: Beat) -> None:
         control, timing = self._control, self._control.timing

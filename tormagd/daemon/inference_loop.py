@@ -52,14 +52,15 @@ class InferenceLoop:
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 
-    def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool) -> None:
-        """Plans if a setpoint has come (`is_asked`) or a plan is due. `measured` is what the last step measured."""
+    def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
+        """Plans if a setpoint has come (`is_asked`) or a plan is due. `measured` is what the last step measured,
+        `is_followed` whether it followed the plan."""
         period_ns = self.timing.period_ns
         # by when beats are due, not by when they begin: lateness takes nothing from the rate
         if not is_asked and beat.due_ns < self._due_ns:
             return
         start_ns = self._clock_ns()
-        self._make_plan(start_ns * 1e-9, measured)
+        self._make_plan(start_ns * 1e-9, measured, is_followed)
         self.timing.record(beat.due_ns, start_ns, self._clock_ns())
         # what was missed is not made up for
         is_regular = not is_asked and beat.due_ns - self._due_ns < period_ns
@@ -76,7 +77,7 @@ class InferenceLoop:
             self._journal.foresaw()
         return is_made
 
-    def _make_plan(self, now_s: float, measured: Measured | None) -> None:
+    def _make_plan(self, now_s: float, measured: Measured | None, is_followed: bool) -> None:
         setpoint, beside = self._inbox.newest, self.beside
         answer = None if beside is None else beside.answer()
         if answer is not None:
@@ -84,7 +85,7 @@ class InferenceLoop:
             self.planner.answered(answer)
         self._journal.planned(now_s, setpoint)
         try:
-            self.planner.plan(now_s, setpoint, measured)
+            self.planner.plan(now_s, setpoint, measured, is_followed)
         except PLAN_ERRORS as error:
             self._begin_afresh(now_s, error)
         if beside is not None:

@@ -69,7 +69,7 @@ def status_line(
         return f"{told}; waiting for the device ({link}): {why}"
     if faults:
         return f"{told}; next: tormagctl status"
-    return told if is_homed else f"{told}; next: tormagctl home"
+    return told if is_homed else f"{told}; next: tormagctl arm"
 
 
 def notify(message: str) -> bool:

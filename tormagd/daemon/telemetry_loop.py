@@ -33,8 +33,10 @@ from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd_client.messages import (
+    ArmReport,
     Description,
     DeviceReport,
+    Explained,
     OutputReport,
     PortraitReport,
     Request,
@@ -164,6 +166,7 @@ class TelemetryLoop:
         self._endpoint.inbox.tell(now_s)
         self._box.look()
         self._tell_service(now_s, self._is_homed())
+        self._control.go_on_arming(self.conditions())
         self._endpoint.tell(now_s)
         self._phases.tell()
         return True
@@ -186,15 +189,9 @@ class TelemetryLoop:
 
     def conditions(self) -> Conditions:
         """What a command is decided on now."""
+        control, doubted = self._control, self._inference.planner.believe.sensor.is_doubted
         return conditions(
-            time.monotonic(),
-            self.config,
-            self._connection,
-            self._control.stepper,
-            self._control.output,
-            self._endpoint.inbox.newest,
-            self._inference.planner.believe.min_N,
-            sensor_doubted=self._inference.planner.believe.sensor.is_doubted,
+            time.monotonic(), self.config, self._connection, control.stepper, control.output, sensor_doubted=doubted
         )
 
     def is_busy(self) -> bool:
@@ -240,7 +237,7 @@ class TelemetryLoop:
         )
         for message in service.news(now_s, is_alive, link, status):
             if message == READY:
-                log.info("ready: the device is identified; next: %s", "enable" if is_homed_ else "home")
+                log.info("ready: the device is identified; next: tormagctl arm")
             notify(message)
 
     def _in_turn(self) -> Iterator[Histogram]:
@@ -287,7 +284,10 @@ class TelemetryLoop:
             return self._confirm(request.args.get("what"))
         if request.command == "blackbox":
             return {"file": str(self.keep("REQUEST", 0.0))}
-        self._control.command(request.command, self.conditions())
+        if request.command == "arm":
+            self._control.arm(self.conditions())
+        else:
+            self._control.command(request.command, self.conditions())
         return {
             "operating_state": str(self._control.stepper.safety.operating_state),
             # without a device nothing moves yet: a request to open is kept for it, and no other is taken
@@ -364,9 +364,18 @@ class TelemetryLoop:
             not_granted=self._not_granted,
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, is_homed_))),
+            arm=self._arm_report(),
             is_open=self.is_open(),
             following=self._following.report(),
         )
+
+    def _arm_report(self) -> ArmReport | None:
+        arming = self._control.arming
+        if arming is None:
+            return None
+        why = arming.refusal
+        ended = None if why is None else Explained(why.code, why.message, why.hint)
+        return ArmReport(given=arming.given, is_over=arming.is_over, error=ended)
 
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:
         """The reports that take most of a status' time: made anew every TELL_S, after a command, and when the link

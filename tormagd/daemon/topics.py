@@ -75,14 +75,14 @@ class Topics:
 
     def _judge(self) -> Judged:
         planner, stepper, core = self._inference.planner, self._control.stepper, self._core
-        measured, believe = stepper.measured, planner.believe
+        measured, believe, force = stepper.measured, planner.believe, core.scene.force
         return judged(
             planner.planned,
             stepper.safety.operating_state,
             measured.gap_mm if measured is not None and measured.is_homed else None,
             core.portrait,
             believe.device,
-            Carriages(core.gap_speed_mm_s, believe.carriages.lag_s, core.scene.force.tolerance_rms_N),
+            Carriages(core.gap_speed_mm_s, believe.carriages.lag_s, force.tolerance_rms_N, force.release_N_s),
         )
 
     @staticmethod

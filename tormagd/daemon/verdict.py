@@ -26,11 +26,12 @@ class Judged(NamedTuple):
 
 
 class Carriages(NamedTuple):
-    """How fast the gap moves, how late its motion begins, and what the scene tolerates."""
+    """How fast the gap moves, how late its motion begins, what the scene tolerates, and its ramp."""
 
     gap_speed_mm_s: float
     lag_s: float
     tolerance_N: float
+    release_N_s: float
 
 
 def judged(
@@ -55,8 +56,10 @@ def judged(
         return Judged(RENDERED, 0.0)
     if why := tuple(str(limit) for limit in plan.limits if _holds(limit, plan, aim_mm)):
         return Judged(CANNOT, None, why)
-    arrives_s = abs(aim_mm - gap_mm) / carriages.gap_speed_mm_s + carriages.lag_s
-    return Judged(ARRIVES, round(1e3 * arrives_s, 1))
+    moves_s = abs(aim_mm - gap_mm) / carriages.gap_speed_mm_s
+    if Limit.TAKEOVER in plan.limits:
+        moves_s = max(moves_s, abs(asked_N - plan.governed_N) / carriages.release_N_s)
+    return Judged(ARRIVES, round(1e3 * (moves_s + carriages.lag_s), 1))
 
 
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:

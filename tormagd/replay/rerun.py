@@ -218,7 +218,7 @@ class _Running:
             case journal.PLAN:
                 now_s, timed = planned_for(entry)
                 try:
-                    self._planner.plan(now_s, timed, self._stepper.measured)
+                    self._planner.plan(now_s, timed, self._stepper.measured, self._stepper.is_followed)
                 except PLAN_ERRORS as error:
                     self._failure = error
             case journal.FORESEE:

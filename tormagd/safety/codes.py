@@ -120,11 +120,11 @@ class Limit(StrEnum):
 
 FAULTS: dict[Fault, Explanation] = {
     Fault.STOPPED: Explanation(
-        "somebody gave the stop command", "clear-fault when it is safe to go on", Reaction.OPENING, 100.0, "at once"
+        "somebody gave the stop command", "tormagctl arm when it is safe to go on", Reaction.OPENING, 100.0, "at once"
     ),
     Fault.HOST_STALL: Explanation(
         "the control loop stood still for longer than the device waits, and the device opened the gap by itself",
-        "run `tormagctl doctor`; look for load on this machine; then clear-fault and home",
+        "run `tormagctl doctor`; look for load on this machine; then `tormagctl arm`",
         Reaction.OPENING,
         51.0,
         "once the loop runs again; the device opens before that",
@@ -132,7 +132,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.LINK_LOST: Explanation(
         "the device stopped answering or its port disappeared",
-        "check cable and supply; the device opens by itself; then clear-fault and home",
+        "check cable and supply; the device opens by itself; then `tormagctl arm`",
         Reaction.OPENING,
         51.0,
         "at once; the device opens by itself, the daemon knows after 80 ms",
@@ -140,14 +140,14 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.PLAN_FAILED: Explanation(
         "no gap could be planned: model or search refused a number, or a slow search is late",
-        "report the daemon's log, or choose a faster solver; clear-fault",
+        "report the daemon's log, or choose a faster solver; `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "at once",
     ),
     Fault.NOT_FINITE: Explanation(
         "a number in the loop was not finite",
-        "keep the recording and report it; clear-fault starts afresh",
+        "keep the recording and report it; `tormagctl arm` starts afresh",
         Reaction.OPENING,
         100.0,
         "at once",
@@ -178,7 +178,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_TEMPERATURE: Explanation(
         "the device is too hot",
-        "let it cool down, then clear-fault",
+        "let it cool down, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "at once",
@@ -186,7 +186,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_COMMAND_TIMEOUT: Explanation(
         "the device heard no valid drive command in time and opened the gap",
-        "clear-fault, then home",
+        "tormagctl arm",
         Reaction.OPENING,
         51.0,
         "at once",
@@ -194,7 +194,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_OVERCURRENT: Explanation(
         "a motor drew more current than allowed",
-        "look for a blocked carriage, then clear-fault and home",
+        "look for a blocked carriage, then `tormagctl arm`",
         Reaction.OPENING,
         500.0,
         "while a blocked carriage is driven",
@@ -202,7 +202,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_END_STOP: Explanation(
         "a carriage reached its closed end stop",
-        "clear-fault, then home",
+        "tormagctl arm",
         Reaction.OPENING,
         100.0,
         "at once",
@@ -210,7 +210,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_SKEW: Explanation(
         "the device saw its carriages apart",
-        "look for a blocked carriage, then home",
+        "look for a blocked carriage, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "at once",
@@ -226,7 +226,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_HOMING_FAILED: Explanation(
         "a home switch was not found in time",
-        "check the switches and the screws, then clear-fault and home",
+        "check the switches and the screws, then `tormagctl arm`",
         Reaction.HELD,
         12000.0,
         "while it homes",
@@ -242,7 +242,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.HOMING: Explanation(
         "homing took too long, or ended without having found both switches",
-        "check the open switches and the screws, then clear-fault and home",
+        "check the open switches and the screws, then `tormagctl arm`",
         Reaction.OPENING,
         12100.0,
         "while it homes",
@@ -250,7 +250,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.ENCODER: Explanation(
         "an encoder moved faster than any motor can: it has lost or invented counts",
-        "check the encoder's cable and screen, then clear-fault and home",
+        "check the encoder's cable and screen, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "at once",
@@ -259,7 +259,7 @@ FAULTS: dict[Fault, Explanation] = {
     Fault.OUT_OF_STROKE: Explanation(
         "a homed carriage reads a position where none can be, or one far from its open switch while that is closed: "
         "counts were lost, homing found a wrong zero, or the switch is stuck",
-        "check switches and encoders, then clear-fault and home",
+        "check switches and encoders, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "at once",
@@ -267,21 +267,21 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.MEASUREMENT_STALE: Explanation(
         "the device fell silent, or its states came too late to close the loop",
-        "check cable and supply, and the round trip in `tormagctl firmware`; then clear-fault",
+        "check cable and supply, and the round trip in `tormagctl firmware`; then `tormagctl arm`",
         Reaction.OPENING,
         52.0,
         "at once; 50 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.SENSE_STALE: Explanation(
         "the device sends no Sense any more: force and handle are not measured, and the scene needs them",
-        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
+        "look at the firmware and at `refused` in `tormagctl firmware`; then `tormagctl arm`",
         Reaction.OPENING,
         102.0,
         "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.STATUS_STALE: Explanation(
         "the device sends no Status any more: its faults, switches and supply are not known",
-        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
+        "look at the firmware and at `refused` in `tormagctl firmware`; then `tormagctl arm`",
         Reaction.OPENING,
         102.0,
         "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
@@ -289,21 +289,21 @@ FAULTS: dict[Fault, Explanation] = {
     Fault.LINK_DEGRADED: Explanation(
         "the answers of the device come so late that the position loop would swing",
         "look at the round trip in `tormagctl firmware`: a USB adapter's latency timer (`tormagctl doctor`), a hub, "
-        "a full bus; then clear-fault",
+        "a full bus; then `tormagctl arm`",
         Reaction.OPENING,
         500.0,
         "over some round trips",
     ),
     Fault.CLOCK: Explanation(
         "the device's clock runs far too fast or too slow, or stands: no speed and no timeout of its is what it says",
-        "check the firmware's timer and its clock source; then clear-fault",
+        "check the firmware's timer and its clock source; then `tormagctl arm`",
         Reaction.OPENING,
         4000.0,
         "over some seconds",
     ),
     Fault.SKEW: Explanation(
         "the two carriages moved apart from each other",
-        "look for dirt or wear on the slower screw, then clear-fault and home",
+        "look for dirt or wear on the slower screw, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "while a carriage moves",
@@ -311,7 +311,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.FOLLOWING_ERROR: Explanation(
         "the gap did not follow its reference",
-        "look for something that blocks a carriage, then clear-fault and home",
+        "look for something that blocks a carriage, then `tormagctl arm`",
         Reaction.OPENING,
         1000.0,
         "while the gap is to move",
@@ -319,21 +319,21 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.OVER_FORCE: Explanation(
         "the measured force stayed over what the scene allows; the gap opens at the device's own bounded speed",
-        "compare force sensor and gap: is it the insert and the model that the scene names? Then clear-fault, home",
+        "compare force sensor and gap: is it the insert and the model that the scene names? Then `tormagctl arm`",
         Reaction.OPENING,
         150.0,
         "while the handle moves",
     ),
     Fault.SENSOR: Explanation(
         "the force sensor reads what no believable device gives at this gap, and the scene needs it",
-        "check sensor, cable and zero, and that the insert is the scene's; then clear-fault",
+        "check sensor, cable and zero, and that the insert is the scene's; then `tormagctl arm`",
         Reaction.OPENING,
         3000.0,
         "over 2 s of sliding",
     ),
     Fault.NO_MOTION: Explanation(
         "a carriage away from its open end was driven and its encoder did not move",
-        "look for a block or a loose encoder, then clear-fault and home",
+        "look for a block or a loose encoder, then `tormagctl arm`",
         Reaction.OPENING,
         250.0,
         "while a carriage is driven: 60 ms of a duty that moves one, which takes a following error to come about",
@@ -341,7 +341,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.NOT_OPENING: Explanation(
         "the gap is to be open, and a carriage did not begin, stopped, went back or was slower than the device says",
-        "the insert still brakes: remove it by hand; check screws, motors and supply, then clear-fault and home",
+        "the insert still brakes: remove it by hand; check screws, motors and supply, then `tormagctl arm`",
         Reaction.HELD,
         500.0,
         "while it is to be open",
@@ -349,7 +349,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_NOT_RUNNING: Explanation(
         "the device stopped taking drive commands by itself, as after a reset",
-        "check its supply; clear-fault, home",
+        "check its supply; `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "at once",
@@ -380,7 +380,7 @@ LIMITS: dict[Limit, Explanation] = {
         "at once",
     ),
     Limit.TAKEOVER: Explanation(
-        "the brake has passed to another publisher; the force goes to what it asks for along a ramp",
+        "the force goes along a ramp to what is asked: it followed nobody before, or another publisher",
         "wait a moment",
         Reaction.LIMITED,
         100.0,

@@ -87,8 +87,6 @@ class Conditions(Value):
         homed: bool,
         busy: bool,
         device_latched: bool,
-        requested_N: float | None,
-        neutral_N: float,
         sensor_doubted: bool = False,
         cause: str = "",
         remedy: str = "",
@@ -104,8 +102,6 @@ class Conditions(Value):
         self.homed: Final = homed
         self.busy: Final = busy
         self.device_latched: Final = device_latched
-        self.requested_N: Final = requested_N
-        self.neutral_N: Final = neutral_N
         self.sensor_doubted: Final = sensor_doubted
         self.cause: Final = cause
         "What keeps the device from being connected or its measurements from being fresh; empty where nothing does."
@@ -217,12 +213,6 @@ def _doubted(state: SafetyState, present: Conditions) -> str:
     return "the force sensor reads what no believable device gives with its gap open" if present.sensor_doubted else ""
 
 
-def _loaded(state: SafetyState, present: Conditions) -> str:
-    if present.requested_N is None or present.requested_N <= present.neutral_N:  # NaN is not neutral
-        return ""
-    return f"the setpoint is {present.requested_N:.2f} N: allowed is at most {present.neutral_N:.2f} N"
-
-
 def _apart(state: SafetyState, present: Conditions) -> str:
     if present.apart_mm <= present.most_apart_mm:
         return ""
@@ -254,22 +244,16 @@ NOT_BUSY = Guard("busy", "the device neither homes nor opens", _busy, "wait unti
 HOMABLE = Guard("device_latched", "the device has latched nothing", _latched, "tormagctl clear-fault")
 READY: tuple[Guard, ...] = (
     CONNECTED,
-    Guard("device_latched", "the device has latched nothing", _latched, "tormagctl clear-fault, then home"),
+    Guard("device_latched", "the device has latched nothing", _latched, "tormagctl arm"),
     NOT_BUSY,
-    Guard("not_homed", "it has homed since the last fault that took positions away", _lost, "tormagctl home"),
-    Guard("not_homed", "the device is homed", _unhomed, "tormagctl home"),
+    Guard("not_homed", "it has homed since the last fault that took positions away", _lost, "tormagctl arm"),
+    Guard("not_homed", "the device is homed", _unhomed, "tormagctl arm"),
     Guard("not_fresh", "State, Sense and Status are fresh", _stale, "look at the link in tormagctl status"),
     Guard(
         "sensor_doubted",
         "the force sensor is believed",
         _doubted,
         "check sensor, cable and zero, then turn the handle for a second: it is judged while friction slides",
-    ),
-    Guard(
-        "not_neutral",
-        "the setpoint, where there is one, is at most F_min + `limits.neutral_margin_N`",
-        _loaded,
-        "lower the setpoint, enable, then raise it",
     ),
     Guard("skewed", "the carriages are no further apart than `limits.skew_fault_mm`", _apart, "tormagctl home"),
     Guard(
@@ -299,21 +283,21 @@ _OPENS = "the device is asked to open the gap"
 _CLEARED = "faults are cleared; nothing moves"
 _UNLATCHED = "no fault is latched here, and the device's own is cleared; nothing moves"
 ROWS: tuple[Transition | Refusal, ...] = (
-    Transition(Event.ENABLE, DISABLED, ENABLED, "the force follows the setpoint from here", READY),
+    Transition(Event.ENABLE, DISABLED, ENABLED, "the force goes to the setpoint along a ramp", READY),
     Refusal(Event.ENABLE, ENABLED, "already_enabled", NOTHING_TO_DO),
     Refusal(Event.ENABLE, PAUSED, "already_enabled", "tormagctl resume"),
-    Refusal(Event.ENABLE, FAULTED, "fault", CLEAR_FIRST),
+    Refusal(Event.ENABLE, FAULTED, "fault", "tormagctl arm"),
     Transition(Event.DISABLE, DISABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
     Transition(Event.DISABLE, ENABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
     Transition(Event.DISABLE, PAUSED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
     Refusal(Event.DISABLE, FAULTED, "fault", CLEAR_FIRST),
-    Refusal(Event.PAUSE, DISABLED, "not_enabled", "tormagctl enable"),
+    Refusal(Event.PAUSE, DISABLED, "not_enabled", "tormagctl arm"),
     Transition(Event.PAUSE, ENABLED, PAUSED, "the gap is held where it is", (CONNECTED,)),
     Refusal(Event.PAUSE, PAUSED, "not_enabled", NOTHING_TO_DO),
     Refusal(Event.PAUSE, FAULTED, "fault", CLEAR_FIRST),
-    Refusal(Event.RESUME, DISABLED, "not_paused", "tormagctl enable"),
+    Refusal(Event.RESUME, DISABLED, "not_paused", "tormagctl arm"),
     Refusal(Event.RESUME, ENABLED, "not_paused", NOTHING_TO_DO),
-    Transition(Event.RESUME, PAUSED, ENABLED, "the force follows the setpoint again", (CONNECTED,)),
+    Transition(Event.RESUME, PAUSED, ENABLED, "the force goes to the setpoint along a ramp", (CONNECTED,)),
     Refusal(Event.RESUME, FAULTED, "fault", CLEAR_FIRST),
     Transition(
         Event.HOME,
@@ -384,10 +368,10 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
     row = TRANSITIONS[event, state.operating_state]
     if isinstance(row, Refusal):
         if not conditions.connected:  # a missing device is told first, whatever else is in the way
-            _ask(CONNECTED, state, conditions)
+            require(CONNECTED, state, conditions)
         raise RefusedError(row.code, _refused(row, state), row.remedy)
     for guard in row.guards:
-        _ask(guard, state, conditions)
+        require(guard, state, conditions)
     if event is Event.STOP:
         return latch(state, (Fault.STOPPED,))
     request = row.request
@@ -400,6 +384,14 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
         elif request is DeviceRequest.CLEAR:
             state = state.replaced(clearing_until_s=now_s + CLEARING_S)
     return _taken(state, row.target, request)
+
+
+def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
+    """Raise RefusedError where `guard` does not hold."""
+    message = guard.refuses(state, conditions)
+    if message:
+        is_told_better = guard is CONNECTED and conditions.remedy
+        raise RefusedError(guard.code, message, conditions.remedy if is_told_better else guard.remedy)
 
 
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
@@ -441,14 +433,6 @@ def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -
     """
     after = state.replaced(operating_state=target)
     return after if request is DeviceRequest.NONE else after.ask(request)
-
-
-def _ask(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
-    """Raise RefusedError where the guard does not hold; the connection's own remedy replaces CONNECTED's."""
-    message = guard.refuses(state, conditions)
-    if message:
-        is_told_better = guard is CONNECTED and conditions.remedy
-        raise RefusedError(guard.code, message, conditions.remedy if is_told_better else guard.remedy)
 
 
 def _refused(row: Refusal, state: SafetyState) -> str:

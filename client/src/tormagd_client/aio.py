@@ -1,8 +1,9 @@
 """The client of `tormagd_client.blocking` for asyncio: other tasks run while a call waits."""
 
 import asyncio
+import contextlib
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from types import TracebackType
 from typing import Any, Self
 
@@ -11,11 +12,12 @@ import zmq.asyncio
 
 from tormagd_client.blocking import RETRY_S
 from tormagd_client.endpoints import Endpoints
-from tormagd_client.errors import RefusedError
+from tormagd_client.errors import ClientError, RefusedError
 from tormagd_client.messages import (
     MOTION_TOPIC,
     TELEMETRY_TOPIC,
     VERDICT_TOPIC,
+    ArmReport,
     Description,
     Motion,
     Status,
@@ -24,11 +26,12 @@ from tormagd_client.messages import (
     decode,
 )
 from tormagd_client.wire import (
-    NOT_YET,
     SUBSCRIBED,
     Connections,
     Told,
     answered,
+    arm_report,
+    armed,
     asked,
     understood,
 )
@@ -62,21 +65,25 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         """Return what the daemon runs: configuration, scene, model, device. Raises as `request`."""
         return understood(await self.request("describe"), Description)
 
-    async def arm(self, timeout_s: float = 30.0) -> None:
-        """Home both carriages and enable; whoever holds the handle has to know. Raises as `request`.
-
-        A command that is refused for the moment is repeated for at most `timeout_s`.
-        """
-        until_s = asyncio.get_running_loop().time() + timeout_s
-        for command in ("home", "enable"):
-            while True:
-                try:
-                    await self.request(command)
-                    break
-                except RefusedError as error:
-                    if error.code not in NOT_YET or asyncio.get_running_loop().time() > until_s:
-                        raise
-                await asyncio.sleep(RETRY_S)
+    async def arm(
+        self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None
+    ) -> tuple[str, ...]:
+        """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know."""
+        until_s, report = asyncio.get_running_loop().time() + timeout_s, ArmReport(given=(), is_over=False)
+        await self.request("arm")
+        try:
+            while not report.is_over:
+                if asyncio.get_running_loop().time() > until_s:
+                    raise RefusedError("arm", "timeout", f"not armed within {timeout_s:g} s", "tormagctl status")
+                before, report = report, arm_report(await self.request("status"))
+                for command in report.given[len(before.given) :]:
+                    told(command)
+                await asyncio.sleep(0.0 if report.is_over else RETRY_S)
+        finally:
+            if not report.is_over:
+                with contextlib.suppress(ClientError):
+                    await self.request("disable")
+        return armed(report)
 
     async def publish(
         self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any

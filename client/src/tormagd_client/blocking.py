@@ -3,16 +3,18 @@
 import contextlib
 import math
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
 import zmq
 
-from tormagd_client.errors import RefusedError
+from tormagd_client.errors import ClientError, RefusedError
 from tormagd_client.messages import (
     MOTION_TOPIC,
     TELEMETRY_TOPIC,
     VERDICT_TOPIC,
+    ArmReport,
     Description,
     Motion,
     Status,
@@ -21,12 +23,13 @@ from tormagd_client.messages import (
     decode,
 )
 from tormagd_client.wire import (
-    NOT_YET,
     SUBSCRIBED,
     Connections,
     Pending,
     Told,
     answered,
+    arm_report,
+    armed,
     asked,
     understood,
 )
@@ -85,21 +88,27 @@ class Client(Connections["zmq.Socket[bytes]"]):
         """Return what the daemon runs: configuration, scene, model, device. Raises as `request`."""
         return understood(self.request("describe"), Description)
 
-    def arm(self, timeout_s: float = 30.0) -> None:
-        """Home both carriages and enable; whoever holds the handle has to know. Raises as `request`.
+    def arm(self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None) -> tuple[str, ...]:
+        """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know.
 
-        A command that is refused for the moment is repeated for at most `timeout_s`.
+        `told` hears each command as it is given; all are returned. Where the wait ends before, by `timeout_s` or an
+        interrupt, the daemon is told to disable. Raises as `request`.
         """
-        until_s = time.monotonic() + timeout_s
-        for command in ("home", "enable"):
-            while True:
-                try:
-                    self.request(command)
-                    break
-                except RefusedError as error:
-                    if error.code not in NOT_YET or time.monotonic() > until_s:
-                        raise
-                time.sleep(RETRY_S)
+        until_s, report = time.monotonic() + timeout_s, ArmReport(given=(), is_over=False)
+        self.request("arm")
+        try:
+            while not report.is_over:
+                if time.monotonic() > until_s:
+                    raise RefusedError("arm", "timeout", f"not armed within {timeout_s:g} s", "tormagctl status")
+                before, report = report, arm_report(self.request("status"))
+                for command in report.given[len(before.given) :]:
+                    told(command)
+                time.sleep(0.0 if report.is_over else RETRY_S)
+        finally:
+            if not report.is_over:
+                with contextlib.suppress(ClientError):
+                    self.request("disable")
+        return armed(report)
 
     def publish(self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any) -> None:
         """Ask for a force at the roller, meant at `stamp_ns`, CLOCK_REALTIME, now by default.

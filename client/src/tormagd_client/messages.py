@@ -414,6 +414,15 @@ class FollowingReport(msgspec.Struct, frozen=True, kw_only=True):
     delay_ms: float
 
 
+class ArmReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The newest `arm`: the commands that it has given so far, whether it is over, and why the force does not follow
+    then."""
+
+    given: tuple[str, ...]
+    is_over: bool
+    error: Explained | None = None
+
+
 class Status(Telemetry, frozen=True, kw_only=True):
     """Answer to the command `status`: the newest telemetry, and all else that is told only on demand."""
 
@@ -447,6 +456,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     next_commands: tuple[str, ...] = ()
     is_open: bool | None = None
     following: FollowingReport | None = None
+    arm: ArmReport | None = None
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):

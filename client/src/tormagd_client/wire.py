@@ -15,8 +15,10 @@ from tormagd_client.errors import InFaultError, RefusedError, SettingError, Unre
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
+    ArmReport,
     Contact,
     Description,
+    Explained,
     MessageError,
     Motion,
     Reply,
@@ -30,14 +32,12 @@ from tormagd_client.messages import (
 )
 from tormagd_client.printable import printable
 
-T = TypeVar("T", Status, Description)
+T = TypeVar("T", Status, Description, ArmReport)
 Told = TypeVar("Told", Telemetry, Motion, Verdict)
 SocketT = TypeVar("SocketT", bound="zmq.Socket[Any]")
 
 FAULT_CODES = ("fault", "device_latched")
 "Refusals that mean: the device is in FAULT."
-NOT_YET = ("busy", "not_homed", "not_fresh")
-"Refusals of `enable` that end by themselves, once homing is over and the newest measurement is fresh."
 
 SUBSCRIBED = b"\x01"
 "First byte of what an XPUB socket receives when somebody subscribes; 0 when the last subscriber has gone."
@@ -140,8 +140,7 @@ def answered(data: bytes, pending: Pending) -> dict[str, Any] | None:
     if reply.id not in (pending.number, None):
         return None
     if reply.error is not None:
-        kind = InFaultError if reply.error.code in FAULT_CODES else RefusedError
-        raise kind(pending.command, reply.error.code, reply.error.message, reply.error.hint)
+        raise refused(pending.command, reply.error.code, reply.error.message, reply.error.hint)
     return reply.result or {}
 
 
@@ -159,6 +158,27 @@ def understood(result: dict[str, Any], kind: type[T]) -> T:
             f"tormagctl {__version__} knows: {error}",
             "install tormagd and tormagctl of the same version, and start the daemon again",
         ) from error
+
+
+def arm_report(status: dict[str, Any]) -> ArmReport:
+    """How far an `arm` has come, in an answer to `status`. Raises as `understood`."""
+    told = status.get("arm")
+    if told is None:
+        return ArmReport(given=(), is_over=True, error=Explained("gone", "the daemon was started anew", "arm again"))
+    return understood(told, ArmReport)
+
+
+def armed(report: ArmReport) -> tuple[str, ...]:
+    """The commands that an `arm` has given. Raises RefusedError or InFaultError where the force does not follow."""
+    if (error := report.error) is not None:
+        raise refused("arm", error.code, error.cause, error.remedy)
+    return report.given
+
+
+def refused(command: str, code: str, message: str, hint: str) -> RefusedError:
+    """What a client raises for this refusal."""
+    kind = InFaultError if code in FAULT_CODES else RefusedError
+    return kind(command, code, message, hint)
 
 
 def _printable(value: Any) -> Any:

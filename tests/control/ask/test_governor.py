@@ -196,7 +196,6 @@ def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
         now_s += elapsed_s
         before_N = following.asked_N
         ask = decide(following, now_s, TimedSetpoint(0.5 + 0.5 * holder, now_s - age_s, VALID_S, holder=holder))
-        # a first publisher takes over from nobody, and one that comes back says itself what it wants
         if following.is_passing or Limit.STALE in ask.limits:
             assert before_N - following.asked_N <= SCENE.release_N_s * elapsed_s + 1e-9
         assert following.asked_N == ask.path_N[0]
@@ -205,9 +204,23 @@ def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
 def test_a_publisher_that_comes_back_is_followed_again_without_a_slope_from_before() -> None:
     following, _ = stream_of([1.0, 1.1, 1.2])
     decide(following, 0.5, TimedSetpoint(1.2, 0.03, VALID_S))
-    ask = decide(following, 0.6, TimedSetpoint(1.5, 0.6, VALID_S))
+    ask = decide(following, 0.501, TimedSetpoint(1.5, 0.501, VALID_S))
+    assert ask.limits == (Limit.TAKEOVER,)
+    assert np.all(path_N(ask) == ask.force_N)
+    ask = decide(following, 1.2, TimedSetpoint(1.5, 1.2, VALID_S))
     assert (ask.force_N, ask.limits) == (1.5, ())
     assert np.all(path_N(ask) == 1.5)
+
+
+@pytest.mark.parametrize("asked_N", [0.8, 1.8])
+def test_from_a_gap_that_was_held_the_force_goes_along_the_ramp(asked_N: float) -> None:
+    following, _ = stream_of([1.0] * 20)
+    for tick in range(1, 30):
+        now_s = 0.2 + tick * 1e-3
+        ask = following.update(now_s, TimedSetpoint(asked_N, now_s, VALID_S), DeviceFit(), 0.0, held_N=1.3)
+        assert (ask.force_N, ask.path_N) == (1.3, [1.3] * len(PATH_S))
+    ask = decide(following, now_s + 0.01, TimedSetpoint(asked_N, now_s + 0.01, VALID_S))
+    assert ask.force_N == pytest.approx(1.3 + math.copysign(0.01 * SCENE.release_N_s, asked_N - 1.3))
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.02])

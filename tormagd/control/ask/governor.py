@@ -6,7 +6,8 @@ path      where what comes is known: the forces along the gap's path that misses
           that is EARLY_N over what is felt there
 blend     from one wall to the next or to none, at the scene's release rate beside what the handle's motion makes of it
 decay     without a setpoint, or with one that is too old: to F_min at the scene's release rate
-takeover  from one publisher's force to the next one's, at the same rate
+passing   to a publisher's forces, at the same rate: from another one's, and from where the force was while it followed
+          none, as before the first, while the gap was open or held, or after a silence
 """
 
 import math
@@ -62,7 +63,7 @@ class Governor:
     holder: int
     "Whose setpoints it followed last."
     is_passing: bool
-    "The force is on its way to those of a new holder."
+    "The force is on its way to those of its holder, along the ramp."
     sent_N: float | None
     "Where the carriages were sent, as a force; None where it is not known what comes."
     expected_N: float | None
@@ -97,14 +98,21 @@ class Governor:
         self._forget()
 
     def update(
-        self, now_s: float, setpoint: TimedSetpoint | None, device: DeviceFit, lag_s: float, travel: Travel = AT_REST
+        self,
+        now_s: float,
+        setpoint: TimedSetpoint | None,
+        device: DeviceFit,
+        lag_s: float,
+        travel: Travel = AT_REST,
+        held_N: float | None = None,
     ) -> Ask:
         """Return what is asked of `device` at `now_s`.
 
         `setpoint` is None without a publisher. `travel` is the handle's. `lag_s` is the carriages' lag: what is known
-        ahead is looked at this much further on. A setpoint that jumps is followed at once, within the scene's and the
-        device's bounds. Decay to F_min without a valid setpoint, and takeover by a new publisher, go at the scene's
-        release rate; so does what one wall asks for beside the next.
+        ahead is looked at this much further on. `held_N` is the force of a gap that follows no plan; None where it
+        does. A setpoint that jumps is followed at once, within the scene's and the device's bounds. At the scene's
+        release rate go: decay to F_min without a valid setpoint; the way to a publisher's forces, from another one's or
+        from a force that followed none; and what one wall asks for beside the next.
 
         Raises DomainError for a number that is not finite or beyond LARGEST, and for a preview without `preview_dt_s` >
         0.
@@ -112,6 +120,8 @@ class Governor:
         lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
         dt_s = max(now_s - self.time_s, 0.0)
         self.time_s = now_s
+        if held_N is not None:
+            self.asked_N, self.above_N, self.is_passing = held_N, max(held_N - lowest_N, 0.0), True
         if setpoint is None:
             return self._decay(dt_s, lowest_N, None, (Limit.NO_SETPOINT,))
         age_s = now_s - setpoint.stamp_s
@@ -150,8 +160,10 @@ class Governor:
         governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
         if self.blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N:
             limits = (*limits, Limit.RATE)
-        if self.is_passing and self._passes(path_N[0], dt_s):
-            governed_N = self.asked_N + math.copysign(self._release_N_s * dt_s, path_N[0] - self.asked_N)
+        step_N = self._release_N_s * dt_s if held_N is None else 0.0
+        self.is_passing = self.is_passing and abs(path_N[0] - self.asked_N) > step_N
+        if self.is_passing:
+            governed_N = self.asked_N + math.copysign(step_N, path_N[0] - self.asked_N)
             path_N, self.sent_N, self.expected_N = [governed_N] * len(PATH_S), None, None
             limits, foresight = (*limits, Limit.TAKEOVER), 0.0
         self.asked_N, self.above_N = path_N[0], max(path_N[0] - lowest_N, 0.0)
@@ -182,7 +194,7 @@ class Governor:
         if before_N is None and wall is not None and self.stamp_s != -math.inf and self.was_pushing:
             before_N = self.last_N
         blended_N = allowed_N
-        # a takeover has a ramp of its own, and one that withdraws is let go at once
+        # a new holder has a ramp of its own, and one that withdraws is let go at once
         if before_N is not None and travel.is_pushing and setpoint.holder == self.holder:
             moved_N = 0.0 if wall is None else wall.stiffness_N_mm * abs(place_mm - self.law_mm)
             most_N = self._release_N_s * dt_s + moved_N
@@ -293,14 +305,9 @@ class Governor:
 
     def _left_from(self, force_N: float) -> tuple[float, float]:
         """The force at the last plan, and the one that the carriages were sent to then."""
-        # what a takeover passes to is what is asked, not what the gap can make of it
+        # what the ramp leads to is what is asked, not what the gap can make of it
         from_N = force_N if self.is_passing else self.asked_N
         return from_N, from_N if self.is_passing or self.sent_N is None else self.sent_N
-
-    def _passes(self, to_N: float, dt_s: float) -> bool:
-        """Whether the force of a new holder is still further away than a takeover goes in `dt_s`."""
-        self.is_passing = abs(to_N - self.asked_N) > self._release_N_s * dt_s
-        return self.is_passing
 
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
@@ -319,7 +326,7 @@ class Governor:
     def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
         # a device that is found to make less than was believed is not asked for more above its least than it was
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
-        self.asked_N, self.above_N = lowest_N + above_N, above_N
+        self.asked_N, self.above_N, self.is_passing = lowest_N + above_N, above_N, True
         self._forget()
         return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, limits)
 

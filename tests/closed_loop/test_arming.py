@@ -1,0 +1,154 @@
+"""Arming beside a live publisher, from every state: the force goes to its setpoint along the scene's ramp."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+
+from tormagd.assembly.build import Core
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.control.records import TimedSetpoint
+from tormagd.daemon.arming import MOVES_S, PATIENCE_S, Arming
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import Conditions, OperatingState, RefusedError, SafetyState, latch
+
+ASKED_N = 1.5
+OVER_S = 0.05
+READY = Conditions(True, True, True, False, False)
+DISABLED, ENABLED, _, _ = OperatingState
+STOPPED = latch(SafetyState(), (Fault.STOPPED,))
+
+
+def live(now_s: float, force_N: float = ASKED_N) -> TimedSetpoint:
+    """A publisher's newest, 500 a second."""
+    return TimedSetpoint(force_N, now_s - now_s % 0.002, 0.1)
+
+
+def ticks(loop: ClosedLoop, duration_s: float, force_N: float | None = ASKED_N) -> list[Sample]:
+    return list(loop.run(duration_s, lambda now_s: None if force_N is None else live(now_s, force_N)))
+
+
+def arm_beside(loop: ClosedLoop) -> tuple[Arming, list[Sample]]:
+    """What came of one `arm` beside the publisher, and of the two seconds after it."""
+    arming, samples = Arming(loop.now_s, loop.stepper.safety.faults), []
+    while not arming.is_over:
+        arming.advance(loop.now_s, loop.stepper.safety, loop.conditions(), loop.command)
+        samples.append(loop.tick(live(loop.now_s)))
+    return arming, samples + ticks(loop, 2.0)
+
+
+def steepest_step_N_s(samples: list[Sample]) -> float:
+    """Of the governed force, from each plan to the next one."""
+    plans = [each.plan for each in samples]
+    return max(
+        abs(after.governed_N - before.governed_N) / (after.time_s - before.time_s)
+        for before, after in pairwise(plans)
+        if after is not before
+    )
+
+
+def fastest_N_s(samples: list[Sample]) -> float:
+    """Of the plant's force, over OVER_S."""
+    forces_N, over = [each.truth.force_N for each in samples], round(OVER_S * 1e3)
+    return max(abs(after - before) / OVER_S for before, after in zip(forces_N, forces_N[over:], strict=False))
+
+
+def held(loop: ClosedLoop) -> None:
+    ticks(loop, 1.5, 1.1)
+    loop.command("pause")
+    ticks(loop, 0.2)
+
+
+def stopped(loop: ClosedLoop) -> None:
+    ticks(loop, 1.0)
+    loop.command("stop")
+    ticks(loop, 0.1)  # the gap still opens
+
+
+def disabled(loop: ClosedLoop) -> None:
+    loop.command("disable")
+    ticks(loop, 0.5)
+
+
+STATES: dict[str, tuple[Callable[[ClosedLoop], object], tuple[str, ...]]] = {
+    "paused": (held, ("resume",)),
+    "stopped": (stopped, ("clear-fault", "enable")),
+    "disabled": (disabled, ("enable",)),
+    "enabled": (lambda loop: None, ()),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_from_each_state_the_force_goes_to_a_live_setpoint_along_the_ramp(
+    armed: ClosedLoop, core: Core, name: str
+) -> None:
+    before, given = STATES[name]
+    before(armed)
+    arming, samples = arm_beside(armed)
+    assert (arming.given, arming.refusal) == (given, None)
+    release_N_s = core.scene.force.release_N_s
+    followed = samples[[it.safety.operating_state for it in samples].index(ENABLED) :]
+    assert steepest_step_N_s(followed) <= release_N_s + 1e-6
+    # the carriages may be behind the ramp, and catch up
+    assert fastest_N_s(followed) <= 1.25 * release_N_s
+    assert any(Limit.TAKEOVER in it.plan.limits for it in followed)
+    assert samples[-1].truth.force_N == pytest.approx(ASKED_N, abs=0.05)
+
+
+def test_a_device_that_is_not_homed_is_homed_on_the_way(make: Callable[..., ClosedLoop]) -> None:
+    loop = make()
+    ticks(loop, 1.0)
+    arming, samples = arm_beside(loop)
+    assert (arming.given, arming.refusal) == (("home", "enable"), None)
+    assert samples[-1].truth.force_N == pytest.approx(ASKED_N, abs=0.05)
+
+
+def test_after_a_silence_and_before_the_first_setpoint_there_is_the_same_ramp(armed: ClosedLoop, core: Core) -> None:
+    for silent_s in (0.5, 1.0, 0.12):
+        ticks(armed, silent_s, None)
+        samples = ticks(armed, 1.5)
+        assert steepest_step_N_s(samples) <= core.scene.force.release_N_s + 1e-6
+        assert samples[-1].truth.force_N == pytest.approx(ASKED_N, abs=0.05)
+
+
+def test_a_fault_that_comes_on_the_way_ends_it_and_nothing_is_cleared_twice() -> None:
+    arming, given = Arming(0.0, STOPPED.faults), []
+    arming.advance(0.0, latch(STOPPED, (Fault.ENCODER,)), READY, given.append)
+    assert (given, arming.refusal and arming.refusal.code) == ([], "fault")
+    arming = Arming(0.0, STOPPED.faults)
+    for now_s in (0.0, 0.1):
+        arming.advance(now_s, STOPPED, READY, given.append)
+    assert (given, arming.refusal and arming.refusal.code) == (["clear-fault"], "fault")
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "after_s"),
+    [
+        ({"connected": False}, "not_connected", 0.0),
+        ({"busy": True}, "busy", MOVES_S),
+        ({"homed": False}, "busy", PATIENCE_S),
+    ],
+)
+def test_what_does_not_come_to_its_end_ends_it_with_the_reason(
+    changes: dict[str, bool], code: str, after_s: float
+) -> None:
+    arming, now_s = Arming(0.0, ()), 0.0
+    while not arming.is_over:
+        arming.advance(now_s, SafetyState(), READY.replaced(**changes), lambda name: None)
+        now_s += 0.1
+    assert arming.refusal is not None
+    assert (arming.refusal.code, now_s) == (code, pytest.approx(after_s, abs=0.25))
+
+
+@pytest.mark.parametrize(("code", "given"), [("not_fresh", 1), ("sensor_doubted", 0)])
+def test_a_refusal_that_goes_away_is_waited_for_and_another_is_told(code: str, given: int) -> None:
+    arming, refusals = Arming(0.0, ()), [RefusedError(code, "so it is", "wait")]
+
+    def give(name: str) -> None:
+        if refusals:
+            raise refusals.pop()
+
+    for now_s, state in ((0.0, DISABLED), (0.1, DISABLED), (0.2, DISABLED if code == "sensor_doubted" else ENABLED)):
+        arming.advance(now_s, SafetyState(state), READY, give)
+    assert (len(arming.given), arming.is_over) == (given, True)
+    assert (arming.refusal and arming.refusal.code) == (None if given else code)
