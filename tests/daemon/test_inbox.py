@@ -12,6 +12,7 @@ from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
 from tormagd.daemon.source_clock import AHEAD_S, SETTLED_S
+from tormagd.daemon.stamp_unit import FACTORS
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, SourceReport, decode, encode
@@ -276,8 +277,34 @@ def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock
 
 
 def test_a_stamp_of_long_ago_is_taken_and_is_as_old_as_it_says(publishing: Publishing) -> None:
-    assert publishing.send(1, stamp_ns=0)
-    assert publishing.age_s == pytest.approx(START_NS * 1e-9)
+    assert publishing.send(1, 1.0, "a", 43_200.0)
+    assert publishing.age_s == pytest.approx(43_200.0)
+
+
+@pytest.mark.parametrize("unit", FACTORS)
+@pytest.mark.parametrize("period_s", [0.002, 0.2])
+def test_stamps_in_another_unit_are_refused_by_name_and_take_no_brake(
+    publishing: Publishing, unit: str, period_s: float
+) -> None:
+    noise = random.Random(1)
+    for number in range(30):
+        publishing.now_s += period_s * noise.uniform(0.2, 1.8)
+        assert not publishing.send(number, 1.5, "a", stamp_ns=publishing.realtime_ns // FACTORS[unit])
+        if number >= 9:
+            assert f"of 'a' counts {unit}: send ns since 1970" in (publishing.inbox.last_refusal or "")
+    assert (publishing.inbox.hold.source, publishing.inbox.newest) == ("", None)
+    assert publishing.of("a").cause == f"its stamps count {unit}, and are refused"
+    assert publishing.send(30, 1.5, "a")
+
+
+def test_a_clock_that_was_never_set_is_corrected_and_named(publishing: Publishing) -> None:
+    noise = random.Random(1)
+    for number in range(500):
+        publishing.now_s += 0.002 * noise.uniform(0.2, 1.8)
+        uptime_ns = 1_790 * 10**9 + round(publishing.now_s * 1e9)  # as a time in ms, it would be a day of these
+        publishing.send(number, 1.5, "a", stamp_ns=uptime_ns)
+    assert (publishing.force_N, publishing.age_s) == (1.5, pytest.approx(0.0, abs=0.002))
+    assert publishing.of("a").cause == "its clock: it was never set (it says 1970), and is corrected"
 
 
 def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -> None:

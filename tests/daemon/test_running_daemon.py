@@ -6,6 +6,7 @@ import gc
 import logging
 import os
 import signal
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -207,6 +208,14 @@ class Running:
             self.command("home")
         self.until(lambda status: status["is_homed"] and not status["is_busy"], "homed")
         self.command("enable")
+
+    def scene(self, name: str) -> dict[str, Any]:
+        """The status once the daemon has changed its scene, or has not."""
+        self.command("use-scene", scene=name)
+        for _ in range(PATIENCE_TICKS):
+            if (status := self.command("status"))["scene_change"]["is_over"]:
+                return status
+        pytest.fail("the scene did not change")
 
     def ask(self, force_N: float, valid_for_ms: float = 30_000.0, by: Client | None = None) -> None:
         """Publishes one setpoint, and waits until it is taken or refused."""
@@ -525,6 +534,65 @@ def test_what_may_not_be_done_yet_is_refused_and_stop_opens_and_latches(armed: R
     assert (status["operating_state"], status["fault_details"][0]["code"]) == ("FAULT", "STOPPED")
     armed.command("clear-fault")
     assert armed.command("status")["operating_state"] == "DISABLED"
+
+
+def test_arming_is_one_word_beside_a_publisher_from_a_fault_on(armed: Running) -> None:
+    armed.ask(1.5)
+    armed.until(lambda status: status["governed_cf"] > 1.49, "1.5 N")
+    armed.command("stop")
+    assert armed.command("arm")["operating_state"] == "FAULT"  # the gap still opens
+    status = armed.until(lambda status: status["arm"]["is_over"], "armed")
+    assert (status["operating_state"], status["arm"]["error"]) == ("ENABLED", None)
+    assert status["arm"]["given"] == ["clear-fault", "enable"]
+    assert status["governed_cf"] < 1.0
+    assert "TAKEOVER" in status["limits"]
+    armed.until(lambda status: status["measured_cf"] > 1.45, "1.5 N again")
+
+
+def test_whatever_else_is_commanded_ends_an_arming_and_nothing_closes_by_itself(armed: Running) -> None:
+    armed.command("disable")
+    armed.until(lambda status: not status["is_busy"], "open")
+    armed.command("home")
+    armed.command("arm")
+    armed.command("disable")
+    armed.tick(3_000)
+    status = armed.command("status")
+    assert (status["operating_state"], status["arm"]["given"]) == ("DISABLED", [])
+    assert status["arm"]["error"]["code"] == "overtaken"
+
+
+def test_a_scene_is_changed_while_disabled_and_the_device_stays_homed(armed: Running) -> None:
+    assert armed.refused("use-scene", scene="pulse") == "not_disabled"
+    armed.command("pause")
+    assert armed.refused("use-scene", scene="pulse") == "not_disabled"
+    armed.command("disable")
+    assert armed.refused("use-scene", scene="pulse") == "busy"
+    armed.until(lambda status: not status["is_busy"], "open")
+    for scene in (7, ""):
+        assert armed.refused("use-scene", scene=scene) == "bad_scene"
+    status = armed.scene("nowhere")
+    assert (status["scene"], status["scene_change"]["error"]["code"]) == ("coronary", "bad_scene")
+    status = armed.scene("pulse")
+    assert (status["scene"], status["is_homed"], status["scene_change"]["error"]) == ("pulse", True, None)
+    assert armed.command("describe")["configuration"]["scene"] == "pulse"
+    armed.command("arm")
+    armed.ask(1.5)
+    status = armed.until(lambda status: (status["measured_cf"] or 0.0) > 1.45, "1.5 N")
+    assert status["arm"]["given"] == ["enable"]
+    armed.command("stop")
+    assert armed.refused("use-scene", scene="coronary") == "fault"
+
+
+def test_a_hundred_changes_of_the_scene_leave_nothing_behind(alone: Running) -> None:
+    alone.tick()
+    counts = []
+    for number in range(100):
+        alone.scene(("pulse", "coronary")[number % 2])
+        if number % 20 == 19:
+            gc.collect()
+            counts.append((len(gc.get_objects()), len(list(Path("/proc/self/fd").iterdir())), threading.active_count()))
+    assert counts[-1][1:] == counts[1][1:]
+    assert counts[-1][0] - counts[1][0] < 600  # some for each of sixty changes would be thousands
 
 
 def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(armed: Running) -> None:

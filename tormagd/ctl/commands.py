@@ -310,15 +310,16 @@ COMMANDS = {
         (option("--port", type=port, metavar="N", help="of 127.0.0.1, for Prometheus to scrape"),),
     ),
     "scene": Command(
-        "list the scenes, or show, check, explain or make one (default: the configuration's)",
+        "list the scenes; show, check, explain or make one (default: the configuration's); or have the daemon use it",
         "scene.scene",
-        ("config", "config_file"),
+        ("config", "config_file", "endpoints", "wait_s"),
         (
             option(
                 "action",
-                choices=("list", "show", "check", "explain", "new"),
+                choices=("list", "show", "check", "explain", "new", "use"),
                 help="check: does the daemon take it, and what does the device give of it; explain: how it may be "
-                "served, how exactly, at what cost; new: write one, asking for what the task needs",
+                "served, how exactly, at what cost; new: write one, asking for what the task needs; "
+                "use: change to it, while disabled",
             ),
             option("name", nargs="?", metavar="NAME|FILE"),
             option("--force", type=Path, metavar="FORCE.csv", help="new: propose a scene for this recorded force"),

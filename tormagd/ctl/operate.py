@@ -49,7 +49,7 @@ def arm(client: Client, timeout_s: float) -> Outcome:
     if known.operating_state != "ENABLED":
         raise _not_done(f"it was armed, and is {known.operating_state}")
     seconds = round(time.monotonic() - begun_s, 2)
-    to = "F_min, and to a publisher's" if known.setpoint_cf is None else f"{known.setpoint_cf:.2f} N"
+    to = "what is published next" if known.setpoint_cf is None else f"{known.setpoint_cf:.2f} N"
     text = f"armed in {seconds:.1f} s; the force goes to {to} along the scene's ramp"
     result = {"operating_state": known.operating_state, "given": list(given), "seconds": seconds}
     return Outcome(result, text if given else "it was armed already")

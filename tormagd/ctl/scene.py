@@ -1,7 +1,8 @@
 """`tormagctl scene`: which scenes there are, what one asks for, whether this configuration can give it, and how."""
 
+import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -10,10 +11,14 @@ from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, fol
 from tormagd.ctl.process import answer_of
 from tormagd.scenes.measured import Measured, MeasuredScene, Share, Tried, Way, measured
 from tormagd.scenes.scene import Force, Scene, load_scene, shipped_scenes
-from tormagd_client.endpoints import ConfigError
+from tormagd_client.endpoints import ConfigError, Endpoints
+
+if TYPE_CHECKING:  # whoever lists scenes needs no sockets
+    from tormagd_client.blocking import Client
 
 LONGEST_S = 30.0
 "Of the daemon's own check, which takes half a second."
+POLL_S = 0.05
 
 
 def scene(
@@ -25,8 +30,10 @@ def scene(
     out: Path | None,
     config: Config,
     config_file: Path | None,
+    endpoints: Endpoints,
+    wait_s: float,
 ) -> Outcome:
-    """One of the five; without a name, of the configuration's scene. Raises CommandError."""
+    """One of the six; without a name, of the configuration's scene. Raises CommandError."""
     named = name or config.scene
     if share is not None or tolerance_N is not None or out is not None:
         from tormagd.ctl.scene_served import serve_scene
@@ -41,11 +48,33 @@ def scene(
             return check_scene(named, config_file)
         case "explain":
             return explain_scene(named, config_file)
+        case "use":
+            from tormagd_client.blocking import Client
+
+            with Client(endpoints, wait_s) as client:
+                return use_scene(client, named)
     if name is None:
         raise usage_error("scene new: the file to write is missing", "tormagctl scene new FILE.toml")
     from tormagd.ctl.scene_new import new_scene
 
     return new_scene(Path(name), force, config_file)
+
+
+def use_scene(client: "Client", name: str) -> Outcome:
+    """Have a disabled daemon change its scene, and wait until it has. Raises CommandError (REFUSED) where it stays."""
+    scene = str(Path(name).absolute()) if name not in shipped_scenes() and Path(name).exists() else name
+    client.request("use-scene", scene=scene)
+    until_s = time.monotonic() + LONGEST_S
+    while (change := (state := client.status()).scene_change) is None or not change.is_over:
+        if time.monotonic() > until_s:
+            raise CommandError(
+                Exit.REFUSED, "timeout", f"{scene} is not ready after {LONGEST_S:g} s", "tormagctl status"
+            )
+        time.sleep(POLL_S)
+    if change.error is not None:
+        raise CommandError(Exit.REFUSED, change.error.code, change.error.cause, change.error.remedy)
+    result = {"scene": state.scene, "fingerprint": state.scene_fingerprint, "is_homed": state.is_homed}
+    return Outcome(result, f"scene {state.scene} runs until the daemon is started anew. next: tormagctl arm")
 
 
 def list_scenes() -> Outcome:

@@ -97,6 +97,15 @@ class BlackBox:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
+    def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
+        """From now on it is of another core: what was kept of the one before is forgotten."""
+        if self._beside is None or self._folder is None:
+            return
+        self.journal.take()
+        self._packer.take()
+        self._say(Begin(str(self._folder), header))
+        self._snapshot(stepper, planner)
+
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
         """A control period is over, with these states."""
         if self._beside is None:

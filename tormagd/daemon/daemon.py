@@ -9,11 +9,13 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from tormagd.assembly.build import Core
+import msgspec
+
+from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
 from tormagd.control.believe.strength import device_bounds
 from tormagd.daemon.beat import Beat, Phases
-from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox
+from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox, header
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
@@ -23,6 +25,7 @@ from tormagd.daemon.profiles import ProfileFolder, Profiles, state_folder
 from tormagd.daemon.rate_group import ERROR_PERIODS
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
+from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.daemon.service import notify
 from tormagd.daemon.telemetry_loop import TelemetryLoop
@@ -68,7 +71,7 @@ class Daemon:
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, lambda: self._control.lose_link())
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
-        self._endpoint.inbox.has_way = core.scene.element == "torque"
+        self._endpoint.inbox.forget(has_way=core.scene.element == "torque")
         self._keys = keys
         rates = config.rates
         period_ns = NS // rates.control_hz
@@ -83,14 +86,7 @@ class Daemon:
             on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
             beside=beside,
         )
-        folder = state_folder(config.device.profiles, "profiles")
-        self._profiles = Profiles(
-            None
-            if folder is None
-            else ProfileFolder(folder, core.scene.insert.name, core.model, device_bounds(config.trim)),
-            self._inference.planner.believe,
-            self._inference.teach,
-        )
+        self._profiles = self._profiles_of(core)
         self._telemetry = TelemetryLoop(
             config,
             core,
@@ -105,6 +101,7 @@ class Daemon:
             refused,
             config_file,
         )
+        self._telemetry.scene_change = SceneChange(self._build, self._require_disabled, self._run_scene)
         self._box.begin(self._control.stepper, self._inference.planner, self._connection)
         admission, telemetry = self._endpoint.admission, self._telemetry
         self._phases.begin(
@@ -125,6 +122,11 @@ class Daemon:
             ],
         )
         self._ended = asyncio.Event()
+
+    def _profiles_of(self, core: Core) -> Profiles:
+        folder, bounds = state_folder(core.config.device.profiles, "profiles"), device_bounds(core.config.trim)
+        of_insert = None if folder is None else ProfileFolder(folder, core.scene.insert.name, core.model, bounds)
+        return Profiles(of_insert, self._inference.planner.believe, self._inference.teach)
 
     async def run(self) -> None:
         """Runs until SIGTERM or SIGINT; opens the gap before it returns."""
@@ -186,6 +188,37 @@ class Daemon:
             self._causes.tell(faults, control.stepper, control.measurement)
             with contextlib.suppress(RefusedError):  # where none is kept
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
+
+    async def _build(self, scene: str) -> Core:
+        """The core for a scene at the rates that run. Raises ConfigError."""
+        # in a thread: no beat waits for it
+        core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
+        if core.element.is_beside or self._inference.beside is not None:
+            raise ConfigError(f"scene {core.scene.name}: a search beside the plans begins with the daemon: restart it")
+        await self._profiles.finished()
+        return core
+
+    def _require_disabled(self) -> None:
+        """Raises RefusedError where the scene may not be changed now."""
+        self._control.command("use-scene", self._telemetry.conditions())
+
+    def _run_scene(self, scene: str, core: Core) -> None:
+        """Goes on with another core, between two beats. The device stays homed, and what is known of it where insert
+        and model are the same."""
+        control, inference, before, now_s = self._control, self._inference, self._core, time.monotonic()
+        learned, safety = inference.planner.believe.learned(), control.stepper.safety
+        stepper, planner = core.stepper(now_s), core.planner(now_s)
+        stepper.safety = safety
+        stepper.opening.rest(safety.request_number)
+        if (core.model, core.scene.insert.name) == (before.model, before.scene.insert.name):
+            planner.teach(learned)
+        self._config, self._core = msgspec.structs.replace(self._config, scene=scene), core
+        control.stepper, inference.planner = stepper, planner
+        self._endpoint.inbox.forget(has_way=core.scene.element == "torque")
+        self._profiles.close()
+        self._profiles = self._profiles_of(core)
+        self._telemetry.run_scene(self._config, core, self._profiles)
+        self._box.begin_scene(header(self._config, core), stepper, planner)
 
     def _begin_reload(self) -> None:
         self._reloading = self._loop.create_task(self._reload())

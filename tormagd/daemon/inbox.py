@@ -1,12 +1,14 @@
 """The inbox: which of the setpoints that several publishers sent is the one to plan for.
 
-Each message goes through three judgements, a module each: is it newer than what its source sent before (`sequence`),
-how old is it by a clock that may be wrong (`source_clock`), and does its source hold the brake (`hold`)?
+Each message goes through four judgements, a module each: is it newer than what its source sent before (`sequence`), does
+its stamp count in ns (`stamp_unit`), how old is it by a clock that may be wrong (`source_clock`), and does its source hold
+the brake (`hold`)?
 """
 
 import logging
 import math
 import shlex
+import time
 from collections import deque
 
 from tormagd.control.records import TimedSetpoint, Wall
@@ -14,6 +16,7 @@ from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
+from tormagd.daemon.stamp_unit import LOOKED_AT, StampUnit
 from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
 from tormagd.safety.codes import Explanation, Limit
@@ -30,6 +33,8 @@ REPORTED = 6
 "Sources that are reported in full, the newest ones: an answer has to stay under its limit."
 MOST_DRIFT_PPM = 100.0
 "A clock that drifts faster than quartz does is named."
+NEVER_SET_NS = 946_684_800 * 10**9
+"The year 2000, in which nobody publishes: a clock that begins in 1970 has not been set."
 SURE_WINDOWS = 20
 "Of fewer half seconds the scatter around the line says little of how sure its slope is."
 NEWS, NEWS_S = 4, 1.0
@@ -47,7 +52,7 @@ class _Source:
         self.setpoint, self.heard_s = setpoint, now_s
         self.stamp_s = -math.inf  # nothing of it has been taken yet
         self.sequence = Sequence(setpoint.session, setpoint.seq)
-        self.clock = SourceClock()
+        self.unit, self.clock = StampUnit(), SourceClock()
         self.delays = Histogram()
         self.accepted = self.refused = 0
         self.is_named = False
@@ -57,7 +62,9 @@ class _Source:
         """Makes the figures anew; True if there is something wrong with the clock that was not named before."""
         self.delays.refresh()
         self.fit = self.clock.line.fit()
-        self.cause, self.remedy = _of_clock(self.clock, self.fit, now_s)
+        self.cause, self.remedy = _of_clock(self.clock, self.fit, now_s, self.setpoint.stamp_ns)
+        if self.unit.wrong:
+            self.cause, self.remedy = f"its stamps count {self.unit.wrong}, and are refused", self.unit.remedy
         was_named, self.is_named = self.is_named, self.clock.is_settled and bool(self.cause)
         return self.is_named and not was_named
 
@@ -102,7 +109,7 @@ class SetpointInbox:
             setpoint = decode(data, Setpoint)
             if not self.has_way:
                 _refuse_way(setpoint)
-            return self._judge(setpoint, now_s, (realtime_ns - setpoint.stamp_ns) * 1e-9)
+            return self._judge(setpoint, now_s, realtime_ns)
         except MessageError as error:
             self._refuse(str(error))
             return False
@@ -131,6 +138,10 @@ class SetpointInbox:
         """The same of what was refused last, because another source holds the brake; None where nothing was."""
         other = self._sources.get(self._other)
         return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
+
+    def forget(self, *, has_way: bool) -> None:
+        """Forgets the newest setpoint: it was meant for another element. `has_way` is of this one."""
+        self.newest, self.has_way = None, has_way
 
     def withdraw(self, reason: str) -> None:
         """Forgets the newest setpoint: nothing can be planned for it. It counts as refused, too."""
@@ -177,7 +188,7 @@ class SetpointInbox:
             by_source={name: self._source_report(name, now_s) for name in newest[:REPORTED]},
         )
 
-    def _judge(self, setpoint: Setpoint, now_s: float, lateness_s: float) -> bool:
+    def _judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> bool:
         source, order = self._sources.get(setpoint.source), Order.NEWER
         if source is None:
             self._make_room(setpoint.source, now_s)
@@ -188,6 +199,8 @@ class SetpointInbox:
             if order is Order.STRAY:
                 self.dropped += 1
                 return False
+        _require_ns(source, setpoint, now_s, realtime_ns)
+        lateness_s = (realtime_ns - setpoint.stamp_ns) * 1e-9
         delay_s = source.clock.hear(now_s, lateness_s, is_continued=order is not Order.REPLACED)
         if delay_s < -AHEAD_S:
             raise MessageError(
@@ -307,12 +320,28 @@ def _refuse_way(setpoint: Setpoint) -> None:
             raise MessageError(f"{name}: allowed is servo_cf alone, as the scene's element is a pad")
 
 
-def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float) -> tuple[str, str]:
+def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
+    """Raises MessageError where the source's stamps count in something else, or may."""
+    unit = source.unit
+    unit.hear(now_s, setpoint.stamp_ns, realtime_ns)
+    source.heard_s = now_s
+    if unit.wrong:
+        raise MessageError(f"stamp_ns = {setpoint.stamp_ns} of {setpoint.source!r} counts {unit.wrong}: {unit.remedy}")
+    if not unit.is_known:
+        raise MessageError(
+            f"stamp_ns = {setpoint.stamp_ns} of {setpoint.source!r} is days from this clock: allowed is less until "
+            f"{LOOKED_AT} messages show whether it counts ns"
+        )
+
+
+def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: int) -> tuple[str, str]:
     """What is wrong with a publisher's clock, and what to do; empty where nothing is."""
     if not clock.is_settled:
         return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"
     causes = []
-    if clock.is_wrong:
+    if clock.is_wrong and stamp_ns < NEVER_SET_NS:
+        causes.append(f"it was never set (it says {time.gmtime(stamp_ns * 1e-9).tm_year}), and is corrected")
+    elif clock.is_wrong:
         side = "behind" if clock.offset_s > 0.0 else "ahead of"
         or_way = " (or its way takes that long)" if clock.offset_s > 0.0 and not clock.steps else ""
         causes.append(f"it is {abs(clock.offset_s):.3f} s {side} this machine's{or_way}, and is corrected")

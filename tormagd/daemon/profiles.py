@@ -123,6 +123,10 @@ class Profiles:
         self._writing = asyncio.get_running_loop().run_in_executor(None, self._folder.write, profile)
         self._writing.add_done_callback(self._note)
 
+    def close(self) -> None:
+        """Takes nothing any more that is still being read."""
+        self._serial_number = None
+
     async def finished(self) -> None:
         """Waits until what is being kept is on the disk."""
         if self._writing is not None:

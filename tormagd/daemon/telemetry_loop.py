@@ -26,6 +26,7 @@ from tormagd.daemon.following import Following
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import Histogram, RateGroup
+from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.service import READY, Service, notify, status_line
 from tormagd.daemon.telemetry import snapshot, tick_record
 from tormagd.daemon.topics import Topics
@@ -96,6 +97,8 @@ class TelemetryLoop:
         self._way = Way()
         self._following = Following(1.0 / config.rates.telemetry_hz, core.scene.force.tolerance_rms_N)
         self.topics = Topics(config, core, control, inference, endpoint)
+        self.scene_change: SceneChange | None = None
+        "Where the scene may be changed."
         self._service = Service()
         self._status: msgspec.Raw | None = None
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // config.rates.telemetry_hz
@@ -103,6 +106,11 @@ class TelemetryLoop:
         self._histograms = self._in_turn()
         self._reports: dict[str, Any] = {}
         self._reported_s, self._reported_state = -math.inf, connection.state
+
+    def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
+        """Tells of another core from now on."""
+        self.config, self._core, self.topics.core, self._profiles = config, core, core, profiles
+        self._status, self._reported_s = None, -math.inf
 
     def record(self, _beat: Beat) -> None:
         """Keeps the control tick that just ran, with the plan that it used."""
@@ -286,6 +294,8 @@ class TelemetryLoop:
             return {"file": str(self.keep("REQUEST", 0.0))}
         if request.command == "arm":
             self._control.arm(self.conditions())
+        elif request.command == "use-scene" and self.scene_change is not None:
+            self.scene_change.begin(request.args.get("scene"))
         else:
             self._control.command(request.command, self.conditions())
         return {
@@ -365,6 +375,7 @@ class TelemetryLoop:
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, is_homed_))),
             arm=self._arm_report(),
+            scene_change=None if self.scene_change is None else self.scene_change.newest,
             is_open=self.is_open(),
             following=self._following.report(),
         )

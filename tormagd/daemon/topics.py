@@ -22,7 +22,9 @@ class Topics:
     def __init__(
         self, config: Config, core: Core, control: ControlLoop, inference: InferenceLoop, endpoint: Endpoint
     ) -> None:
-        self._core, self._control, self._inference, self._endpoint = core, control, inference, endpoint
+        self._control, self._inference, self._endpoint = control, inference, endpoint
+        self.core = core
+        "Of the scene that runs."
         self._push_sign = float(config.handle.push_sign)
         self._period_ns = NS // min(config.rates.motion_hz, config.rates.control_hz)
         self._due_ns, self._sensed_s = 0, 0.0
@@ -74,7 +76,7 @@ class Topics:
         return is_said
 
     def _judge(self) -> Judged:
-        planner, stepper, core = self._inference.planner, self._control.stepper, self._core
+        planner, stepper, core = self._inference.planner, self._control.stepper, self.core
         measured, believe, force = stepper.measured, planner.believe, core.scene.force
         return judged(
             planner.planned,

@@ -105,7 +105,7 @@ class Keeper:
             case Part():
                 self._ring.put(said)
             case Begin():
-                self._begun = said
+                self._begun, self._ring = said, Ring()
             case Write() if len(self._due) < MOST_DUE:
                 self._due.append((time.monotonic() + said.after_s, said))
             case Write():

@@ -42,6 +42,7 @@ class Event(StrEnum):
     HOME = "home"
     STOP = "stop"
     CLEAR_FAULT = "clear-fault"
+    USE_SCENE = "use-scene"
     FAULT = "a fault shows"
 
 
@@ -318,6 +319,10 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Transition(Event.CLEAR_FAULT, ENABLED, ENABLED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
     Transition(Event.CLEAR_FAULT, PAUSED, PAUSED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
     Transition(Event.CLEAR_FAULT, FAULTED, DISABLED, _CLEARED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
+    Transition(Event.USE_SCENE, DISABLED, DISABLED, "another scene takes the place of this one", (NOT_BUSY,)),
+    Refusal(Event.USE_SCENE, ENABLED, "not_disabled", "tormagctl disable"),
+    Refusal(Event.USE_SCENE, PAUSED, "not_disabled", "tormagctl disable"),
+    Refusal(Event.USE_SCENE, FAULTED, "fault", CLEAR_FIRST),
     *[Transition(Event.FAULT, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}

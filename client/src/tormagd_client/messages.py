@@ -423,6 +423,14 @@ class ArmReport(msgspec.Struct, frozen=True, kw_only=True):
     error: Explained | None = None
 
 
+class SceneReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The newest change of the scene: to which, whether it is over, and why the scene stayed as it was."""
+
+    scene: str
+    is_over: bool
+    error: Explained | None = None
+
+
 class Status(Telemetry, frozen=True, kw_only=True):
     """Answer to the command `status`: the newest telemetry, and all else that is told only on demand."""
 
@@ -457,6 +465,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     is_open: bool | None = None
     following: FollowingReport | None = None
     arm: ArmReport | None = None
+    scene_change: SceneReport | None = None
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):

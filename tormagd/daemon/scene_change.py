@@ -1,0 +1,61 @@
+"""Another scene while the device is disabled: its core is built beside the beats, then takes the place of the other."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+
+from tormagd.assembly.build import Core
+from tormagd.safety.operating_state import RefusedError
+from tormagd_client.endpoints import ConfigError
+from tormagd_client.messages import Explained, SceneReport
+
+LONGEST_NAME = 4_096
+
+log = logging.getLogger(__name__)
+
+
+class SceneChange:
+    """The changes, one after the other. `build` makes a scene's core and raises ConfigError; `require` raises
+    RefusedError where the device is in use; `take` goes on with the core."""
+
+    def __init__(
+        self, build: Callable[[str], Awaitable[Core]], require: Callable[[], None], take: Callable[[str, Core], None]
+    ) -> None:
+        self._build, self._require, self._take = build, require, take
+        self.newest: SceneReport | None = None
+        "None before the first."
+        self._changing: asyncio.Task[None] | None = None
+
+    def begin(self, scene: object) -> None:
+        """Begin to change to `scene`, a name or a path. Raises RefusedError."""
+        if not isinstance(scene, str) or not 0 < len(scene) <= LONGEST_NAME:
+            raise RefusedError(
+                "bad_scene", f"args.scene is no text of 1..{LONGEST_NAME} characters", "tormagctl scene list"
+            )
+        if self._changing is not None:
+            raise RefusedError("busy", "another scene is being made ready", "tormagctl status")
+        self._require()
+        self.newest = SceneReport(scene=scene, is_over=False)
+        self._changing = asyncio.get_running_loop().create_task(self._change(scene))
+        # an error that nobody expects is told at once
+        self._changing.add_done_callback(self._finish)
+
+    async def _change(self, scene: str) -> None:
+        error = None
+        try:
+            core = await self._build(scene)
+            self._require()
+            self._take(scene, core)
+        except ConfigError as refused:
+            error = Explained("bad_scene", str(refused), "tormagctl scene check says what the device can give")
+        except RefusedError as refused:
+            error = Explained(refused.code, refused.message, refused.hint)
+        if error is None:
+            log.info("scene: %s", scene)
+        else:
+            log.warning("the scene stays as it was: %s", error.cause)
+        self.newest = SceneReport(scene=scene, is_over=True, error=error)
+
+    def _finish(self, changing: "asyncio.Task[None]") -> None:
+        self._changing = None
+        changing.result()
