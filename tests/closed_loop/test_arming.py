@@ -112,7 +112,7 @@ def test_after_a_silence_and_before_the_first_setpoint_there_is_the_same_ramp(ar
 
 
 def test_a_fault_that_comes_on_the_way_ends_it_and_nothing_is_cleared_twice() -> None:
-    arming, given = Arming(0.0, STOPPED.faults), []
+    arming, given = Arming(0.0, STOPPED.faults), list[str]()
     arming.advance(0.0, latch(STOPPED, (Fault.ENCODER,)), READY, given.append)
     assert (given, arming.refusal and arming.refusal.code) == ([], "fault")
     arming = Arming(0.0, STOPPED.faults)

@@ -139,7 +139,7 @@ UNDER_WAY = {"given": ["home"], "is_over": False, "error": None}
 def test_arming_tells_each_command_and_ends_when_the_daemon_has(client, fake_daemon):
     done = {"given": ["home", "enable"], "is_over": True, "error": None}
     fake_daemon.answers["status"] = arming(UNDER_WAY, UNDER_WAY, done)
-    told = []
+    told: list[str] = []
     assert client.arm(told=told.append) == ("home", "enable")
     assert (told, fake_daemon.commands) == (["home", "enable"], ["arm", *["status"] * 3])
 

@@ -125,7 +125,8 @@ over_tcp = pytest.mark.parametrize("rig", ["tcp"], indirect=True)
 
 
 def setpoint(seq: int) -> bytes:
-    return msgpack.packb({"v": 1, "source": "a", "seq": seq, "stamp_ns": 1, "servo_cf": 1.0, "valid_for_ms": 50.0})
+    message = {"v": 1, "source": "a", "seq": seq, "servo_cf": 1.0, "valid_for_ms": 50.0}
+    return msgpack.packb(message | {"stamp_ns": time.time_ns()})
 
 
 def request(command: str) -> bytes:

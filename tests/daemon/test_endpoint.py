@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -155,7 +156,8 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 
 def setpoint(seq: int, force_N: float = 1.0) -> bytes:
-    return msgpack.packb({"v": 1, "source": "a", "seq": seq, "stamp_ns": 1, "servo_cf": force_N, "valid_for_ms": 50.0})
+    message = {"v": 1, "source": "a", "seq": seq, "servo_cf": force_N, "valid_for_ms": 50.0}
+    return msgpack.packb(message | {"stamp_ns": time.time_ns()})
 
 
 def command(name: str, request_id: int = 1, **args: Any) -> bytes:

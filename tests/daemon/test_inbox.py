@@ -167,7 +167,7 @@ def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is
     assert not publishing.send(1, 2.0, "b", at_s=0.04)
     assert (publishing.counters(), publishing.force_N) == ((1, 1, 0), 1.0)
     assert publishing.send(2, 1.0, "a")
-    assert publishing.newest.is_contested
+    assert publishing.newest.limits == (Limit.OTHER_SOURCE,)
     report = publishing.inbox.report(publishing.now_s)
     states = {source: each.state for source, each in report.by_source.items()}
     assert (report.newest_source, report.sources, states) == ("a", {"a": 2, "b": 1}, {"a": "holds", "b": "refused"})
@@ -176,7 +176,7 @@ def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is
     assert told.remedy.endswith("tormagctl take b")
     assert publishing.send(2, 2.0, "b", at_s=0.0901)
     newest = publishing.newest
-    assert (newest.force_N, newest.holder, newest.is_contested) == (2.0, 1, False)
+    assert (newest.force_N, newest.holder, newest.limits) == (2.0, 1, ())
     publishing.inbox.tell(publishing.now_s)
     assert "'b' holds the brake instead of 'a': that is stale" in caplog.text
     # and now the first is the other one
@@ -189,7 +189,7 @@ def test_a_limit_that_is_over_is_over(publishing: Publishing) -> None:
     for tick in range(2, 200):
         publishing.now_s += 0.01
         assert publishing.send(tick, 1.0, "a")
-        assert publishing.newest.is_contested == (publishing.now_s < SILENT_S)
+        assert (Limit.OTHER_SOURCE in publishing.newest.limits) == (publishing.now_s < SILENT_S)
 
 
 def test_a_source_that_is_late_itself_takes_nothing_over(publishing: Publishing) -> None:
@@ -205,7 +205,7 @@ def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None
     publishing.send(1, 2.0, "b")
     publishing.inbox.give("b", publishing.now_s)
     newest = publishing.newest
-    assert (newest.force_N, newest.holder, newest.is_contested) == (2.0, 1, False)
+    assert (newest.force_N, newest.holder, newest.limits) == (2.0, 1, ())
     assert not publishing.send(2, 1.0, "a")
     assert publishing.send(2, 2.1, "b")
     publishing.now_s = 0.2
@@ -223,7 +223,7 @@ def test_two_publishers_of_one_name_do_not_alternate_on_the_brake(publishing: Pu
             publishing.send(seq, force_N)
             forces.append(publishing.force_N)
     assert set(forces[4:]) in ({0.9}, {1.6})
-    assert publishing.newest.is_contested
+    assert publishing.newest.limits == (Limit.OTHER_SOURCE,)
     assert "two publishers call themselves 'a'" in publishing.inbox.told(publishing.now_s)[Limit.OTHER_SOURCE].cause
 
 

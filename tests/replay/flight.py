@@ -65,7 +65,8 @@ class Flight:
         self._is_stepped = False
         due_ns = self._now_ns + NS // self.config.rates.control_hz
         self._now_ns, beat = due_ns, Beat(due_ns, due_ns, 0)
-        self._inference.plan(beat, self.loop.stepper.measured, is_asked=self._drain(setpoint))
+        stepper, is_asked = self.loop.stepper, self._drain(setpoint)
+        self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
         self._inference.foresee(beat)

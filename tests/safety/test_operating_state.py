@@ -28,6 +28,7 @@ from tormagd.safety.operating_state import (
 )
 
 READY = Conditions(connected=True, fresh=True, homed=True, busy=False, device_latched=False)
+NEED_NO_DEVICE = ("stop", "use-scene")
 DISABLED, ENABLED, PAUSED, FAULT = OperatingState
 FAULTED = latch(SafetyState(), (Fault.DEVICE_OVERCURRENT,))
 
@@ -72,7 +73,11 @@ def test_starts_disabled_and_asks_nothing() -> None:
         ("home", {"device_latched": True}, "device_latched"),
         ("home", {"busy": True}, "busy"),
         ("clear-fault", {"busy": True}, "busy"),
-        *((name, {"connected": False, "fresh": False}, "not_connected") for name in COMMANDS if name != "stop"),
+        *(
+            (name, {"connected": False, "fresh": False}, "not_connected")
+            for name in COMMANDS
+            if name not in NEED_NO_DEVICE
+        ),
     ],
 )
 def test_what_a_command_wants_and_has_not_is_said(name: str, changes: dict[str, bool | float], code: str) -> None:
@@ -93,6 +98,7 @@ TAKEN: dict[str, tuple[OperatingState | tuple[OperatingState, DeviceRequest] | s
     "home": ((DISABLED, DeviceRequest.HOME), "tormagctl disable", "tormagctl disable", CLEAR),
     "stop": (STOPPED, STOPPED, STOPPED, STOPPED),
     "clear-fault": (DISABLED, ENABLED, PAUSED, DISABLED),
+    "use-scene": (DISABLED, "tormagctl disable", "tormagctl disable", CLEAR),
 }
 """Where each command leads and what it asks of the device, or what is hinted at where it is refused."""
 
@@ -206,7 +212,7 @@ def test_what_the_table_promises() -> None:
         if row.event in (Event.STOP, Event.FAULT):
             assert (row.target, row.guards) == (FAULT, ())
         elif row.event is not Event.FAULT:
-            assert row.guards[0].code == "not_connected"
+            assert row.guards[0].code == "not_connected" or row.event is Event.USE_SCENE
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.event} in {row.source}")

@@ -38,7 +38,7 @@ class TimedSetpoint(Value):
     displacement_mm, rate_mm_s   the handle's motion that is planned for; None where the publisher states none
     preview_N                    the forces that follow `force_N`, `preview_dt_s` apart; empty without a preview
     holder                       number of the publisher that holds the brake; each new holder has a greater one
-    is_contested                 another publisher sends setpoints too
+    limits                       what is wrong with how it came, or with who else sends setpoints
     withdraw_N                   for a handle that withdraws; None: the wall's friction, `force_N` without a wall
     wall                         what the handle pushes against; None: nothing
     """
@@ -53,7 +53,7 @@ class TimedSetpoint(Value):
         preview_N: tuple[float, ...] = (),
         preview_dt_s: float = 0.0,
         holder: int = 0,
-        is_contested: bool = False,
+        limits: tuple[Limit, ...] = (),
         withdraw_N: float | None = None,
         wall: Wall | None = None,
     ) -> None:
@@ -65,7 +65,7 @@ class TimedSetpoint(Value):
         self.preview_N: Final = preview_N
         self.preview_dt_s: Final = preview_dt_s
         self.holder: Final = holder
-        self.is_contested: Final = is_contested
+        self.limits: Final = limits
         self.withdraw_N: Final = withdraw_N
         self.wall: Final = wall
 

@@ -71,7 +71,7 @@ class Daemon:
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, lambda: self._control.lose_link())
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
-        self._endpoint.inbox.forget(has_way=core.scene.element == "torque")
+        self._endpoint.inbox.begin_scene(core.scene)
         self._keys = keys
         rates = config.rates
         period_ns = NS // rates.control_hz
@@ -214,7 +214,7 @@ class Daemon:
             planner.teach(learned)
         self._config, self._core = msgspec.structs.replace(self._config, scene=scene), core
         control.stepper, inference.planner = stepper, planner
-        self._endpoint.inbox.forget(has_way=core.scene.element == "torque")
+        self._endpoint.inbox.begin_scene(core.scene)
         self._profiles.close()
         self._profiles = self._profiles_of(core)
         self._telemetry.run_scene(self._config, core, self._profiles)

@@ -1,8 +1,8 @@
 """The inbox: which of the setpoints that several publishers sent is the one to plan for.
 
-Each message goes through four judgements, a module each: is it newer than what its source sent before (`sequence`), does
-its stamp count in ns (`stamp_unit`), how old is it by a clock that may be wrong (`source_clock`), and does its source hold
-the brake (`hold`)?
+Each message goes through judgements, a module each: is it newer than what its source sent before (`sequence`), does its
+stamp count in ns (`stamp_unit`), how old is it by a clock that may be wrong (`source_clock`), how does its source send
+(`source_manner`), and does that hold the brake (`hold`)?
 """
 
 import logging
@@ -16,11 +16,13 @@ from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
+from tormagd.daemon.source_manner import MOST_LATE_S, Needs, SourceManner, needs_of
 from tormagd.daemon.stamp_unit import LOOKED_AT, StampUnit
 from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.safety.operating_state import RefusedError
+from tormagd.scenes.scene import Scene
 from tormagd_client.messages import MessageError, Setpoint, SetpointReport, SourceReport, decode
 
 SOURCES = 16
@@ -52,7 +54,7 @@ class _Source:
         self.setpoint, self.heard_s = setpoint, now_s
         self.stamp_s = -math.inf  # nothing of it has been taken yet
         self.sequence = Sequence(setpoint.session, setpoint.seq)
-        self.unit, self.clock = StampUnit(), SourceClock()
+        self.unit, self.clock, self.manner = StampUnit(), SourceClock(), SourceManner()
         self.delays = Histogram()
         self.accepted = self.refused = 0
         self.is_named = False
@@ -71,9 +73,14 @@ class _Source:
     def is_stale(self, now_s: float) -> bool:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
-    def keep(self, setpoint: Setpoint, now_s: float, delay_s: float) -> None:
-        if self.clock.is_settled:
+    def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, needs: Needs) -> None:
+        clock = self.clock
+        if clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
+            # a way of over 0.2 s is taken for the clock; which of the two it is, nobody can tell from here
+            hidden_s = clock.offset_s if 0.0 < clock.offset_s < MOST_LATE_S and not clock.steps else 0.0
+            preview_s = len(setpoint.preview_N or ()) * (setpoint.preview_dt_ms or 0.0) * 1e-3
+            self.manner.hear(now_s, hidden_s + delay_s, self.sequence.lost, preview_s, needs)
         # the worse of arrival and corrected stamp: a stamp of the time to come is of now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 
@@ -93,6 +100,7 @@ class SetpointInbox:
         self.oversize = 0
         self.last_refusal: str | None = None
         self.newest: TimedSetpoint | None = None
+        self._needs = Needs()
         self.hold = Hold()
         self.priority = priority
         "May be set anew at any time; who holds the brake goes on holding it until another message comes."
@@ -139,9 +147,9 @@ class SetpointInbox:
         other = self._sources.get(self._other)
         return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
 
-    def forget(self, *, has_way: bool) -> None:
-        """Forgets the newest setpoint: it was meant for another element. `has_way` is of this one."""
-        self.newest, self.has_way = None, has_way
+    def begin_scene(self, scene: Scene) -> None:
+        """Judges by what this scene needs, and forgets the newest setpoint: it was meant for another one."""
+        self.newest, self.has_way, self._needs = None, scene.element == "torque", needs_of(scene)
 
     def withdraw(self, reason: str) -> None:
         """Forgets the newest setpoint: nothing can be planned for it. It counts as refused, too."""
@@ -164,7 +172,8 @@ class SetpointInbox:
         holder = self._sources.get(self.hold.source)
         if holder is None:
             return {}
-        return {Limit.STALE: self._why_stale(holder, now_s), Limit.OTHER_SOURCE: self._why_other(holder, now_s)}
+        why = {Limit.STALE: self._why_stale(holder, now_s), Limit.OTHER_SOURCE: self._why_other(holder, now_s)}
+        return why | holder.manner.found
 
     def refresh(self, now_s: float) -> None:
         """Makes the figures of one source anew, for `report`: of each in turn."""
@@ -207,7 +216,7 @@ class SetpointInbox:
                 f"stamp_ns is {-delay_s * 1e3:.0f} ms ahead of this clock: allowed is {AHEAD_S * 1e3:.0f} ms, "
                 "until the clock of its source has shown itself"
             )
-        source.keep(setpoint, now_s, delay_s)
+        source.keep(setpoint, now_s, delay_s, self._needs)
         hold = self.hold
         if source.setpoint.source != hold.source:
             is_free = self.newest is None or now_s - self.newest.stamp_s > self.newest.valid_for_s
@@ -238,6 +247,8 @@ class SetpointInbox:
         """The source's newest setpoint, on the control clock, which no setting of the time moves."""
         setpoint = source.setpoint
         wall = setpoint.contact
+        is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
+        others = (Limit.OTHER_SOURCE,) if is_contested else ()
         return TimedSetpoint(
             setpoint.servo_cf,
             source.stamp_s,
@@ -247,7 +258,7 @@ class SetpointInbox:
             setpoint.preview_N or (),
             (setpoint.preview_dt_ms or 0.0) * 1e-3,
             self.hold.number,
-            now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s),
+            (*others, *source.manner.found),
             setpoint.withdraw_cf,
             None if wall is None else Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
         )

@@ -24,7 +24,7 @@ from tormagd.inverse.solution import Answer
 from tormagd.recording.black_box import frames_in, is_tick
 from tormagd.replay.conversation import Conversation, Damage, Found, differing
 from tormagd.replay.rebuild import ReplayError
-from tormagd.safety.codes import Fault
+from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.messages import TickRecord
 
@@ -33,7 +33,7 @@ UNTAKEN = (
 )  # fmt: skip
 "What the core raises at values of a kind that no part of it makes."
 SETPOINT = tuple[
-    float, float, float, float | None, float | None, tuple[float, ...], float, int, bool, float | None, Any
+    float, float, float, float | None, float | None, tuple[float, ...], float, int, tuple[Limit, ...], float | None, Any
 ]
 NOT_THE_CORES = 1
 "The first column of a record is the clock's."

@@ -92,6 +92,10 @@ class Limit(StrEnum):
     NO_SETPOINT = "NO_SETPOINT"
     STALE = "STALE"
     OTHER_SOURCE = "OTHER_SOURCE"
+    SOURCE_LOSS = "SOURCE_LOSS"
+    SOURCE_SELDOM = "SOURCE_SELDOM"
+    SOURCE_LATE = "SOURCE_LATE"
+    SOURCE_JITTER = "SOURCE_JITTER"
     TAKEOVER = "TAKEOVER"
     RANGE = "RANGE"
     STANDBY = "STANDBY"
@@ -378,6 +382,34 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         100.0,
         "at once",
+    ),
+    Limit.SOURCE_LOSS: Explanation(
+        "over 5 % of the setpoints are lost on the way",
+        "look for the lossy part of the network",
+        Reaction.HELD,
+        2000.0,
+        "over a second",
+    ),
+    Limit.SOURCE_SELDOM: Explanation(
+        "setpoints come more seldom than the scene states, or than 20 times a second",
+        "send more often, or a preview_N that reaches to the next one",
+        Reaction.HELD,
+        2000.0,
+        "over a second",
+    ),
+    Limit.SOURCE_LATE: Explanation(
+        "setpoints are older when they come than the scene allows, budget.delay_ms",
+        "take a shorter way, or send a preview_N of that length",
+        Reaction.HELD,
+        2000.0,
+        "over a second",
+    ),
+    Limit.SOURCE_JITTER: Explanation(
+        "setpoints are on the way for times that differ by over 20 ms",
+        "send a preview_N that is longer than that, or take a steadier way",
+        Reaction.HELD,
+        2000.0,
+        "over a second",
     ),
     Limit.TAKEOVER: Explanation(
         "the force goes along a ramp to what is asked: it followed nobody before, or another publisher",

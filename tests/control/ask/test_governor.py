@@ -136,7 +136,7 @@ def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(
         now_s, last_N = tick * 1e-3, ask.force_N
         preview_N = tuple(after_N * share for share in ahead_N)
         setpoint = TimedSetpoint(
-            after_N, now_s, VALID_S, preview_N=preview_N, preview_dt_s=0.002, holder=1, is_contested=True
+            after_N, now_s, VALID_S, preview_N=preview_N, preview_dt_s=0.002, holder=1, limits=(Limit.OTHER_SOURCE,)
         )
         ask = decide(following, now_s, setpoint)
         assert abs(ask.force_N - last_N) <= SCENE.release_N_s * 1e-3 + 1e-9

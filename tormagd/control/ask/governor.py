@@ -127,16 +127,14 @@ class Governor:
         age_s = now_s - setpoint.stamp_s
         _require_numbers(setpoint, age_s)
         if age_s > setpoint.valid_for_s:
-            stale = (Limit.STALE, Limit.OTHER_SOURCE) if setpoint.is_contested else (Limit.STALE,)
-            return self._decay(dt_s, lowest_N, age_s, stale)
+            return self._decay(dt_s, lowest_N, age_s, (Limit.STALE, *setpoint.limits))
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
         # what comes is told from what is asked: the least that the device makes is learned, and so it varies
         asked_N = setpoint.asked_N(travel)
         allowed_N = within(asked_N, self._allowed)
         blended_N = self._blended(setpoint, travel, allowed_N, dt_s)
         force_N, limits = self._within_reach(asked_N, blended_N, lowest_N, highest_N)
-        if setpoint.is_contested:
-            limits = (*limits, Limit.OTHER_SOURCE)
+        limits = (*limits, *setpoint.limits)
         heard_N = within(setpoint.force_N, self._allowed)
         self._hear(setpoint, heard_N, force_N, device)
         given = lowest_N, highest_N
