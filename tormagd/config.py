@@ -194,6 +194,35 @@ class BlackBox(Strict, frozen=True):
     kept."""
 
 
+class Recordings(Strict, frozen=True):
+    """What `tormagctl record` keeps in a folder, and the key of its seals."""
+
+    folder: str = "/var/lib/tormag/recordings"
+    "That of `tormagctl recordings`, where none is named."
+    segment_MB: Annotated[float, Meta(ge=0.1, le=100_000.0)] = 250.0
+    "A recording in a folder goes on in a new file after so much."
+    segment_minutes: Annotated[float, Meta(ge=0.01, le=1_440.0)] = 10.0
+    "Or after so long."
+    most_MB: Annotated[float, Meta(gt=0.0, le=1e8)] = 20_000.0
+    "All recordings in the folder: the oldest unmarked ones go first."
+    most_days: Annotated[float, Meta(gt=0.0, le=36_500.0)] = 30.0
+    "The same for their age."
+    free_MB: Annotated[float, Meta(ge=1.0, le=1e8)] = 500.0
+    "Stays free on the folder's disk, for black boxes and profiles."
+    one_tick_of: Annotated[int, Meta(ge=1, le=1_000)] = 1
+    "Of so many ticks one is recorded, and all within 10 s of a fault or a mark; 1: all."
+    key: str = ""
+    "A file of 16 to 64 bytes: with it recordings and black boxes are sealed, and a forged seal is told."
+
+    def __post_init__(self) -> None:
+        require(
+            2.0 * self.segment_MB + 1.0 <= self.most_MB,
+            "recordings.most_MB",
+            self.most_MB,
+            f"at least twice recordings.segment_MB = {self.segment_MB:g}, and 1",
+        )
+
+
 class Config(Strict, frozen=True):
     """Everything `tormagd` can be told."""
 
@@ -210,6 +239,7 @@ class Config(Strict, frozen=True):
     trim: Trim = msgspec.field(default_factory=Trim)
     limits: Limits = msgspec.field(default_factory=Limits)
     black_box: BlackBox = msgspec.field(default_factory=BlackBox)
+    recordings: Recordings = msgspec.field(default_factory=Recordings)
 
     def __post_init__(self) -> None:
         rates, device, limits = self.rates, self.device, self.limits

@@ -21,11 +21,12 @@ from aiohttp import ClientResponse, ClientSession, ClientWebSocketResponse
 from aiohttp.test_utils import TestClient, TestServer
 from hypothesis import given, settings, strategies as st
 
-from tormagd.dashboard.frame import LATE_US, SHOWN_S, Frame, late_counts
+from tormagd.dashboard.frame import SHOWN_S, Frame, late_counts
 from tormagd.dashboard.live import WAITING, Live
 from tormagd.dashboard.recorded import Recorded
 from tormagd.dashboard.server import application
-from tormagd.recording.reader import read_recording
+from tormagd.recording.overview import LATE_US
+from tormagd.recording.reader import RecordingFile
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
@@ -62,7 +63,7 @@ def recorded_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def recorded(recorded_path: Path) -> Recorded:
-    return Recorded(read_recording(recorded_path), recorded_path.name)
+    return Recorded(RecordingFile(recorded_path))
 
 
 @asynccontextmanager
@@ -104,7 +105,10 @@ async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
         told = await event(stream, "status")
         assert (told["status"]["link"]["state"], told["explained"]) == (
             "RUNNING",
-            {"RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}},
+            {
+                "limits": {"RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}},
+                "faults": {},
+            },
         )
         assert await event(stream, "portrait") == {"portrait": PORTRAIT}
         first = msgspec.convert(await event(stream, "frame"), Frame)
@@ -177,7 +181,7 @@ async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Rec
 
 def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     about = recorded.about
-    assert (about["kind"], about["scene"], about["duration_s"], about["tracking_rms_N"]) == (
+    assert (about["kind"], about["scene"], about["duration_s"], about["following"]["rms_N"]) == (
         "recording",
         "pulse",
         pytest.approx(SECONDS, abs=0.1),
@@ -186,8 +190,9 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     assert msgspec.to_builtins(about["portrait"]) == {name: tuple(values) for name, values in PORTRAIT.items()}
     assert about["overview"]["limits"] == [pytest.approx((5.0, 7.0))]
     assert max(known for known in about["overview"]["high_N"] if known is not None) == pytest.approx(1.81, abs=1e-3)
-    for code, known in ((Limit.RATE, LIMITS[Limit.RATE]), (Fault.SKEW, FAULTS[Fault.SKEW])):
-        assert about["explained"][code].remedy == known.remedy
+    # a limit and a fault of one name are two things
+    assert about["explained"]["limits"][Limit.SKEW].remedy == LIMITS[Limit.SKEW].remedy
+    assert about["explained"]["faults"][Fault.SKEW].remedy == FAULTS[Fault.SKEW].remedy
     frame = recorded.frame(20.0)
     assert (frame.t_s[0], frame.t_s[-1]) == pytest.approx((START_NS * 1e-9, START_NS * 1e-9 + 20.0))
     assert (frame.asked_N[-1], frame.gap_mm[-1], frame.gap_wanted_mm[-1], frame.field_mT[-1]) == (
@@ -203,7 +208,9 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
         pytest.approx(2_000, abs=2),
         pytest.approx(20, abs=1),
     )
-    assert recorded.frame(29.5).faults == ["SKEW"]
+    fault = recorded.frame(29.5)
+    # in FAULT the gap opens: the field of the plan stands nowhere
+    assert (fault.faults, fault.field_mT[-1], fault.field_mT[0]) == (["SKEW"], None, 120.0)
     assert frame.belief == {}  # ticks do not say
     assert [held.is_now for held in recorded.frame(6.0).held] == [True]
 
@@ -216,7 +223,7 @@ def test_a_recording_shows_what_was_believed_then(tmp_path: Path, telemetry_with
             scale = BeliefReport(value=1.0 + at_s, sd=0.17, unit="", acts=True)
             belief = {"scale": scale, "carriage_lag": lag} if at_s else {}
             writer.telemetry(telemetry_with(seq, START_NS + round(at_s * 1e9), belief=belief))
-    shown = Recorded(read_recording(tmp_path / "b.mcap"), "b.mcap")
+    shown = Recorded(RecordingFile(tmp_path / "b.mcap"))
     assert [shown.frame(at_s).belief for at_s in (0.01, 0.5)] == [{}, {}]
     for at_s, value in ((0.03, 1.02), (0.1, 1.04), (1.0, 2.0)):
         known = BeliefReport(value=value, sd=0.17, unit="", acts=True)

@@ -71,7 +71,7 @@ def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, ct
     made = ctl(*fake_daemon.at, "--json", "record", str(tmp_path), "--duration", "0.1").ended(0).result
     (file,) = tmp_path.iterdir()
     assert made["file"] == str(file)
-    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap", file.name)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.mcap", file.name)
 
 
 def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, ctl):

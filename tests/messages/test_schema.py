@@ -20,6 +20,7 @@ from tormagd_client.messages import (
     FollowingReport,
     LatenessReport,
     LinkReport,
+    Mark,
     Motion,
     OutputReport,
     PeerReport,
@@ -45,12 +46,13 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 TELEMETRY = (
     "v t_ns seq operating_state is_homed is_busy setpoint_cf governed_cf measured_cf predicted_cf field_mT gap_mm "
     "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick belief search_age_ms "
-    "handle_mm handle_mm_s verdict"
+    "handle_mm handle_mm_s verdict mark"
 )
 V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
     Motion: "v t_ns device_s handle_mm handle_mm_s",
+    Mark: "t_ns text",
     Verdict: "v t_ns source seq outcome arrives_ms why",
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver roller_radius_mm uptime_s least_N "
     "most_N trim device profile least_gap_mm link setpoints peers "

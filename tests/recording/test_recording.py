@@ -7,34 +7,20 @@ import shutil
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given, strategies as st
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
+from sent import COLUMNS, START_NS, batch, telemetry
 
 from tormagd.recording.plot import figure, save_plot
-from tormagd.recording.reader import Recording, RecordingError, read_recording
+from tormagd.recording.reader import Recording, RecordingError, RecordingFile, read_recording
 from tormagd.recording.series import series
-from tormagd.recording.ticks import TickBatch, decode_ticks
+from tormagd.recording.ticks import decode_ticks
 from tormagd.recording.writer import RecordingWriter
-from tormagd_client.messages import MessageError, Telemetry, Tick, encode
-
-START_NS = 1_790_000_000_000_000_000
-COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "left_mm", "right_mm", "left_duty")
-
-
-def batch(*rows: tuple[Any, ...], columns: tuple[str, ...] = COLUMNS) -> TickBatch:
-    return TickBatch(v=1, columns=columns, rows=tuple((START_NS + int(ms * 1e6), *rest) for ms, *rest in rows))
-
-
-def telemetry(ms: float, seq: int, **changes: Any) -> Telemetry:
-    known: dict[str, Any] = dict.fromkeys(Telemetry.__struct_fields__)
-    known |= {"v": 1, "t_ns": START_NS + int(ms * 1e6), "seq": seq, "operating_state": "ENABLED", "is_homed": True}
-    known |= {"is_busy": False, "duty": (0.5, -0.5), "limits": (), "faults": (), "tick": Tick(20.0, 100.0)}
-    return Telemetry(**(known | changes))
+from tormagd_client.messages import MessageError, encode
 
 
 @pytest.fixture
@@ -273,16 +259,16 @@ def test_quantities_come_from_the_ticks_and_else_from_telemetry(written):
 
 
 def test_the_picture_names_what_happened(written):
-    drawn = figure(read_recording(written), "a title")
-    # the sensor's noise and the approach are in the figure, and whoever reads it has to know
-    said = ("a title", "100 mN rms (sensor noise and approach included)", "SKEW")
+    drawn = figure(RecordingFile(written).overview, "a title")
+    # the sensor's noise is in the figure, and whoever reads it has to know
+    said = ("a title", "while following 100 mN rms, 100 aligned by", "SKEW")
     assert [words for words in said if words not in drawn.get_suptitle()] == []
     assert [label.get_text() for label in drawn.axes[-1].get_yticklabels()] == ["state", "limit RATE", "FAULT SKEW"]
     assert [line.get_label() for line in drawn.axes[0].lines] == ["measured", "asked"]
 
 
 def test_a_line_that_lies_on_another_leaves_it_visible(written):
-    for axes in figure(read_recording(written), "x").axes[1:3]:
+    for axes in figure(RecordingFile(written).overview, "x").axes[1:3]:
         lower, upper = axes.lines[:2]
         assert lower.get_linewidth() > 2.0 * upper.get_linewidth()
 
@@ -299,7 +285,7 @@ def test_a_disk_that_is_full_keeps_the_picture_that_was_there(written, tmp_path,
     monkeypatch.setattr(Path, "write_bytes", half)
     for name in ("a.png", "new.png"):
         with pytest.raises(OSError, match="No space"):
-            save_plot(read_recording(written), tmp_path / name, "x")
+            save_plot(figure(RecordingFile(written).overview, "x"), tmp_path / name)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "a.png"]
     assert target.read_bytes() == b"precious"
 
@@ -307,17 +293,17 @@ def test_a_disk_that_is_full_keeps_the_picture_that_was_there(written, tmp_path,
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_pictures_in_each_format(written, tmp_path, suffix):
     target = tmp_path / f"a{suffix}"
-    save_plot(read_recording(written), target, "x")
+    save_plot(figure(RecordingFile(written).overview, "x"), target)
     assert target.stat().st_size > 5_000
 
 
 def test_other_formats_and_empty_recordings_are_refused(written, tmp_path):
     with pytest.raises(ValueError, match=r"\.png"):
-        save_plot(read_recording(written), tmp_path / "a.docx", "x")
+        save_plot(figure(RecordingFile(written).overview, "x"), tmp_path / "a.docx")
     with RecordingWriter(tmp_path / "empty.mcap"):
         pass
     with pytest.raises(ValueError, match="no messages"):
-        save_plot(read_recording(tmp_path / "empty.mcap"), tmp_path / "a.png", "x")
+        figure(RecordingFile(tmp_path / "empty.mcap").overview, "x")
 
 
 def test_a_telemetry_message_is_no_tick_batch():

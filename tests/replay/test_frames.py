@@ -230,7 +230,14 @@ def test_settings_that_are_none_are_refused(setting: str, said: str) -> None:
 
 def test_the_commands_of_tormagctl(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(path), "--from", "3"]) == 0
-    assert capsys.readouterr().out.startswith("bit-exact, 1,000 ticks from 3.000 to 3.999 s")
+    seal, said, *_ = capsys.readouterr().out.splitlines()
+    assert seal.startswith("whole: ")
+    assert said.startswith("bit-exact, 1,000 ticks from 3.000 to 3.999 s")
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(path.read_bytes().replace(b"tormagd.Tick", b"tormagd.Tack"))  # of the summary
+    assert main(["replay", str(damaged), "--from", "3"]) == 1
+    seal, said, *_ = capsys.readouterr().out.splitlines()
+    assert (seal.partition(":")[0], said.partition(",")[0]) == ("altered or damaged", "bit-exact")
     rubbish = tmp_path / "rubbish.mcap"
     rubbish.write_bytes(b"rubbish")
     assert main(["--json", "replay", str(rubbish)]) == 2

@@ -23,8 +23,9 @@ from tormagd.assembly.journal import ANSWER, CONFIRM, MISSING
 from tormagd.config import Config, Device
 from tormagd.control.records import TimedSetpoint
 from tormagd.keeping import Part
-from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
+from tormagd.recording.black_box import BlackBoxFile, Derived, read_black_box, write_black_box
 from tormagd.recording.reader import RecordingError, read_recording
+from tormagd.recording.seal import State, verified
 from tormagd.replay.rebuild import ReplayError, differences, rebuilt, recorded
 from tormagd.replay.rerun import Rerun, rerun, ticks_of
 from tormagd.safety.codes import Fault
@@ -223,6 +224,39 @@ def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: B
     state[1]["Stepper"]["measure"]["Measure"]["measured"]["Measured"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
     entries[place] = state
     assert rerun(core, COLUMNS, entries, 1.5).difference.field == "state.step.measure.measured.handle.sliding_mm_s"
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (
+            lambda shown: shown._replace(data=shown.data.replace(b"ENABLED", b"DISABLED")),
+            "message 3000 in /ticks is not",
+        ),
+        (lambda shown: shown._replace(t_ns=shown.t_ns + 1), "message 3000 in /ticks is not"),
+        (lambda shown: None, "message 3001 in /ticks is not"),
+        (lambda shown: shown._replace(sequence=7), "message 7 in /ticks is not"),
+    ],
+)
+def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path, monkeypatch: Any, edit, said) -> None:
+    """A file that was written anew, with seals that fit, and another tick in the place of what the core gave."""
+    box = read_black_box(path)
+    assert box.odd == ""
+    derived = Derived.of
+
+    def other(self: Derived, entries: Any, offset_ns: int | None) -> Any:
+        for shown in derived(self, entries, offset_ns):
+            is_it = shown.topic == "/ticks" and shown.sequence == 3_000
+            if not is_it:
+                yield shown
+            elif (edited := edit(shown)) is not None:
+                yield edited
+
+    monkeypatch.setattr(Derived, "of", other)
+    write_black_box(tmp_path / "edited.mcap", box.header, [Part(0.0, 1, msgspec.msgpack.encode(box.entries))])
+    monkeypatch.undo()
+    assert verified(tmp_path / "edited.mcap").state is State.WHOLE
+    assert read_black_box(tmp_path / "edited.mcap").odd.startswith(said)
 
 
 def test_what_is_not_as_it_was_is_told(box: BlackBoxFile, path: Path) -> None:

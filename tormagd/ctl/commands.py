@@ -210,9 +210,11 @@ COMMANDS = {
     "record": Command(
         "write telemetry and control ticks to an MCAP file until Ctrl-C",
         "record.record",
-        ("endpoints", "wait_s"),
+        ("config", "endpoints", "wait_s"),
         (
-            option("path", type=Path, metavar="FILE.mcap|DIR", help="a folder: a new file, named by the time"),
+            option(
+                "path", type=Path, metavar="FILE.mcap|DIR", help="a folder: files named by the time, within its budget"
+            ),
             option(
                 "--duration",
                 dest="duration_s",
@@ -221,6 +223,22 @@ COMMANDS = {
                 metavar="S",
                 help="end after this time",
             ),
+        ),
+    ),
+    "mark": Command(
+        "put an event into telemetry and recordings; what is recorded around it is kept",
+        "recordings.mark",
+        ("client",),
+        (option("text", metavar="TEXT", help="what happened, in 1..200 characters"),),
+    ),
+    "recordings": Command(
+        "list a folder of recordings, prune it to its budget, keep one of it (mark), or copy one and check its seals",
+        "recordings.recordings",
+        ("config",),
+        (
+            option("action", choices=("list", "prune", "mark", "export")),
+            option("path", type=Path, nargs="?", metavar="DIR|FILE.mcap", help="without, [recordings] folder"),
+            option("--to", dest="target", type=Path, metavar="DIR|FILE.mcap", help="export: where the copy goes"),
         ),
     ),
     "blackbox": Command(

@@ -10,7 +10,7 @@ from tormagd.dashboard.live import Live
 from tormagd.dashboard.recorded import Recorded
 from tormagd.dashboard.server import LOOPBACK, serve
 from tormagd.output import write_line
-from tormagd.recording.reader import read_recording
+from tormagd.recording.reader import RecordingFile
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import Endpoints
 
@@ -43,7 +43,7 @@ async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
 
 async def _recorded(path: Path, port: int) -> None:
     with as_usage_error(ValueError, hint="give a file that tormagctl record has made"):
-        shown = Recorded(read_recording(path), path.name)
+        shown = Recorded(RecordingFile(path))
     await serve(shown, port, _ready)
 
 

@@ -5,17 +5,19 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
 
 import msgspec
 import zmq
 
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.config import Config, Recordings
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.interrupt import interrupted_by
 from tormagd.output import write_line
-from tormagd.recording.ticks import decode_ticks, listening
-from tormagd.recording.writer import RecordingWriter
+from tormagd.recording.folder import Budget, RecordingFolder
+from tormagd.recording.seal import read_key
+from tormagd.recording.ticks import TickBatch, decode_ticks, listening
+from tormagd.recording.writer import RecordingWriter, disk_room
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
@@ -30,8 +32,59 @@ SILENT_S = 1.0
 "A daemon that was silent for so long at the end has gone."
 
 
-def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
-    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM; in a folder, to a file of its own.
+class Recorder:
+    """A writer, and the folder whose segments it writes, if it is one."""
+
+    def __init__(
+        self,
+        path: Path,
+        about: dict[str, str],
+        settings: Recordings,
+        key: bytes,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        """Raises OSError."""
+        self._folder = RecordingFolder(path, budget_of(settings), clock) if path.is_dir() else None
+        room = disk_room if self._folder is None else self._folder.room
+        file = path if self._folder is None else self._folder.new()
+        self.writer = RecordingWriter(file, about, key, room, settings.one_tick_of)
+
+    def ticks(self, batch: TickBatch) -> None:
+        """Writes ticks, and goes on in a new segment where that is due. Raises OSError."""
+        writer, folder = self.writer, self._folder
+        writer.ticks(batch)
+        if folder is not None and folder.is_due(writer.size, writer.lasted_s):
+            writer.rotate(folder.new())
+
+    def telemetry(self, message: Telemetry) -> None:
+        """Writes a snapshot; where it tells of a new mark, the segment is one that is kept. Raises OSError."""
+        before = self.writer.mark
+        self.writer.telemetry(message)
+        new = None if self.writer.mark == before else self.writer.mark
+        if new is not None and new.t_ns >= (self.writer.begin_ns or 0) and self._folder is not None:
+            self.writer.path = self._folder.mark_around(self.writer.path)
+
+
+def budget_of(settings: Recordings) -> Budget:
+    """What the configuration allows a folder."""
+    return Budget(
+        segment_bytes=round(settings.segment_MB * 1e6),
+        segment_s=settings.segment_minutes * 60.0,
+        most_bytes=round(settings.most_MB * 1e6),
+        most_s=settings.most_days * 86_400.0,
+        free_bytes=round(settings.free_MB * 1e6),
+    )
+
+
+def key_of(config: Config) -> bytes:
+    """The key of seals; empty where none is configured. Raises CommandError (USAGE) where it cannot be read."""
+    with as_usage_error(OSError, ValueError, hint="[recordings] key names a file of 16 to 64 bytes"):
+        return read_key(config.recordings.key)
+
+
+def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
+    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM; in a folder, to segments, within its
+    budget.
 
     What is recorded is asked of the daemon and written down first, and again at the end: a device may have been
     connected, or have shown itself, meanwhile.
@@ -41,7 +94,7 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
     what it took stays. A message that cannot be read is counted, and the first one's reason told. The outcome's exit
     code is REFUSED where ticks were lost, UNREACHABLE where the daemon was gone at the end.
     """
-    keys = keys_of(endpoints.curve)
+    key, keys = key_of(config), keys_of(endpoints.curve)
     context = zmq.Context()
     try:
         telemetry = listening(context, endpoints.telemetry, keys, TELEMETRY_TOPIC)
@@ -50,17 +103,16 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
             if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
             about = _about(endpoints, wait_s)
-            if path.is_dir():
-                path /= f"{datetime.now():%Y-%m-%dT%H-%M-%S}.mcap"
             try:
-                writer = RecordingWriter(path, about)
+                recorder = Recorder(path, about, config.recordings, key)
             except FileExistsError as error:
                 raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
             except OSError as error:
                 raise usage_error(f"{path}: {error.strerror}", "give a file in a directory you may write to") from error
+            writer = recorder.writer
             try:
                 with writer:
-                    outcome = _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
+                    outcome = _record(recorder, telemetry, ticks, duration_s, is_interrupted)
                     with contextlib.suppress(ClientError):  # the daemon has gone: what was true at the start stands
                         writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
                     return outcome
@@ -68,7 +120,8 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
                 raise CommandError(
                     Exit.REFUSED,
                     "not_written",
-                    f"{path}: {error.strerror}, after {writer.tick_count} ticks and {writer.telemetry_count} snapshots",
+                    f"{writer.path}: {error.strerror}, after {writer.tick_count} ticks and {writer.telemetry_count} "
+                    "snapshots",
                     "make room; what is in the file, all but about the last second, reads like any other recording",
                 ) from error
     finally:
@@ -97,14 +150,13 @@ def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_inter
 
 
 def _record(
-    writer: RecordingWriter,
-    path: Path,
+    recorder: Recorder,
     telemetry: "zmq.Socket[bytes]",
     ticks: "zmq.Socket[bytes]",
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
-    unreadable = 0
+    writer, unreadable = recorder.writer, 0
     start_s = heard_s = time.monotonic()
     is_over = False
     while not is_over:
@@ -119,9 +171,9 @@ def _record(
                 data = socket.recv_multipart()[-1]
                 try:
                     if socket is telemetry:
-                        writer.telemetry(decode(data, Telemetry))
+                        recorder.telemetry(decode(data, Telemetry))
                     else:
-                        writer.ticks(decode_ticks(data))
+                        recorder.ticks(decode_ticks(data))
                         heard_s = time.monotonic()
                 except MessageError as error:
                     unreadable += 1
@@ -131,7 +183,7 @@ def _record(
     silent_s = end_s - heard_s
     is_silent = writer.note_silence(round(silent_s * 1e9))
     result = {
-        "file": str(path),
+        "file": str(writer.path),
         "seconds": round(end_s - start_s, 3),
         "telemetry": writer.telemetry_count,
         "telemetry_lost": writer.telemetry_lost,
@@ -146,7 +198,7 @@ def _record(
         f"{writer.gaps} gaps (longest {writer.longest_gap_ms:.0f} ms), {writer.ticks_lost} ticks and "
         f"{writer.telemetry_lost} snapshots lost"
     )
-    text = f"{path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots; {losses}"
+    text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots; {losses}"
     if is_silent and silent_s > SILENT_S:
         text += f"; nothing came in the last {silent_s:.1f} s: the daemon has gone, or does not run any more"
         return Outcome(result, text, Exit.UNREACHABLE)

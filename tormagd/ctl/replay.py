@@ -24,8 +24,8 @@ def replay(
     faults: Sequence[str],
     config_file: Path | None,
 ) -> Outcome:
-    """Runs the file. An outcome that is not bit-exact has the exit code REFUSED. Raises CommandError (USAGE) where file
-    or options cannot be used."""
+    """Runs the file. An outcome that is not bit-exact, or of a file that was altered, has the exit code REFUSED. Raises
+    CommandError (USAGE) where file or options cannot be used."""
     arguments = [
         f"--from={from_s!r}",
         f"--plant={plant}",
@@ -42,12 +42,15 @@ def replay(
     except ChildProcessError as error:
         hint = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
         raise usage_error(str(error), hint) from error
+    seal = result["seal"]
+    head = f"{seal['state']}: {seal['why']}\n" + (f"altered: {result['odd']}\n" if result["odd"] else "")
+    is_sound = seal["is_sound"] and not result["odd"]
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
     notes += "" if result["is_complete"] else "\nthe file is cut short"
     if "rerun" not in result:
-        return Outcome(result, _instead(result) + notes)
+        return Outcome(result, head + _instead(result) + notes, Exit.DONE if is_sound else Exit.REFUSED)
     text, is_exact = _rerun(result["rerun"])
-    return Outcome(result, text + notes, Exit.DONE if is_exact else Exit.REFUSED)
+    return Outcome(result, head + text + notes, Exit.DONE if is_exact and is_sound else Exit.REFUSED)
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:

@@ -66,7 +66,7 @@ def header(config: Config, core: Core) -> dict[str, str]:
 class BlackBox:
     """Hands over what the journal has. Without a `folder` nothing is kept, and `report` says so."""
 
-    def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
+    def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int, key: str = "") -> None:
         self._folder = folder
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: Beside | None = None
@@ -81,7 +81,7 @@ class BlackBox:
                 self._refusal = f"the process that keeps it did not start: {error.strerror}"
             else:
                 self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-                self._beside.send(msgspec.msgpack.encode(Begin(str(folder), header)))
+                self._beside.send(msgspec.msgpack.encode(Begin(str(folder), header, key)))
         if folder is not None and self._refusal:
             log.warning("no black box: %s", self._refusal)
         self.journal = Journal(is_kept=self._beside is not None)

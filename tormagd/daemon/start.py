@@ -60,7 +60,8 @@ async def _run(
 ) -> None:
     # before this thread is a real-time one: the process that is started keeps off its processors
     folder = state_folder(config.black_box.folder, "blackbox")
-    box = BlackBox(folder, {} if folder is None else header(config, core), config.rates.control_hz)
+    known = {} if folder is None else header(config, core)
+    box = BlackBox(folder, known, config.rates.control_hz, config.recordings.key)
     beside = SearchProcess(core) if core.element.is_beside else None
     refused = prepare(config.realtime)
     file = None if options.config is None else str(options.config.absolute())

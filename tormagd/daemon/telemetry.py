@@ -8,7 +8,7 @@ from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import SafetyState
-from tormagd_client.messages import VERSION, BeliefReport, Telemetry, Tick, TickRecord, Verdict
+from tormagd_client.messages import VERSION, BeliefReport, Mark, Telemetry, Tick, TickRecord, Verdict
 
 
 def tick_record(
@@ -113,6 +113,7 @@ def snapshot(
     belief: dict[str, BeliefReport],
     handle: tuple[float, float] | None = None,
     verdict: Verdict | None = None,
+    mark: Mark | None = None,
 ) -> Telemetry:
     """The telemetry of the newest tick. `handle` is its place and rate, positive pushing on."""
     known = tick.left_mm is not None and tick.right_mm is not None
@@ -145,4 +146,5 @@ def snapshot(
         handle_mm=None if handle is None else handle[0],
         handle_mm_s=None if handle is None else handle[1],
         verdict=verdict,
+        mark=mark,
     )

@@ -34,10 +34,12 @@ from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd_client.messages import (
+    MAX_MARK_CHARACTERS,
     ArmReport,
     Description,
     DeviceReport,
     Explained,
+    Mark,
     OutputReport,
     PortraitReport,
     Request,
@@ -101,6 +103,7 @@ class TelemetryLoop:
         "Where the scene may be changed."
         self._service = Service()
         self._status: msgspec.Raw | None = None
+        self._mark: Mark | None = None
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // config.rates.telemetry_hz
         self._answers, self._told_s = 0, -math.inf
         self._histograms = self._in_turn()
@@ -221,7 +224,8 @@ class TelemetryLoop:
         planner, stepper = self._inference.planner, self._control.stepper
         believed = beliefs(planner, stepper, now_s, self._core.scene.terms)
         told = self.topics.handle(), self.topics.verdict()
-        return snapshot(self._ticks[-1], self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed, *told)
+        known = self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed
+        return snapshot(self._ticks[-1], *known, *told, self._mark)
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
         """Says to systemd how it stands, and feeds its watchdog while plans and device states are fresh."""
@@ -290,6 +294,8 @@ class TelemetryLoop:
             return self._give(request.args.get("source"))
         if request.command == "confirm":
             return self._confirm(request.args.get("what"))
+        if request.command == "mark":
+            return self._put(request.args.get("text"))
         if request.command == "blackbox":
             return {"file": str(self.keep("REQUEST", 0.0))}
         if request.command == "arm":
@@ -303,6 +309,15 @@ class TelemetryLoop:
             # without a device nothing moves yet: a request to open is kept for it, and no other is taken
             "is_connected": self._connection.measurement is not None,
         }
+
+    def _put(self, text: object) -> dict[str, Any]:
+        """Puts an event into telemetry, and so into what is recorded."""
+        if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
+            allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
+            raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")
+        self._mark = Mark(t_ns=time.time_ns(), text=text)
+        log.info("mark: %s", text)
+        return msgspec.to_builtins(self._mark)  # type: ignore[no-any-return]
 
     def _confirm(self, what: object) -> dict[str, Any]:
         try:

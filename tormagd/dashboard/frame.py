@@ -6,11 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 
+from tormagd.recording.overview import LATE_US
 from tormagd_client.messages import BeliefReport
 
 SHOWN_S = 20.0
-LATE_US = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1_000.0, 2_000.0, 5_000.0)
-"Where one bar of the lateness histogram ends and the next begins."
+DRIVEN = ("ENABLED", "PAUSED")
+"In other states the gap opens or is open, and the planned field stands nowhere."
 
 
 class Held(msgspec.Struct, frozen=True):

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from tormagd.dashboard.frame import Frame, Held, late_counts
+from tormagd.dashboard.frame import DRIVEN, Frame, Held, late_counts
 from tormagd_client.aio import AsyncClient
 from tormagd_client.errors import ClientError
 from tormagd_client.messages import Description, Explained, MessageError, Status, Telemetry
@@ -37,7 +37,7 @@ class Live:
         self._kept: deque[Telemetry] = deque(maxlen=KEPT)
         self._new: list[Telemetry] = []
         self.browsers: set[asyncio.Queue[bytes]] = set()
-        self._explained: dict[str, Explained] = {}
+        self._explained: dict[str, dict[str, Explained]] = {"limits": {}, "faults": {}}
         self._heard_s = time.monotonic()
         self._why_silent = ""
         self._portrait = {"portrait": description.portrait}
@@ -113,7 +113,8 @@ class Live:
             events.put_nowait(data)
 
     def _learn(self, status: Status) -> None:
-        self._explained |= {each.code: each for each in (*status.fault_details, *status.limit_details)}
+        self._explained["limits"] |= {each.code: each for each in status.limit_details}
+        self._explained["faults"] |= {each.code: each for each in status.fault_details}
 
     def _shown_status(self) -> dict[str, object]:
         return {"status": self._status, "explained": self._explained}
@@ -128,7 +129,7 @@ class Live:
             measured_N=[each.measured_cf for each in snapshots],
             gap_mm=[each.gap_mm for each in snapshots],
             gap_wanted_mm=[each.gap_setpoint_mm for each in snapshots],
-            field_mT=[each.field_mT for each in snapshots],
+            field_mT=[each.field_mT if each.operating_state in DRIVEN else None for each in snapshots],
             operating_state=newest.operating_state,
             held=[Held(code, count / len(kept), code in newest.limits) for code, count in times.most_common()],
             faults=newest.faults,

@@ -4,19 +4,26 @@ import math
 import re
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.dashboard.frame import SHOWN_S, Frame, Held, late_counts
-from tormagd.recording.reader import Recording
-from tormagd.recording.series import BREAK_S, Band, Series, bands, series, start_ns, tracking_rms_N
+from tormagd.dashboard.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
+from tormagd.recording.overview import BREAK_NS, BREAK_S
+from tormagd.recording.reader import Recording, RecordingFile
+from tormagd.recording.series import Band, Series, bands, series
 from tormagd.safety.codes import FAULTS, LIMITS
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
 
 STEP_S = 0.02
 "Between two points of a curve, as live."
-OVERVIEW = 600
-"Stretches that the whole recording is shown in, each by its least and greatest force."
+FIELDS = (
+    "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "left_mm", "right_mm", "gap_setpoint_mm", "reference_gap_mm",
+    "field_mT", "operating_state", "limits", "faults", "lateness_us", "tick", "belief",
+)  # fmt: skip
+"Of a message, what a frame is made from."
+AHEAD_NS = 10_000_000_000
+"So much more is read than one frame shows: the next is near."
 CURVES = {
     "asked_N": "setpoint_cf",
     "governed_N": "governed_cf",
@@ -32,62 +39,89 @@ _BELIEVED = re.compile(r"belief\.[^.]+\.value")
 class Recorded:
     """A recording with messages. Times are seconds since its first one."""
 
-    def __init__(self, recording: Recording, name: str) -> None:
+    def __init__(self, file: RecordingFile) -> None:
         """Raises ValueError where there is no message in it."""
-        self._recording, self._name = recording, name
-        self._start_ns = start_ns(recording)
-        self._curves = {ours: series(recording, theirs) for ours, theirs in CURVES.items()}
-        self._late = series(recording, "lateness_us")
-        self._states = bands(recording, "operating_state")
-        self._limits, self._faults = bands(recording, "limits"), bands(recording, "faults")
-        # the curves are the ticks' where there are any, and end with them
-        shown = recording.ticks if recording.ticks.t_ns.size else recording.telemetry
-        self.duration_s = (int(shown.t_ns.max()) - self._start_ns) * 1e-9
+        overview = file.overview
+        if not overview.ticks and not overview.snapshots:
+            raise ValueError("the recording has no messages: was the daemon running?")
+        self._file, self._overview, self._start_ns = file, overview, overview.start_ns
+        self.duration_s = overview.duration_s
+        self._read: tuple[int, int, Recording] | None = None
 
     @property
     def about(self) -> dict[str, Any]:
         """What the page begins with: what is recorded, the whole of it at a glance, and what its codes mean."""
-        metadata = self._recording.metadata
+        file, following = self._file, self._overview.following
         return {
             "kind": "recording",
-            "name": self._name,
+            "name": file.path.name,
             "start_s": self._start_ns * 1e-9,
             "duration_s": self.duration_s,
-            "is_complete": self._recording.is_complete,
-            "tracking_rms_N": tracking_rms_N(self._recording),
-            "version": metadata.get("version", ""),
-            "scene": (self._recording.described("scene", dict[str, Any]) or {}).get("name", ""),
-            "portrait": self._recording.described("portrait", PortraitReport),
-            "overview": self._overview(),
+            "is_complete": file.is_complete,
+            "following": msgspec.to_builtins(following),
+            "version": file.metadata.get("version", ""),
+            "thinned": file.metadata.get("thinned", ""),
+            "scene": (file.described("scene", dict[str, Any]) or {}).get("name", ""),
+            "portrait": file.described("portrait", PortraitReport),
+            "overview": self._glance(),
+            # a fault and a limit of one name are two things
             "explained": {
-                code: Explained(code, known.cause, known.remedy) for code, known in (LIMITS | FAULTS).items()
+                kind: {code: Explained(code, known.cause, known.remedy) for code, known in of.items()}
+                for kind, of in (("limits", LIMITS), ("faults", FAULTS))
             },
         }
 
     def frame(self, at_s: float) -> Frame:
-        """The seconds before `at_s`, which is taken to lie within the recording."""
+        """The seconds before `at_s`, which is taken to lie within the recording. Raises RecordingError."""
         at_s = min(max(at_s, 0.0), self.duration_s)
         from_s = max(at_s - SHOWN_S, 0.0)
+        at_ns = self._start_ns + round(at_s * 1e9)
+        # what was there at a moment stands in the message before it, and ends with the one after
+        shown = self._between(at_ns - round((SHOWN_S + BREAK_S) * 1e9), at_ns + BREAK_NS)
         times_s = np.append(np.arange(from_s, at_s, STEP_S), at_s)
-        late = None if self._late is None else self._late.values[_within(self._late, from_s, at_s)]
+        curves = {ours: self._sampled(shown, theirs, times_s) for ours, theirs in CURVES.items()}
+        states, faults = self._bands(shown, "operating_state"), self._bands(shown, "faults")
+        driven = [any(_is_at(band, t_s) for band in states if band.name in DRIVEN) for t_s in times_s]
+        if states:
+            curves["field_mT"] = [
+                known if is_driven else None for known, is_driven in zip(curves["field_mT"], driven, strict=True)
+            ]
+        late = self._series(shown, "lateness_us")
+        late_us = [] if late is None else late.values[_within(late, from_s, at_s)].tolist()
         limits = [
             Held(band.name, share, _is_at(band, at_s))
-            for band in self._limits
+            for band in self._bands(shown, "limits")
             if (share := _share(band, from_s, at_s)) > 0.0
         ]
         return Frame(
             t_s=(self._start_ns * 1e-9 + times_s).tolist(),
-            **{ours: _sampled(known, times_s) for ours, known in self._curves.items()},
-            operating_state=next((band.name for band in self._states if _is_at(band, at_s)), ""),
+            **curves,
+            operating_state=next((band.name for band in states if _is_at(band, at_s)), ""),
             held=sorted(limits, key=lambda held: -held.share),
-            faults=[band.name for band in self._faults if _is_at(band, at_s)],
-            belief=self._belief(at_s),
-            late_counts=late_counts([] if late is None else late[np.isfinite(late)].tolist()),
+            faults=[band.name for band in faults if _is_at(band, at_s)],
+            belief=self._belief(shown, at_s),
+            late_counts=late_counts(value for value in late_us if math.isfinite(value)),
         )
 
-    def _belief(self, at_s: float) -> dict[str, BeliefReport]:
+    def _between(self, from_ns: int, to_ns: int) -> Recording:
+        """What was recorded in this time, and somewhat more."""
+        if self._read is None or not self._read[0] <= from_ns < to_ns <= self._read[1]:
+            span = from_ns - AHEAD_NS, to_ns + AHEAD_NS
+            self._read = (*span, self._file.between(*span, FIELDS))
+        return self._read[2]
+
+    def _bands(self, shown: Recording, name: str) -> tuple[Band, ...]:
+        return bands(shown, name, self._start_ns)
+
+    def _series(self, shown: Recording, name: str) -> Series | None:
+        return series(shown, name, self._start_ns)
+
+    def _sampled(self, shown: Recording, name: str, times_s: np.ndarray) -> list[float | None]:
+        return _sampled(self._series(shown, name), times_s)
+
+    def _belief(self, shown: Recording, at_s: float) -> dict[str, BeliefReport]:
         """What the newest snapshot said; nothing where that is too old to be true, or said nothing."""
-        telemetry = self._recording.telemetry
+        telemetry = shown.telemetry
         numbers, words, at_ns = telemetry.numbers, telemetry.words, self._start_ns + round(at_s * 1e9)
         row = int(np.searchsorted(telemetry.t_ns, at_ns, side="right")) - 1
         if row < 0 or (at_ns - telemetry.t_ns[row]) * 1e-9 > BREAK_S:
@@ -100,22 +134,18 @@ class Recorded:
                 told[name] = BeliefReport(value=value, sd=sd, unit=unit, acts=bool(acts))
         return told
 
-    def _overview(self) -> dict[str, Any]:
-        """Ends of the stretches, the least and greatest measured force in each, and where faults and limits were."""
-        edges_s = np.linspace(0.0, self.duration_s, OVERVIEW + 1)
-        low: list[float | None] = [None] * OVERVIEW
-        high = low.copy()
-        measured = self._curves["measured_N"] or self._curves["asked_N"]
-        if measured is not None:
-            ends = np.searchsorted(measured.t_s, edges_s)
-            for stretch in range(OVERVIEW):
-                values = measured.values[ends[stretch] : ends[stretch + 1]]
-                values = values[np.isfinite(values)]
-                if values.size:
-                    low[stretch], high[stretch] = float(values.min()), float(values.max())
-        codes = {"limits": self._limits, "faults": self._faults}
-        spans = {name: [span for band in found for span in band.spans_s] for name, found in codes.items()}
-        return {"t_s": edges_s[1:].tolist(), "low_N": low, "high_N": high, **spans}
+    def _glance(self) -> dict[str, Any]:
+        """The least and greatest measured force of each stretch, and where faults and limits were."""
+        known = self._overview.series("measured_cf") or self._overview.series("setpoint_cf")
+        spans = {
+            name: [span for of in self._overview.spans_s(name).values() for span in of] for name in ("limits", "faults")
+        }
+        if known is None:
+            return {"t_s": [], "low_N": [], "high_N": [], **spans}
+        low, high = (
+            [value if math.isfinite(value) else None for value in side.tolist()] for side in (known.low, known.high)
+        )
+        return {"t_s": known.t_s.tolist(), "low_N": low, "high_N": high, **spans}
 
 
 def _number(numbers: dict[str, NDArray[np.float64]], name: str, row: int) -> float | None:

@@ -11,9 +11,11 @@ import msgspec
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from tormagd.dashboard.frame import LATE_US, SHOWN_S
+from tormagd.dashboard.frame import SHOWN_S
 from tormagd.dashboard.live import Live
 from tormagd.dashboard.recorded import Recorded
+from tormagd.recording.overview import LATE_US
+from tormagd.recording.reader import RecordingError
 
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
@@ -49,7 +51,11 @@ def application(shown: Live | Recorded) -> web.Application:
 
     async def frame(request: web.Request) -> web.Response:
         assert isinstance(shown, Recorded)
-        return _json(shown.frame(_seconds(request.query.get("at_s", ""))))
+        at_s = _seconds(request.query.get("at_s", ""))
+        try:
+            return _json(await asyncio.to_thread(shown.frame, at_s))
+        except RecordingError as error:  # the file was taken away, or is damaged there
+            raise web.HTTPGone(text=str(error)) from error
 
     made = web.Application(middlewares=[_only_this_machine])
     made.on_response_prepare.append(_headers)

@@ -6,18 +6,22 @@ the daemon handed over. The metadata `black_box` are its header. `tormagctl repl
 """
 
 import json
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
-from mcap.records import Channel, Message, Metadata
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
 from tormagd.bounded_file import in_place_of
 from tormagd.keeping import READ, WROTE, Part
 from tormagd.recording.reader import RecordingError, opened, scan
+from tormagd.recording.seal import KEYED, PLAIN, SEALED, SealingFile
+from tormagd.recording.stream import Record, Sent
 from tormagd.recording.writer import (
     ABOUT,
     CHUNK_BYTES,
@@ -32,8 +36,11 @@ from tormagd.recording.writer import (
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"
 MAX_PARTS = 100_000
-MAX_BYTES = 200_000_000
-"""Of all parts of a file that is read: a black box is a tenth of it."""
+MAX_BYTES = 50_000_000
+"Of all parts of a file that is read: what is kept is less."
+MAX_ENTRIES = 1_000_000
+"Half a minute at 4 kHz has fewer."
+MAX_TIME_DIFFERENCE_NS = 1_000
 
 
 class BlackBoxFile(msgspec.Struct, frozen=True):
@@ -44,6 +51,8 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
     entries: list[Any]
     is_complete: bool = True
     "False for one that ends in the middle: what came before is there."
+    odd: str = ""
+    "The first message that people see and that is not what the core was given and gave; empty where each is."
 
 
 class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -66,42 +75,72 @@ def frames_in(entry: Any) -> list[Frame]:
     return [Frame(time_s, direction, data.hex(), identifier) for identifier, data in pieces]
 
 
-def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
-    """Writes a new file of some parts, whole or not at all; returns how many ticks are in it. Raises FileExistsError,
-    OSError."""
+class Shown(NamedTuple):
+    """A message that people see: its topic, when, and its number among those of its topic, from 0 or 1."""
+
+    topic: str
+    t_ns: int
+    sequence: int
+    data: bytes
+
+
+class Derived:
+    """What people see of a black box, made from its parts."""
+
+    def __init__(self, columns: tuple[str, ...]) -> None:
+        self._columns = columns
+        self.ticks = self._frames = 0
+        self._offset_ns: int | None = None
+        "Of the clock of `monotonic_s` to that of `t_ns`."
+
+    def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
+        """The messages of a part. Frames are timed by the offset of the first part, so that they stay in their order;
+        None where nothing says it. Raises ValueError, TypeError for odd entries."""
+        if self._offset_ns is None:
+            self._offset_ns = offset_ns
+        for entry in entries:
+            if is_tick(entry):
+                data = msgspec.json.encode(known_values(self._columns, entry))
+                yield Shown(TICKS_TOPIC, entry[0], self.ticks, data)
+                self.ticks += 1
+            for frame in frames_in(entry):
+                self._frames += 1
+                t_ns = round(frame.monotonic_s * 1e9) + (self._offset_ns or 0)
+                yield Shown(FRAMES_TOPIC, t_ns, self._frames, msgspec.json.encode(frame))
+
+
+def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> int:
+    """Writes a new file of some parts, whole or not at all, sealed with `key`; returns how many ticks are in it. Raises
+    FileExistsError, OSError."""
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
     with in_place_of(path) as beside:
-        return _write(beside, header, parts)
+        return _write(beside, header, parts, key)
 
 
-def _write(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
+def _write(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes) -> int:
     columns = tuple(json.loads(header["columns"]))
-    ticks = frames = 0
+    derived = Derived(columns)
     with path.open("wb") as file:
-        mcap = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        sealing = SealingFile(file, key)
+        mcap = Writer(sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         mcap.start(profile="", library=f"tormagd {__version__}")
+        mcap.add_metadata(SEALED, {"by": KEYED if key else PLAIN})
         mcap.add_metadata(HEADER, header)
         mcap.add_metadata(ABOUT, {"version": __version__, "kind": HEADER})
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
         kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
         tick_channel = registered(mcap, TICKS_TOPIC, tick_schema(kinds))
         frame_channel = registered(mcap, FRAMES_TOPIC, plain_schema(Frame))
-        began = parts[0]
+        channels = {TICKS_TOPIC: tick_channel, FRAMES_TOPIC: frame_channel}
         for number, part in enumerate(parts):
             mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
-            for entry in msgspec.msgpack.decode(part.entries):
-                if is_tick(entry):
-                    data = msgspec.json.encode(known_values(columns, entry))
-                    mcap.add_message(tick_channel, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks)
-                    ticks += 1
-                for frame in frames_in(entry):
-                    frames += 1
-                    t_ns = began.t_ns + round((frame.monotonic_s - began.time_s) * 1e9)  # so they stay in their order
-                    data = msgspec.json.encode(frame)
-                    mcap.add_message(frame_channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
-        mcap.finish()  # type: ignore[no-untyped-call]
-    return ticks
+            offset_ns = part.t_ns - round(part.time_s * 1e9)
+            for shown in derived.of(msgspec.msgpack.decode(part.entries), offset_ns):
+                t_ns, channel = shown.t_ns, channels[shown.topic]
+                mcap.add_message(channel, t_ns, shown.data, publish_time=t_ns, sequence=shown.sequence)
+        sealing.finish(mcap)
+    return derived.ticks
 
 
 def is_tick(entry: Any) -> bool:
@@ -111,27 +150,87 @@ def is_tick(entry: Any) -> bool:
 
 def read_black_box(path: Path) -> BlackBoxFile:
     """The black box in `path`. Raises RecordingError: not readable, not MCAP, damaged, or no black box."""
-    header: dict[str, str] = {}
-    entries: list[Any] = []
-    cores: set[int] = set()
-    size = parts = 0
-
-    def take(record: Any) -> None:
-        nonlocal size, parts
-        if isinstance(record, Channel) and record.topic == CORE_TOPIC:
-            if record.message_encoding != "msgpack":
-                raise ValueError(f"{CORE_TOPIC} is {record.message_encoding[:20]!r}: allowed is msgpack")
-            cores.add(record.id)
-        elif isinstance(record, Metadata) and record.name == HEADER:
-            header.update(record.metadata)
-        elif isinstance(record, Message) and record.channel_id in cores:
-            size, parts = size + len(record.data), parts + 1
-            if size > MAX_BYTES or parts > MAX_PARTS:
-                raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
-            entries.extend(msgspec.msgpack.decode(record.data, type=list[Any]))
-
+    found = _Reading(path)
     with opened(path) as file:
-        is_complete = scan(file, str(path), take)
-    if not header or not entries:
-        raise RecordingError(f"{path}: no black box of tormagd: it has nothing in {CORE_TOPIC} or no header {HEADER!r}")
-    return BlackBoxFile(header, entries, is_complete)
+        is_complete = scan(file, str(path), found.take, found.message)
+    if not found.header or not found.entries:
+        raise RecordingError(f"{path}: {NO_BLACK_BOX}")
+    if is_complete:
+        found.end()
+    return BlackBoxFile(found.header, found.entries, is_complete, found.odd)
+
+
+NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC} or no header {HEADER!r}"
+
+
+class _Reading:
+    """A black box as it is read. What people see in it is compared with what replays, message by message."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.header: dict[str, str] = {}
+        self.entries: list[Any] = []
+        self.odd = ""
+        self._topics: dict[int, str] = {}
+        self._derived: Derived | None = None
+        self._expected: dict[str, deque[Shown]] = {TICKS_TOPIC: deque(), FRAMES_TOPIC: deque()}
+        self._late_ns: int | None = None
+        "By how much the frames' times are later than the clock of the ticks."
+        self._size = self._parts = 0
+
+    def take(self, record: Record) -> None:
+        """A record that is no message. Raises ValueError."""
+        if record.opcode == Opcode.CHANNEL:
+            channel = record.read(Channel)
+            if channel.topic == CORE_TOPIC and channel.message_encoding != "msgpack":
+                raise ValueError(f"{CORE_TOPIC} is {channel.message_encoding[:20]!r}: allowed is msgpack")
+            self._topics.setdefault(channel.id, channel.topic)
+        elif record.opcode == Opcode.METADATA:
+            known = record.read(Metadata)
+            if known.name == HEADER:
+                self.header.update(known.metadata)
+
+    def message(self, sent: Sent) -> None:
+        """A message: of the core, or derived from it. Raises UNREADABLE."""
+        if not self.header:
+            raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read
+        topic = self._topics.get(sent.channel, "")
+        if topic == CORE_TOPIC:
+            self._part(sent)
+        elif topic in self._expected and not self.odd:
+            self._compare(topic, sent)
+
+    def _part(self, sent: Sent) -> None:
+        self._size, self._parts = self._size + len(sent.data), self._parts + 1
+        if self._size > MAX_BYTES or self._parts > MAX_PARTS:
+            raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
+        entries = msgspec.msgpack.decode(sent.data, type=list[Any])
+        self.entries.extend(entries)
+        if len(self.entries) > MAX_ENTRIES:
+            raise ValueError(f"over {MAX_ENTRIES} entries")
+        if self._derived is None:
+            self._derived = Derived(tuple(json.loads(self.header.get("columns", "[]"))))
+        try:
+            for shown in self._derived.of(entries, None):
+                self._expected[shown.topic].append(shown)
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
+
+    def _compare(self, topic: str, sent: Sent) -> None:
+        expected = self._expected[topic].popleft() if self._expected[topic] else None
+        if expected is None or (sent.sequence, sent.data) != (expected.sequence, expected.data):
+            is_same = False
+        elif topic == TICKS_TOPIC:
+            is_same = sent.t_ns == expected.t_ns
+        else:
+            late_ns = sent.t_ns - expected.t_ns
+            self._late_ns = late_ns if self._late_ns is None else self._late_ns
+            is_same = abs(late_ns - self._late_ns) <= MAX_TIME_DIFFERENCE_NS
+        if not is_same:
+            self.odd = f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has"
+
+    def end(self) -> None:
+        """The file is over: nothing may be missing."""
+        for topic, left in self._expected.items():
+            if left and not self.odd:
+                self.odd = f"message {left[0].sequence} is missing in {topic}, and {CORE_TOPIC} has it"

@@ -1,18 +1,18 @@
 """One picture of a recording: what was asked, what was rendered, and what held it back."""
 
 import io
-from collections.abc import Iterable
 from datetime import UTC, datetime
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tormagd.bounded_file import in_place_of
-from tormagd.recording.reader import Recording
-from tormagd.recording.series import BREAK_S, Band, Series, bands, end_ns, series, start_ns, tracking_rms_N
+from tormagd.recording.following import FollowingReport
+from tormagd.recording.overview import BREAK_S, Overview, Series
 
 FORMATS = (".png", ".svg", ".pdf")
 
@@ -35,14 +35,21 @@ LINES = {
 "Of each panel, the lowest first: quantity, name, colour, style and width."
 
 
-def figure(recording: Recording, title: str) -> Figure:
+rcParams["text.parse_math"] = False
+"A name with a dollar in it is no formula."
+
+Spans = dict[str, list[tuple[float, float]]]
+"By code, the stretches of time it was there, seconds from the start."
+
+
+def figure(overview: Overview, title: str, is_complete: bool = True) -> Figure:
     """Four panels over one time axis: force, gap, duty, and lanes naming the state, limits and faults at each moment.
 
     Raises ValueError for a recording without messages.
     """
-    begin = start_ns(recording)
-    faults, limits = bands(recording, "faults"), bands(recording, "limits")
-    states = bands(recording, "operating_state")
+    if not overview.ticks and not overview.snapshots:
+        raise ValueError("the recording has no messages: was the daemon running?")
+    states, limits, faults = (overview.spans_s(kind) for kind in ("operating_state", "limits", "faults"))
     lanes = bool(states) + len(limits) + max(1, len(faults))
     fig = Figure(figsize=(12.0, 7.6 + 0.25 * lanes), layout="constrained")
     heights = (4.2, 2.2, 1.6, 0.3 + 0.3 * lanes)
@@ -54,55 +61,82 @@ def figure(recording: Recording, title: str) -> Figure:
         (duty, "duty", "drive duty"),
     ):
         for name, text, colour, style, width in LINES[quantity]:
-            _line(axes, series(recording, name), text, colour, style, width)
+            _line(axes, overview.series(name), text, colour, style, width)
         _dress(axes, label, quantity)
     duty.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
     duty.set_ylim(-1.08, 1.08)
     _lanes(lane, states, limits, faults)
     for axes in (force, gap, duty):
-        for start, end in (span for band in faults for span in band.spans_s):
-            axes.axvspan(start, end, color=RED, alpha=0.12, linewidth=0, zorder=0)
+        held = [(start, end - start) for spans in faults.values() for start, end in spans]
+        place = axes.get_xaxis_transform()
+        axes.broken_barh(held, (0.0, 1.0), transform=place, color=RED, alpha=0.12, linewidth=0, zorder=0)
+    for mark in overview.marks:
+        at_s = (mark.t_ns - overview.start_ns) * 1e-9
+        force.axvline(at_s, color=BLACK, linewidth=0.8, linestyle=":")
+        force.annotate(
+            mark.text[:40], (at_s, 1.0), xycoords=("data", "axes fraction"), fontsize=8, va="top", rotation=90
+        )
 
-    when = datetime.fromtimestamp(begin / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    when = datetime.fromtimestamp(overview.start_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     lane.set_xlabel(f"seconds since {when}")
-    fig.suptitle(_headline(recording, title, faults), x=0.01, ha="left", fontsize=13, fontweight="bold")
-    lane.set_xlim(0.0, max((end_ns(recording) - begin) / 1e9, 1e-3))
+    fig.suptitle(_headline(overview, title, is_complete), x=0.01, ha="left", fontsize=13, fontweight="bold")
+    lane.set_xlim(0.0, max(overview.duration_s, 1e-3))
     return fig
 
 
-def save_plot(recording: Recording, path: Path, title: str) -> None:
-    """Draw `figure` into `path`. Raises ValueError for a suffix other than FORMATS, or without messages; OSError."""
+def picture(drawn: Figure, form: str) -> bytes:
+    """The figure as a file of this form, such as "png"."""
+    made = io.BytesIO()
+    drawn.savefig(made, format=form, dpi=110)
+    return made.getvalue()
+
+
+def save_plot(drawn: Figure, path: Path) -> None:
+    """Writes the figure to `path`. Raises ValueError for a suffix other than FORMATS; OSError."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
-    picture = io.BytesIO()
-    figure(recording, title).savefig(picture, format=path.suffix[1:].lower(), dpi=110)
+    data = picture(drawn, path.suffix[1:].lower())
     # a full disk leaves neither half a picture nor takes the one that was there
     with in_place_of(path) as unfinished:
-        unfinished.write_bytes(picture.getvalue())
+        unfinished.write_bytes(data)
 
 
-def _headline(recording: Recording, title: str, faults: Iterable[Band]) -> str:
-    error_N = tracking_rms_N(recording)
-    names = ", ".join(band.name for band in faults)
+def followed(known: FollowingReport) -> str:
+    """How well the force was followed, in words; empty where it was not."""
+    if known.rms_N is None:
+        return ""
+    text = f"measured minus asked while following {known.rms_N * 1e3:.0f} mN rms"
+    if known.aligned_rms_N is not None:
+        text += f", {known.aligned_rms_N * 1e3:.0f} aligned by {known.delay_ms:.0f} ms"
+    return text
+
+
+def _headline(overview: Overview, title: str, is_complete: bool) -> str:
+    names = ", ".join(overview.spans_s("faults"))
+    told = followed(overview.following)
     parts = [
         title,
-        *(
-            []
-            if error_N is None
-            else [f"measured minus asked {error_N * 1e3:.0f} mN rms (sensor noise and approach included)"]
-        ),
         f"faults: {names}" if names else "no fault",
-        *([] if recording.is_complete else ["recording cut short"]),
+        *([] if is_complete else ["recording cut short"]),
     ]
-    return "  ·  ".join(parts)
+    return "  ·  ".join(parts) + (f"\n{told} (sensor noise included)" if told else "")
 
 
 def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:
     if data is None:
         return
-    cuts = np.flatnonzero(np.diff(data.t_s) > BREAK_S) + 1
-    t_s, values = np.insert(data.t_s, cuts, data.t_s[cuts]), np.insert(data.values, cuts, np.nan)
-    axes.plot(t_s, values, style, label=label, color=colour, linewidth=width)
+    # from the least to the greatest of each stretch, and on to the next
+    t_s, values = np.repeat(data.t_s, 2), np.column_stack((data.low, data.high)).ravel()
+    step_s = float(np.median(np.diff(data.t_s))) if data.t_s.size > 1 else 0.0
+    cuts = np.flatnonzero(np.diff(t_s) > max(BREAK_S, 2.0 * step_s)) + 1
+    axes.plot(
+        np.insert(t_s, cuts, t_s[cuts]),
+        np.insert(values, cuts, np.nan),
+        style,
+        label=label,
+        color=colour,
+        linewidth=width,
+    )
 
 
 def _dress(axes: Axes, label: str, quantity: str) -> None:
@@ -116,18 +150,22 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
         axes.text(0.5, 0.5, f"no {quantity} recorded", transform=axes.transAxes, ha="center", va="center", color=GREY)
 
 
-def _lanes(axes: Axes, states: tuple[Band, ...], limits: tuple[Band, ...], faults: tuple[Band, ...]) -> None:
+def _lanes(axes: Axes, states: Spans, limits: Spans, faults: Spans) -> None:
     """One lane for the operating state, one for every limit and fault that occurred, each with its name and share."""
-    rows: list[tuple[str, list[tuple[Band, str]]]] = [
-        *([("state", [(band, STATE_COLOURS.get(band.name, GREY)) for band in states])] if states else []),
-        *((f"limit {band.name}", [(band, colour)]) for band, colour in zip(limits, cycle(LIMIT_COLOURS), strict=False)),
-        *([(f"FAULT {band.name}", [(band, RED)]) for band in faults] or [("no faults", [])]),
+    rows: list[tuple[str, list[tuple[str, Spans, str]]]] = [
+        *([("state", [(name, states, STATE_COLOURS.get(name, GREY)) for name in states])] if states else []),
+        *(
+            (f"limit {name}", [(name, limits, colour)])
+            for name, colour in zip(limits, cycle(LIMIT_COLOURS), strict=False)
+        ),
+        *([(f"FAULT {name}", [(name, faults, RED)]) for name in faults] or [("no faults", [])]),
     ]
     for row, (_, parts) in enumerate(rows):
-        for band, colour in parts:
-            axes.broken_barh([(a, b - a) for a, b in band.spans_s], (row - 0.38, 0.76), facecolors=colour, linewidth=0)
+        for name, of, colour in parts:
+            spans = of[name]
+            axes.broken_barh([(a, b - a) for a, b in spans], (row - 0.38, 0.76), facecolors=colour, linewidth=0)
             if row == 0 and states:
-                _name_spans(axes, band, row)
+                _name_spans(axes, name, spans, row)
     axes.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=9)
     for label, (name, _) in zip(axes.get_yticklabels(), rows, strict=True):
         label.set_color(RED if name.startswith("FAULT") else BLACK)
@@ -138,15 +176,15 @@ def _lanes(axes: Axes, states: tuple[Band, ...], limits: tuple[Band, ...], fault
     axes.spines[["top", "right", "left"]].set_visible(False)
 
 
-def _name_spans(axes: Axes, band: Band, row: int) -> None:
+def _name_spans(axes: Axes, name: str, spans: list[tuple[float, float]], row: int) -> None:
     """The state's name inside its longest stretch; the clip keeps it from running over its neighbours' ends."""
-    start, end = max(band.spans_s, key=lambda span: span[1] - span[0])
+    start, end = max(spans, key=lambda span: span[1] - span[0])
     axes.annotate(
-        band.name,
+        name,
         ((start + end) / 2, row),
         ha="center",
         va="center",
         fontsize=8,
-        color="white" if band.name in ("ENABLED", "FAULT") else BLACK,
+        color="white" if name in ("ENABLED", "FAULT") else BLACK,
         clip_on=True,
     )

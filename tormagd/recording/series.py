@@ -9,12 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tormagd.recording.following import AWAY, Following
+from tormagd.recording.overview import BREAK_S, Floats
 from tormagd.recording.reader import Recording
 
-Floats = NDArray[np.float64]
-
-BREAK_S = 0.1
-"Rows further apart than this do not belong together: nothing is known between them."
 SPELLINGS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gap_mm": (("gap_mm",), ("left_mm", "right_mm")),
     "gap_setpoint_mm": (("gap_setpoint_mm",), ("reference_gap_mm",)),
@@ -54,9 +52,10 @@ def end_ns(recording: Recording) -> int:
     return max(int(columns.t_ns.max()) for columns in (recording.ticks, recording.telemetry) if columns.t_ns.size)
 
 
-def series(recording: Recording, name: str) -> Series | None:
-    """The quantity `name`, from the ticks or else from telemetry; None where neither has a known value of it."""
-    begin = start_ns(recording)
+def series(recording: Recording, name: str, begin_ns: int | None = None) -> Series | None:
+    """The quantity `name`, from the ticks or else from telemetry, since `begin_ns` or the first message; None where
+    neither has a known value of it."""
+    begin = start_ns(recording) if begin_ns is None else begin_ns
     for columns in (recording.ticks, recording.telemetry):
         for spelling in SPELLINGS.get(name, ((name,),)):
             if not all(part in columns.numbers for part in spelling):
@@ -67,9 +66,10 @@ def series(recording: Recording, name: str) -> Series | None:
     return None
 
 
-def bands(recording: Recording, name: str) -> tuple[Band, ...]:
-    """The codes in the words `name`, in the order of their first appearance, each with its stretches of time."""
-    begin = start_ns(recording)
+def bands(recording: Recording, name: str, begin_ns: int | None = None) -> tuple[Band, ...]:
+    """The codes in the words `name`, in the order of their first appearance, each with its stretches of time since
+    `begin_ns` or the first message."""
+    begin = start_ns(recording) if begin_ns is None else begin_ns
     for columns in (recording.ticks, recording.telemetry):
         words = columns.words.get(name)
         if words is not None and any(words):
@@ -92,15 +92,22 @@ def _bands(t_s: Floats, words: list[tuple[str, ...]]) -> tuple[Band, ...]:
 
 
 def tracking_rms_N(recording: Recording) -> float | None:
-    """RMS of measured minus asked force while ENABLED (all of it where no state is recorded); None without both."""
+    """RMS of measured minus asked force while following; None where nothing was followed, or not both were recorded."""
     asked, measured = series(recording, "setpoint_cf"), series(recording, "measured_cf")
     if asked is None or measured is None:
         return None
     wanted = np.interp(measured.t_s, asked.t_s, asked.values)
-    used = np.isfinite(wanted) & np.isfinite(measured.values) & is_enabled(recording, measured.t_s)
-    if not used.any():
-        return None
-    return float(np.sqrt(np.mean(np.square(measured.values[used] - wanted[used]))))
+    enabled = is_enabled(recording, measured.t_s)
+    for name in AWAY:
+        for band in bands(recording, "limits"):
+            for start, end in band.spans_s if band.name == name else ():
+                enabled &= (measured.t_s < start) | (measured.t_s >= end)
+    following = Following()
+    for t_s, asked_N, measured_N, is_on in zip(measured.t_s, wanted, measured.values, enabled, strict=True):
+        is_known = bool(is_on) and np.isfinite(asked_N) and np.isfinite(measured_N)
+        following.add(round(t_s * 1e9), asked_N if is_known else None, measured_N, {})
+    report = following.made()
+    return None if report is None else report.rms_N
 
 
 def is_enabled(recording: Recording, t_s: Floats) -> NDArray[np.bool_]:

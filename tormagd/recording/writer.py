@@ -2,14 +2,15 @@
 
 Two channels: `/telemetry`, the daemon's snapshots as published, and `/ticks`, one message for every control tick. Such
 files open in Foxglove and PlotJuggler as they are. What is not known is left out of its message: viewers read plain
-schemas only, in which a number cannot be null.
+schemas only, in which a number cannot be null. An overview stands at the end, and seals between (`seal.py`).
 """
 
 import contextlib
 import errno
+import fcntl
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -18,13 +19,20 @@ import msgspec
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
+from tormagd.recording.overview import OverviewBuilder
+from tormagd.recording.seal import KEYED, PLAIN, SEALED, SealingFile
+from tormagd.recording.thinning import AROUND_S, Thinning
 from tormagd.recording.ticks import TickBatch, Value
-from tormagd_client.messages import Telemetry, TickRecord
+from tormagd_client.messages import Mark, Telemetry, TickRecord
 
 ABOUT = "tormagd"
 "The metadata records that say what is recorded."
 CUT = "cut_by"
 "Among them: why a recording ends before its end."
+THINNED = "thinned"
+"Among them: which ticks are there, where not all are."
+OVERVIEW = "overview"
+"The attachment with all of it at a glance."
 TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC = "/ticks"
 NUMBER_COLUMN = "tick"
@@ -39,42 +47,96 @@ INDEX_SHARE = 64
 GAP_NS = 10_000_000
 "A step between two ticks that counts as a gap. Under one lost batch (20 ms), above a few merged ticks."
 
+Room = Callable[[Path, int], str]
+"Makes room on the disk, for so many bytes beside a file; says why there is none."
+
+
+def disk_room(path: Path, needed_bytes: int) -> str:
+    """Why a file's disk has no room for so many bytes more; empty where it has."""
+    free, least = shutil.disk_usage(path.parent).free, LEAST_FREE_BYTES + needed_bytes
+    if free >= least:
+        return ""
+    return f"No space left on device: {free / 1e6:.1f} MB are free, needed are {least / 1e6:.1f}"
+
 
 class RecordingWriter:
-    """One MCAP file, open for writing until `close`; also a context manager.
+    """One MCAP file, open for writing until `close`, or several one after the other; also a context manager.
 
     `telemetry_count`, `tick_count`, `telemetry_lost` (missing `seq`), `ticks_lost` (missing numbers), `gaps` (steps
-    between ticks above GAP_NS, or back in time) and `longest_gap_ms` count what was written. Raises FileExistsError
+    between ticks above GAP_NS, or back in time) and `longest_gap_ms` count what came. Raises FileExistsError
     rather than overwrite a recording, and OSError where the file cannot be made or, from `telemetry`, `ticks`,
-    `describe` and `close`, written. Where the disk is nearly full, it is closed in order first, and says why; where the
-    disk fails without that warning, it reads up to its last whole chunk.
+    `describe`, `rotate` and `close`, written. Where there is no room, it is closed in order first, and says why; where
+    the disk fails without that warning, it reads up to its last whole chunk.
+
+    `key` seals it, `room` makes room, and of `every` ticks one is written where nothing happens.
     """
 
-    def __init__(self, path: Path, metadata: dict[str, str] | None = None) -> None:
-        self._path, self._file = path, path.open("xb")
-        self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._mcap.start(profile="", library=f"tormagd {__version__}")
-        self.describe({"version": __version__, **(metadata or {})})
-        self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
-        self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
-        self._columns: tuple[str, ...] = ()
-        self._kinds: dict[str, str] = {}
-        "What is known of the columns' types; of one that has been null until now, nothing."
-        self._tick_channel = 0
+    def __init__(
+        self,
+        path: Path,
+        metadata: dict[str, str] | None = None,
+        key: bytes = b"",
+        room: Room = disk_room,
+        every: int = 1,
+    ) -> None:
+        self._key, self._room, self._thinning = key, room, Thinning(every)
+        self._about = {"version": __version__, **(metadata or {})}
+        if every > 1:
+            self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
         self._last_seq: int | None = None
         self._last_tick: int | None = None
         self._last_tick_ns: int | None = None
         self._batch_ns = 0
-        self._chunk_ns: int | None = None
+        self.mark: Mark | None = None
+        "The newest that a snapshot told."
         self.telemetry_count = 0
         self.telemetry_lost = 0
         self.tick_count = 0
         self.ticks_lost = 0
         self.gaps = 0
         self.longest_gap_ms = 0.0
+        self._begin(path, "")
+
+    def _begin(self, path: Path, follows: str) -> None:
+        self.path = path
+        self._file = path.open("xb")
+        with contextlib.suppress(OSError):  # some file systems know no locks
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody takes it away while it is written
+        self._sealing = SealingFile(self._file, self._key)
+        self._overview = OverviewBuilder()
+        self._mcap = Writer(self._sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._mcap.start(profile="", library=f"tormagd {__version__}")
+        self._mcap.add_metadata(SEALED, {"by": KEYED if self._key else PLAIN, "follows": follows})
+        self._mcap.add_metadata(ABOUT, self._about)
+        self._sealing.flush()
+        self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
+        self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
+        self._columns: tuple[str, ...] = ()
+        self._kinds: dict[str, str] = {}
+        "What is known of the columns' types; of one that has been null until now, nothing."
+        self._tick_channel = 0
+        self._chunk_ns: int | None = None
+        self.begin_ns: int | None = None
+        "When the first message of this file was, ns since 1970."
+
+    @property
+    def size(self) -> int:
+        """How large the file is."""
+        return self._sealing.tell()
+
+    @property
+    def lasted_s(self) -> float:
+        """How long the file lasts until now, by its messages."""
+        return 0.0 if self.begin_ns is None or self._chunk_ns is None else (self._chunk_ns - self.begin_ns) * 1e-9
+
+    def rotate(self, path: Path) -> None:
+        """Ends the file, and goes on in a new one. Raises FileExistsError, OSError."""
+        self._end()
+        self._begin(path, self._sealing.digest)
 
     def describe(self, metadata: dict[str, str]) -> None:
         """Write down what is recorded: names and values. Of a name that is described twice, the later one counts."""
+        self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 
     def telemetry(self, message: Telemetry) -> None:
@@ -82,8 +144,12 @@ class RecordingWriter:
         if self._last_seq is not None and message.seq > self._last_seq + 1:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
-        data = msgspec.json.encode(_known(msgspec.to_builtins(message)))
-        self._add(self._telemetry_channel, message.t_ns, data, self.telemetry_count)
+        if message.mark is not None and message.mark != self.mark:
+            self.mark = message.mark
+            self._thinning.happened(message.t_ns)
+        known = _known(msgspec.to_builtins(message))
+        self._add(self._telemetry_channel, message.t_ns, msgspec.json.encode(known), self.telemetry_count)
+        self._overview.add(message.t_ns, known | {"mark": message.mark}, is_tick=False)
         self.telemetry_count += 1
 
     def ticks(self, batch: TickBatch) -> None:
@@ -107,7 +173,8 @@ class RecordingWriter:
                     self.ticks_lost += number - self._last_tick - 1
                 self._last_tick = number
             message = known_values(batch.columns, row)
-            self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
+            self._write(self._thinning.take((t_ns, message)))
+            self._overview.add(t_ns, message, is_tick=True)
             self.tick_count += 1
         if before_ns is not None and self._last_tick_ns is not None:
             self._batch_ns = self._last_tick_ns - before_ns
@@ -123,13 +190,20 @@ class RecordingWriter:
         return True
 
     def close(self) -> None:
-        """Write the index and close the file. Without it the file still reads, up to its last whole chunk.
+        """Write what waits, overview and index, and close the file. Without it the file still reads, up to its last
+        whole chunk.
 
-        Raises OSError where the index or the last chunk could not be written.
+        Raises OSError where one of them could not be written.
         """
         if not self._file.closed:
-            with self._file:
-                self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._write(self._thinning.rest(self._thinning.every))
+            self._end()
+
+    def _end(self) -> None:
+        with self._file:
+            self._mcap.flush()  # type: ignore[no-untyped-call]
+            self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", self._overview.made().packed())
+            self._sealing.finish(self._mcap)
 
     def __enter__(self) -> Self:
         return self
@@ -147,6 +221,10 @@ class RecordingWriter:
         self.gaps += 1
         self.longest_gap_ms = max(self.longest_gap_ms, gap_ns / 1e6)
 
+    def _write(self, ticks: Sequence[tuple[int, dict[str, Value]]]) -> None:
+        for t_ns, message in ticks:
+            self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
+
     def _channel_of(self, message: dict[str, Value]) -> int:
         """The tick channel whose schema `message` obeys."""
         kinds = self._kinds
@@ -160,17 +238,20 @@ class RecordingWriter:
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
         if self._chunk_ns is None or abs(t_ns - self._chunk_ns) > CHUNK_NS:
+            self.begin_ns = self.begin_ns or t_ns
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._require_room()
+            if self._chunk_ns is not None:
+                self._sealing.seal()
+                self._sealing.flush()
             self._chunk_ns = t_ns
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 
     def _require_room(self) -> None:
-        free, least = shutil.disk_usage(self._path).free, LEAST_FREE_BYTES + self._file.tell() // INDEX_SHARE
-        if free < least:
-            reason = f"No space left on device: {free / 1e6:.1f} MB are free, needed are {least / 1e6:.1f}"
+        reason = self._room(self.path, self.size // INDEX_SHARE)
+        if reason:
             self.describe({CUT: reason})
-            self.close()
+            self._end()
             raise OSError(errno.ENOSPC, reason)
 
 

@@ -14,6 +14,7 @@ from tormagd.config import load_config
 from tormagd.output import write_line
 from tormagd.recording.black_box import BlackBoxFile, read_black_box
 from tormagd.recording.reader import RecordingError
+from tormagd.recording.seal import read_key, verified
 from tormagd.replay.rebuild import Recorded, ReplayError, differences, rebuilt, recorded
 from tormagd.replay.rehearse import changed, rehearse, script
 from tormagd.replay.rerun import rerun
@@ -33,10 +34,13 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         configured = None if options.config is None else load_config(options.config)
         box = read_black_box(options.file)
+        seal = verified(options.file, read_key("" if configured is None else configured.recordings.key))
         try:
             known = recorded(box, options.file.absolute().parent)
             result: dict[str, Any] = {
                 "file": str(options.file),
+                "seal": {"state": seal.state, "is_sound": seal.is_sound, "why": seal.why},
+                "odd": box.odd,
                 "version": known.header["version"],
                 "reason": box.header.get("reason", ""),
                 "build": str(settle()),
@@ -50,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
                 result["rerun"] = msgspec.to_builtins(done)
         except ReplayError as error:
             raise ReplayError(f"{options.file}: {error}") from error
-    except (ConfigError, RecordingError, ReplayError) as error:
+    except (ConfigError, RecordingError, ReplayError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
     return 0 if write_line(json.dumps(result), sys.stdout) is None else 1

@@ -20,6 +20,7 @@ TELEMETRY_TOPIC, MOTION_TOPIC, VERDICT_TOPIC = b"\xde", b"motion", b"verdict"
 "What to subscribe to at the telemetry socket. A snapshot is a map of over 15 fields, which msgpack begins so."
 MAX_MESSAGE_BYTES = 16_384  # a setpoint with the longest preview is under 3 kB; libzmq drops what is larger
 MAX_SOURCE_CHARACTERS = 64
+MAX_MARK_CHARACTERS = 200
 MAX_PREVIEW_SAMPLES = 256
 MAX_FORCE_N = 1_000.0  # a value no brake of this size can mean; `ask` keeps to the scene's own range
 MAX_VALIDITY_MS = 60_000.0
@@ -148,12 +149,20 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     why: tuple[str, ...]
 
 
+class Mark(msgspec.Struct, frozen=True, kw_only=True):
+    """An event that a person has marked with `tormagctl mark`: when, CLOCK_REALTIME, and what they said."""
+
+    t_ns: int
+    text: str
+
+
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME.
 
     `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion. `belief` has the
     believed values of the device by name. `search_age_ms` is how long ago the search for `field_mT` began, where it
-    runs beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest setpoint's. A
+    runs beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest setpoint's, `mark` the newest since
+    the start. A
     value that is not known (no device, no setpoint) is null.
     """
 
@@ -183,6 +192,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     handle_mm: float | None = None
     handle_mm_s: float | None = None
     verdict: Verdict | None = None
+    mark: Mark | None = None
 
 
 class Explained(msgspec.Struct, frozen=True):

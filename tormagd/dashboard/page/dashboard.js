@@ -8,7 +8,7 @@ const PATH_S = 2;
 
 const at = (id) => document.getElementById(id);
 const kept = {t_s: [], ...Object.fromEntries(CURVES.map((name) => [name, []]))};
-let about, explained = {}, portrait = null, charts = {}, notGranted = [];
+let about, explained = {limits: {}, faults: {}}, portrait = null, charts = {}, notGranted = [];
 
 // ---- charts
 
@@ -137,7 +137,7 @@ function element(name, text, ...classes) {
 }
 
 function code(name, label, kind) {
-  const made = element("div", "", kind), why = explained[name];
+  const made = element("div", "", kind), why = explained[kind === "fault" ? "faults" : "limits"][name];
   made.append(element("b", name), label);
   if (why) made.append(`: ${why.cause}`, element("em", `Next: ${why.remedy}`));
   return made;
@@ -248,8 +248,10 @@ function recording() {
   at("recording").hidden = false;
   explained = about.explained;
   at("scene").textContent = about.scene && `scene ${about.scene}`;
-  const error = about.tracking_rms_N === null ? "" : `, measured minus asked ${(1e3 * about.tracking_rms_N).toFixed(0)} mN rms`;
-  at("source").textContent = `${about.name}, ${new Date(1e3 * about.start_s).toLocaleString()}${error}`;
+  const {rms_N, aligned_rms_N, delay_ms} = about.following;
+  const aligned = aligned_rms_N === null ? "" : ` (${(1e3 * aligned_rms_N).toFixed(0)} with ${delay_ms.toFixed(0)} ms taken out)`;
+  const error = rms_N === null ? "" : `, while following measured minus asked ${(1e3 * rms_N).toFixed(0)} mN rms${aligned}`;
+  at("source").textContent = `${about.name}, ${new Date(1e3 * about.start_s).toLocaleString()}${error}${about.thinned && `; ${about.thinned}`}`;
   at("silence").textContent = about.is_complete ? "" : "cut short: the end of this recording is missing";
   at("rates").textContent = "Of the ticks recorded in the 20 s shown, bars as logarithms.";
   portrait = about.portrait;

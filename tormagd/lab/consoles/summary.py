@@ -7,8 +7,9 @@ import msgspec
 import numpy as np
 
 from tormagd.lab.arrays import rms
+from tormagd.recording.overview import Floats
 from tormagd.recording.reader import Recording
-from tormagd.recording.series import Floats, bands, end_ns, is_enabled, series, start_ns, tracking_rms_N
+from tormagd.recording.series import bands, end_ns, is_enabled, series, start_ns, tracking_rms_N
 
 FIELDS = (
     "setpoint_cf",

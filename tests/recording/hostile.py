@@ -1,0 +1,146 @@
+"""Files that somebody made to hurt whoever reads them: each small, and each meant to cost what it does not hold."""
+
+import io
+import json
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, Metadata, Schema
+from mcap.writer import Writer
+
+from tormagd.recording.stream import MAGIC
+
+NESTED = b"[" * 100_000 + b"]" * 100_000
+
+
+def written(fill: Callable[[Writer], None]) -> bytes:
+    """A file by the usual writer."""
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start()
+    fill(writer)
+    writer.finish()
+    return file.getvalue()
+
+
+def messages(*data: bytes, topic: str = "/ticks", t_ns: int = 1, encoding: str = "json", **metadata: Any) -> bytes:
+    """A file of these messages."""
+
+    def fill(writer: Writer) -> None:
+        for name, known in metadata.items():
+            writer.add_metadata({"header": "black_box", "about": "tormagd"}[name], known)
+        channel = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=0)
+        for each in data:
+            writer.add_message(channel, log_time=t_ns, data=each, publish_time=t_ns)
+
+    return written(fill)
+
+
+def record(*things: Any) -> bytes:
+    """Records one after the other."""
+    builder = RecordBuilder()
+    for thing in things:
+        thing.write(builder)
+    return bytes(builder.end())
+
+
+def chunk(data: bytes, size: int) -> bytes:
+    """A file of one chunk of packed data that says it has this size."""
+    return MAGIC + record(Channel(1, "/ticks", "json", {}, 0), Chunk("zstd", data, 1, 1, 0, size))
+
+
+def ended(body: bytes, *summary: Any, at: int | None = None) -> bytes:
+    """A file with this body and summary."""
+    data = MAGIC + body
+    return data + record(*summary, Footer(len(data) if at is None else at, 0, 0)) + MAGIC
+
+
+def rows(count: int) -> Iterator[bytes]:
+    """Ticks with a column of their own each."""
+    for number in range(count):
+        yield b'{"c%d":1}' % number
+
+
+ZEROS = b"\0" * 1_500_000_000
+CHANNEL = record(Channel(1, "/ticks", "json", {}, 0))
+FILES: dict[str, Callable[[], bytes]] = {
+    "a message of brackets": lambda: messages(NESTED),
+    "a small message of brackets": lambda: messages(b'{"a":' * 120 + b"1" + b"}" * 120),
+    "a schema of brackets": lambda: written(
+        lambda w: (w.register_channel("/ticks", "json", w.register_schema("x", "jsonschema", NESTED)), None)[1]
+    ),
+    "metadata of brackets": lambda: messages(b"{}", about={"scene": NESTED.decode(), "portrait": NESTED.decode()}),
+    "a chunk that unpacks to 1.5 GB": lambda: chunk(zstandard.compress(ZEROS), 1_500_000_000),
+    "a chunk that unpacks to more than it says": lambda: chunk(zstandard.compress(ZEROS[:300_000_000]), 1_000),
+    "a chunk with a huge window": lambda: chunk(
+        zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters(window_log=27)).compress(
+            ZEROS[:200_000_000]
+        ),
+        15_000_000,
+    ),
+    "a chunk that says less than nothing": lambda: chunk(b"", 2**63),
+    "ever new columns": lambda: messages(*rows(40_000)),
+    "a million columns at once": lambda: messages(json.dumps(dict.fromkeys(map(str, range(400_000)), 1)).encode()),
+    "a list of a million": lambda: messages(b'{"limits":[' + b",".join([b'"A"'] * 1_000_000) + b"]}"),
+    "a word of 7 MB": lambda: messages(b'{"operating_state":"' + b"A" * 7_000_000 + b'"}'),
+    "a number beyond all": lambda: messages(b'{"setpoint_cf":1' + b"0" * 400 + b"}"),
+    "a time beyond all": lambda: messages(b"{}", t_ns=2**64 - 1),
+    "a record of 2^63 bytes": lambda: MAGIC + struct.pack("<BQ", Opcode.CHUNK, 2**63) + b"x",
+    "records of no kind": lambda: MAGIC + b"\0" * 20_000_000,
+    "70,000 channels": lambda: MAGIC + record(*(Channel(n % 65_536, f"/{n}", "json", {}, 0) for n in range(70_000))),
+    "70,000 schemas in a chunk": lambda: chunk(
+        zstandard.compress(s := record(*(Schema(n % 65_000, b"{}", "jsonschema", "x") for n in range(70_000)))), len(s)
+    ),
+    "metadata of 20 MB": lambda: MAGIC + record(Metadata("tormagd", {str(n): "x" for n in range(1_400_000)})),
+    "an index that points into itself": lambda: ended(
+        CHANNEL,
+        Channel(1, "/ticks", "json", {}, 0),
+        AttachmentIndex(8, 9, 0, 0, 1, "overview", "x"),
+        ChunkIndex(9, 8, "", 1, 9, 0, {}, 0, 9),
+    ),
+    "an overview of rubbish": lambda: ended(
+        record(Attachment(0, 0, "overview", "x", b"\xdd\xff\xff\xff\xff" * 1_000)),
+        AttachmentIndex(8, 9, 0, 0, 1, "overview", "x"),
+    ),
+    "a summary that is the file": lambda: ended(CHANNEL * 3, at=8),
+    "a message without a chunk, too short": lambda: MAGIC + CHANNEL + struct.pack("<BQ", Opcode.MESSAGE, 3) + b"abc",
+    "a chunk within a chunk": lambda: chunk(zstandard.compress(s := record(Chunk("", b"x" * 99, 1, 1, 0, 99))), len(s)),
+    "another compression": lambda: MAGIC + record(Chunk("lz4", b"x", 1, 1, 0, 9)),
+}
+"What is no recording, and is refused."
+BOXES: dict[str, Callable[[], bytes]] = {
+    "entries of brackets": lambda: messages(
+        b"\x91" * 100_000 + b"\xc0", topic="/core", encoding="msgpack", header={"a": ""}
+    ),
+    "an array that says 2^32": lambda: messages(
+        b"\xdd\xff\xff\xff\xff", topic="/core", encoding="msgpack", header={"a": ""}
+    ),
+    "a hundred million entries": lambda: messages(
+        *[b"\xdd" + struct.pack(">I", 6_000_000) + b"\xc0" * 6_000_000] * 12,
+        topic="/core",
+        encoding="msgpack",
+        header={"a": ""},
+    ),
+    "columns of brackets": lambda: messages(
+        msgpack.packb(["step"]), topic="/core", encoding="msgpack", header={"columns": "[" * 200_000}
+    ),
+    "no header, and a long recording": lambda: messages(*[b"{}"] * 100_000),
+}
+"What is no black box, and is refused."
+
+
+def write(folder: Path) -> list[tuple[str, Path]]:
+    """All of them: what each is of, and the file."""
+    made = []
+    for kind, files in (("recording", FILES), ("black box", BOXES)):
+        for number, (name, make) in enumerate(files.items()):
+            path = folder / f"{kind.replace(' ', '_')}_{number}.mcap"
+            path.write_bytes(make())
+            made.append((f"{kind}: {name}", path))
+    return made

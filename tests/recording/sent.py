@@ -1,0 +1,20 @@
+"""Messages as a daemon publishes them."""
+
+from typing import Any
+
+from tormagd.recording.ticks import TickBatch
+from tormagd_client.messages import Telemetry, Tick
+
+START_NS = 1_790_000_000_000_000_000
+COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "left_mm", "right_mm", "left_duty")
+
+
+def batch(*rows: tuple[Any, ...], columns: tuple[str, ...] = COLUMNS) -> TickBatch:
+    return TickBatch(v=1, columns=columns, rows=tuple((START_NS + int(ms * 1e6), *rest) for ms, *rest in rows))
+
+
+def telemetry(ms: float, seq: int, **changes: Any) -> Telemetry:
+    known: dict[str, Any] = dict.fromkeys(Telemetry.__struct_fields__)
+    known |= {"v": 1, "t_ns": START_NS + int(ms * 1e6), "seq": seq, "operating_state": "ENABLED", "is_homed": True}
+    known |= {"is_busy": False, "duty": (0.5, -0.5), "limits": (), "faults": (), "tick": Tick(20.0, 100.0)}
+    return Telemetry(**(known | changes))

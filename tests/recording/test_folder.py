@@ -1,0 +1,187 @@
+"""A folder of recordings never outgrows its budget, and nothing marked is lost, wherever its recorder is killed."""
+
+import random
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from sent import START_NS, batch, telemetry
+
+from tormagd.config import Recordings
+from tormagd.ctl.record import Recorder, budget_of
+from tormagd.recording.folder import Budget, RecordingFolder, mark, segment_of
+from tormagd.recording.reader import RecordingFile
+from tormagd.recording.seal import State, verified
+from tormagd.recording.writer import RecordingWriter
+from tormagd_client.messages import Mark
+
+DAY_S = 86_400.0
+BUDGET = Budget(segment_bytes=40_000, segment_s=3_600.0, most_bytes=1_000_000, most_s=30 * DAY_S, free_bytes=1_000_000)
+SETTINGS = Recordings(segment_MB=0.1, segment_minutes=60.0, most_MB=2.0, most_days=30.0, free_MB=1.0)
+
+
+class Clock:
+    """The time that a test says, s since 1970."""
+
+    def __init__(self) -> None:
+        self.now_s = START_NS * 1e-9
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def write(folder: RecordingFolder, clock: Clock, *, is_marked: bool = False) -> Path:
+    """A small recording of this moment."""
+    path = folder.new()
+    with RecordingWriter(path, room=folder.room) as writer:
+        ms = (clock.now_s - START_NS * 1e-9) * 1e3
+        rng = random.Random(ms)
+        writer.ticks(batch(*((ms + i, rng.random(), rng.random(), 35.0, 36.0, 0.25) for i in range(200))))
+    return mark(path) if is_marked else path
+
+
+def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> None:
+    clock = Clock()
+    folder = RecordingFolder(tmp_path, BUDGET, clock)
+    for name in ("mine.mcap", "2020-01-01T00-00-00-mine.mcap"):
+        (tmp_path / name).write_bytes(b"x" * 20_000)
+    marked = write(folder, clock, is_marked=True)
+    made = []
+    for _ in range(40):
+        clock.now_s += 3_600.0
+        made.append(write(folder, clock))
+        assert sum(each.bytes for each in folder.segments()) <= BUDGET.most_bytes
+    left = {each.path for each in folder.segments()}
+    kept = [path for path in made if path in left]
+    assert kept == made[-len(kept) :]
+    assert 3 < len(kept) < 40
+    assert {marked, tmp_path / "mine.mcap", tmp_path / "2020-01-01T00-00-00-mine.mcap"} < left
+    # one that is written is not taken away, whatever its age; nor is a marked one
+    clock.now_s += 3_600.0
+    held = folder.new()
+    kept = [path for path in kept if path.exists()]
+    with RecordingWriter(held) as writer:
+        writer.ticks(batch((0, 1.0, 1.0, 35.0, 36.0, 0.25)))
+        clock.now_s += 31 * DAY_S
+        assert {each.path for each in folder.prune()} == set(kept)
+        assert held.exists()
+    assert [each.path for each in folder.prune()] == [held]
+    assert marked.exists()
+
+
+def fill(folder: RecordingFolder, clock: Clock) -> None:
+    """With marked recordings."""
+    for _ in range(60):
+        clock.now_s += 3_600.0
+        write(folder, clock, is_marked=True)
+
+
+def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, monkeypatch: Any) -> None:
+    clock = Clock()
+    folder = RecordingFolder(tmp_path, BUDGET, clock)
+    with pytest.raises(OSError, match=r"up to 0\.5 come, its budget is 1\.0, and nothing unmarked is left"):
+        fill(folder, clock)
+    assert all(each.is_marked for each in folder.segments())
+    # what stays free is for black boxes
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=900_000))
+    assert "0.9 MB are free, and 1.0 stay so for black boxes" in folder.room(tmp_path, 0)
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "2026-13-45T05-09-27Z.mcap", "2026-11-26T05-09-27.mcap.part"])
+def test_other_names_are_not_marked(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(ValueError, match="allowed is that of a segment"):
+        mark(tmp_path / name)
+
+
+def test_the_former_name_is_a_segment_too(tmp_path: Path) -> None:
+    path = tmp_path / "2026-11-26T05-09-27.mcap"
+    path.touch()
+    assert (segment_of(path).began_s, segment_of(path).is_marked) == (1_795_669_767.0, False)
+    assert mark(mark(path)) == tmp_path / "2026-11-26T05-09-27-marked.mcap"
+
+
+def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
+    """Through the recorder, as it goes on for so long: a batch a minute, now and then a mark; the marks."""
+    recorder = Recorder(path, {}, SETTINGS, b"", clock)
+    told, newest = [], None
+    with recorder.writer:
+        for minute in range(hours * 60):
+            clock.now_s += 60.0
+            ms = (clock.now_s - START_NS * 1e-9) * 1e3
+            recorder.ticks(batch(*((ms + i, rng.random(), rng.random(), rng.random(), 36.0, 0.25) for i in range(20))))
+            if rng.random() < 0.0005:
+                newest = Mark(t_ns=round(clock.now_s * 1e9), text=f"event {minute}")
+                told.append(newest.text)
+            recorder.telemetry(telemetry(ms + 20, minute, mark=newest))
+    return told
+
+
+def marks_in(path: Path) -> set[str]:
+    """What the recordings that are kept tell."""
+    kept = [RecordingFile(each) for each in path.glob("*-marked.mcap")]
+    return {known.text for each in kept for known in each.overview.marks}
+
+
+def test_a_year_of_recording_never_outgrows_its_budget_and_keeps_its_marks(tmp_path: Path) -> None:
+    clock, rng = Clock(), random.Random(1)
+    marks, written_bytes = [], 0
+    for _ in range(12):
+        before = {each.path for each in RecordingFolder(tmp_path, budget_of(SETTINGS), clock).segments()}
+        marks += record(tmp_path, clock, 12, rng)
+        clock.now_s += 30 * DAY_S
+        segments = RecordingFolder(tmp_path, budget_of(SETTINGS), clock).segments()
+        assert sum(each.bytes for each in segments) <= 2_000_000
+        written_bytes += sum(each.bytes for each in segments if each.path not in before)
+    assert written_bytes > 3_000_000
+    assert marks_in(tmp_path) == set(marks) != set()
+    assert {verified(each).state for each in tmp_path.iterdir()} == {State.WHOLE}
+
+
+KILLED = """
+import os, random, signal, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from test_folder import Clock, record
+what, after = sys.argv[3].split(":")
+count = [int(after)]
+def deadly(function, is_before):
+    def call(*arguments, **named):
+        count[0] -= 1
+        if count[0] < 0 and is_before:
+            os.kill(os.getpid(), signal.SIGKILL)
+        result = function(*arguments, **named)
+        if count[0] < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+    return call
+from tormagd.recording import folder, seal, writer
+room, name = {
+    "rotate": (writer.RecordingWriter, "rotate"), "begin": (writer.RecordingWriter, "_begin"),
+    "prune": (Path, "unlink"), "mark": (Path, "rename"), "seal": (seal.SealingFile, "seal"),
+    "finish": (seal.SealingFile, "finish"),
+}[what]
+setattr(room, name, deadly(getattr(room, name), random.Random(after).random() < 0.5))
+record(Path(sys.argv[2]), Clock(), 24, random.Random(3))
+"""
+
+
+@pytest.mark.parametrize("where", ["rotate:2", "begin:4", "prune:1", "mark:0", "mark:1", "seal:90", "finish:3"])
+def test_a_recorder_that_is_killed_anywhere_loses_nothing_marked(tmp_path: Path, where: str) -> None:
+    command = [sys.executable, "-P", "-c", KILLED, str(Path(__file__).parent), str(tmp_path), where]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    clock = Clock()
+    said = {each.name: verified(each).state for each in tmp_path.iterdir()}
+    assert set(said.values()) <= {State.WHOLE, State.UNFINISHED, State.UNSEALED}
+    assert list(said.values()).count(State.WHOLE) >= len(said) - 1
+    before = marks_in(tmp_path)
+    # whoever records next goes on from there
+    clock.now_s += 40 * DAY_S
+    record(tmp_path, clock, 12, random.Random(5))
+    assert before <= marks_in(tmp_path)
+    assert sum(each.stat().st_size for each in tmp_path.iterdir()) <= 2_000_000

@@ -1,0 +1,43 @@
+"""Whatever a file holds, readers refuse it in a sentence or read it, within 200 MB."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import hostile
+
+READABLE = {
+    "a small message of brackets", "metadata of brackets", "ever new columns", "a million columns at once",
+    "a time beyond all", "a summary that is the file", "a chunk within a chunk",
+}  # fmt: skip
+"Of what is in these, nothing is shown: a picture of them is empty."
+MOST_MB = 200
+READ = """
+import json, sys
+from pathlib import Path
+from tormagd.recording.black_box import read_black_box
+from tormagd.recording.reader import RecordingError, RecordingFile, read_recording
+said = {}
+for path in map(Path, sys.argv[1:]):
+    for read in (read_black_box,) if path.name.startswith("black") else (RecordingFile, read_recording):
+        try:
+            read(path)
+        except RecordingError as error:
+            said[f"{read.__name__} {path}"] = str(error)
+peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1]
+print(json.dumps([int(peak) // 1024, said]))
+"""
+
+
+def test_hostile_files_are_refused_in_a_sentence_within_200_MB(tmp_path: Path) -> None:
+    files = {str(path): name.partition(": ")[2] for name, path in hostile.write(tmp_path)}
+    assert len(files) >= 25
+    done = subprocess.run([sys.executable, "-P", "-c", READ, *files], capture_output=True, text=True, check=True)
+    peak_MB, said = json.loads(done.stdout)
+    assert peak_MB < MOST_MB
+    assert [each for each in said.values() if "\n" in each or len(each) > 400] == []
+    refused = {files[each.split(" ", 1)[1]] for each in said}
+    assert set(files.values()) - refused <= READABLE
+    glanced = {files[each.split(" ", 1)[1]] for each in said if not each.startswith("read_recording")}
+    assert set(files.values()) - glanced <= READABLE

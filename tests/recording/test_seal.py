@@ -1,0 +1,125 @@
+"""Seals: any byte changed, cut, put elsewhere or of another file is named; an end that is missing is told apart."""
+
+import random
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from sent import batch, telemetry
+
+from tormagd.recording.seal import State, read_key, verified
+from tormagd.recording.stream import HEAD, MAGIC, SEAL, records
+from tormagd.recording.writer import RecordingWriter
+
+KEY = b"0123456789abcdef"
+CHANGES = 200
+
+
+def write(path: Path, force_N: float, key: bytes = b"") -> Path:
+    """Three seconds of a force, with a seal each half of one."""
+    rng = random.Random(path.name)
+    with RecordingWriter(path, {"scene": "pulse"}, key) as writer:
+        for k in range(150):
+            writer.ticks(batch(*((20 * k + i, force_N, rng.random(), 35.0, 36.0, 0.25) for i in range(20))))
+            writer.telemetry(telemetry(20 * k, k))
+    return path
+
+
+@pytest.fixture(scope="module")
+def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("sealed") / "a.mcap", 1.5)
+
+
+@pytest.fixture(scope="module")
+def other(sealed: Path) -> Path:
+    return write(sealed.with_name("b.mcap"), 1.7)
+
+
+def pieces(path: Path) -> list[bytes]:
+    """The file, cut behind each seal."""
+    data, ends = path.read_bytes(), [0]
+    with path.open("rb") as file:
+        ends += [each.at + HEAD.size + len(each.body) for each in records(file) if each.opcode == SEAL]
+    return [data[a:b] for a, b in zip(ends, [*ends[1:], len(data)], strict=True)]
+
+
+def changed(rng: random.Random, data: bytes, of_other: bytes) -> bytes:
+    """With one byte changed, some taken out, some put elsewhere, or some of another file; its end stays."""
+    size, at = rng.randrange(1, 5_000), rng.randrange(len(data))
+    if rng.random() < 0.4:
+        return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :]
+    at = rng.randrange(len(data) - size - len(MAGIC))
+    match rng.randrange(3):
+        case 0:
+            return data[:at] + data[at + size :]
+        case 1:
+            to = rng.randrange(len(data) - size - len(MAGIC))
+            moved = data[:at] + data[at + size :]
+            return moved[:to] + data[at : at + size] + moved[to:]
+        case _:
+            return data[:at] + of_other[at : at + size] + data[at + size :]
+
+
+def test_a_file_that_is_whole_says_so_and_others_read_it(sealed: Path) -> None:
+    assert verified(sealed).state is State.WHOLE
+    with sealed.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_summary().statistics.message_count == len(list(reader.iter_messages())) == 3_150
+
+
+def test_whatever_is_changed_is_named(sealed: Path, other: Path, tmp_path: Path) -> None:
+    rng, data, of_other = random.Random(39), sealed.read_bytes(), other.read_bytes()
+    path = tmp_path / "changed.mcap"
+    found = []
+    for _ in range(CHANGES):
+        spoilt = changed(rng, data, of_other)
+        path.write_bytes(spoilt)
+        if spoilt != data:
+            found.append(verified(path).state)
+    assert len(found) > 0.9 * CHANGES
+    assert set(found) == {State.ALTERED}
+
+
+def test_a_file_that_was_cut_is_one_that_was_not_finished(sealed: Path, tmp_path: Path) -> None:
+    rng, data, path = random.Random(7), sealed.read_bytes(), tmp_path / "cut.mcap"
+    parts = pieces(sealed)
+    assert len(parts) > 6
+    whole = b"".join(parts[:4])
+    for size in (len(whole), *(rng.randrange(len(parts[0]), len(data)) for _ in range(50)), len(data) - 1):
+        path.write_bytes(data[:size])
+        assert verified(path).state is State.UNFINISHED
+    path.write_bytes(whole)
+    assert "its last 0 bytes" in verified(path).why
+    # cut, and changed before that: it is the change that is told
+    at = len(parts[0]) + 500
+    path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :] + b"abc")
+    assert verified(path).state is State.ALTERED
+    for order in ([0, 2, 1, 3], [0, 1, 1, 2], [0, 2, 3]):
+        path.write_bytes(b"".join(parts[i] for i in order))
+        assert verified(path).state is State.ALTERED
+
+
+def test_who_has_no_key_cannot_seal(tmp_path: Path, sealed: Path) -> None:
+    keyed = write(tmp_path / "k.mcap", 1.5, KEY)
+    assert verified(keyed, KEY).state is State.WHOLE
+    assert verified(keyed, KEY[::-1]).state is State.ALTERED
+    assert verified(keyed).state is State.OTHER_KEY
+    # sealed anew by somebody who changed it
+    assert verified(sealed, KEY).state is State.NO_KEY
+    (tmp_path / "key").write_bytes(KEY + b"\n")
+    assert read_key(str(tmp_path / "key")) == KEY
+    (tmp_path / "key").write_bytes(b"short")
+    with pytest.raises(ValueError, match=r"a key of 5 bytes: allowed are 16\.\.64"):
+        read_key(str(tmp_path / "key"))
+
+
+def test_segments_follow_each_other(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "0.mcap")
+    for k in range(3):
+        writer.ticks(batch(*((2_000 * k + i, 1.5, 1.5, 35.0, 36.0, 0.25) for i in range(20))))
+        if k < 2:
+            writer.rotate(tmp_path / f"{k + 1}.mcap")
+    writer.close()
+    said = [verified(tmp_path / f"{k}.mcap") for k in range(3)]
+    assert {each.state for each in said} == {State.WHOLE}
+    assert [each.follows for each in said] == ["", said[0].last, said[1].last]

@@ -1,0 +1,97 @@
+"""`tormagctl recordings` and `mark`: what a folder of recordings holds, and which of it stays."""
+
+import contextlib
+import shutil
+from pathlib import Path
+from typing import Any
+
+from tormagd.config import Config
+from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
+from tormagd.ctl.record import budget_of, key_of
+from tormagd.recording.folder import RecordingFolder, Segment, mark as mark_segment
+from tormagd.recording.reader import RecordingError, RecordingFile
+from tormagd.recording.seal import verified
+from tormagd_client.blocking import Client
+
+
+def mark(client: Client, text: str) -> Outcome:
+    """Put an event into telemetry, and so into what is recorded, which is then kept."""
+    result = client.request("mark", text=text)
+    return Outcome(result, f"marked: {text}")
+
+
+def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
+    """List a folder, take away what is over its budget, mark a recording of it, or export one.
+
+    Raises CommandError (USAGE) where a path cannot be used.
+    """
+    with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
+        if action in ("list", "prune"):
+            folder = RecordingFolder(path or Path(config.recordings.folder), budget_of(config.recordings))
+            if not folder.path.is_dir():
+                raise usage_error(f"{folder.path}: no such folder", "name the folder, or set [recordings] folder")
+            return _list(folder) if action == "list" else _prune(folder)
+        if path is None:
+            raise usage_error(f"{action}: no recording is named", f"tormagctl recordings {action} FILE.mcap")
+        if action == "mark":
+            kept = mark_segment(path)
+            return Outcome({"file": str(kept)}, f"{kept} stays until somebody takes it away")
+        return _export(path, target, key_of(config))
+
+
+def _list(folder: RecordingFolder) -> Outcome:
+    rows = [_row(segment) for segment in folder.segments()]
+    size_MB = sum(row["MB"] for row in rows)
+    lines = [
+        f"{row['name']:<44} {row['MB']:9.1f} MB {row['seconds'] or 0.0:9.1f} s  "
+        f"{'marked' if row['is_marked'] else '':<7}{row['said']}"
+        for row in rows
+    ]
+    total = f"{len(rows)} recordings, {size_MB:.1f} of {folder.budget.most_bytes / 1e6:.1f} MB in {folder.path}"
+    return Outcome({"folder": str(folder.path), "recordings": rows, "MB": size_MB}, "\n".join([*lines, total]))
+
+
+def _row(segment: Segment) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "name": segment.path.name,
+        "began_s": segment.began_s,
+        "MB": round(segment.bytes / 1e6, 3),
+        "is_marked": segment.is_marked,
+        "seconds": None,
+        "faults": [],
+        "marks": [],
+        "said": "",
+    }
+    try:
+        known = RecordingFile(segment.path, is_scanned=False)
+    except RecordingError as error:
+        return row | {"said": str(error).removeprefix(f"{segment.path}: ")}
+    overview = known.overview
+    faults, marks = list(overview.spans_s("faults")), [each.text for each in overview.marks]
+    said = ", ".join([*faults, *(f"“{text}”" for text in marks)])
+    return row | {"seconds": round(overview.duration_s, 3), "faults": faults, "marks": marks, "said": said}
+
+
+def _prune(folder: RecordingFolder) -> Outcome:
+    gone = folder.prune()
+    over = folder.make_room(0)
+    names = [each.path.name for each in gone]
+    text = f"{len(gone)} recordings taken away, {sum(each.bytes for each in gone) / 1e6:.1f} MB"
+    return Outcome({"removed": names, "over": over}, f"{text}\n{over}".strip(), Exit.REFUSED if over else Exit.DONE)
+
+
+def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
+    """A copy, and what its seals say."""
+    if target is None:
+        raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
+    copy = target / path.name if target.is_dir() else target
+    with path.open("rb") as source, copy.open("xb") as made:
+        try:
+            shutil.copyfileobj(source, made)
+        except OSError:
+            with contextlib.suppress(OSError):
+                copy.unlink()  # half a copy is none
+            raise
+    seal = verified(copy, key)
+    result = {"file": str(copy), "seal": seal.state, "why": seal.why}
+    return Outcome(result, f"{copy}: {seal.text()}", Exit.DONE if seal.is_sound else Exit.REFUSED)

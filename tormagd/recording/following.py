@@ -1,0 +1,85 @@
+"""How well a force was followed: only while it was to be, as it is and with the delay taken out.
+
+Following begins when the device is ENABLED with a fresh setpoint, and either the measured force has come near the asked
+one or the approach has had its second. It ends with either. So neither approach nor decay is in it.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+AWAY = frozenset({"NO_SETPOINT", "STALE", "TAKEOVER"})
+"Limits under which the force is not to be that of the setpoint."
+NEAR_N = 0.15
+APPROACH_NS = 1_000_000_000
+STEP_NS = 10_000_000
+"Of the delays that are tried, and between the moments at which they are."
+DELAYS = 31
+
+
+class FollowingReport(msgspec.Struct, frozen=True):
+    """RMS of measured minus asked while following, for how long, and the same `delay_ms` later, where it is least; None
+    where nothing was followed. The sensor's noise is in both."""
+
+    rms_N: float | None = None
+    seconds: float = 0.0
+    aligned_rms_N: float | None = None
+    delay_ms: float | None = None
+
+
+class Following:
+    """The sums on the way."""
+
+    def __init__(self) -> None:
+        self._count, self._sum, self._lasted_ns = 0, 0.0, 0
+        self._last_ns = self._looked_ns = self._began_ns = 0
+        self._is_due = self._is_following = False
+        self._asked: deque[float] = deque(maxlen=DELAYS)
+        self._sums, self._counts = [0.0] * DELAYS, [0] * DELAYS
+
+    def add(self, t_ns: int, asked_N: float | None, measured_N: float | None, message: Mapping[str, Any]) -> None:
+        """One moment, in their order."""
+        if asked_N is None or measured_N is None or not is_asked(message):
+            self._is_due = self._is_following = False
+            self._asked.clear()
+            self._last_ns = t_ns
+            return
+        if not self._is_due:
+            self._is_due, self._began_ns, self._looked_ns = True, t_ns, t_ns - STEP_NS
+        error_N = measured_N - asked_N
+        if not self._is_following:
+            self._is_following = abs(error_N) <= NEAR_N or t_ns - self._began_ns >= APPROACH_NS
+        if self._is_following:
+            self._count += 1
+            self._sum += error_N * error_N
+            self._lasted_ns += min(max(t_ns - self._last_ns, 0), STEP_NS * 10)
+        self._last_ns = t_ns
+        if (passed_ns := t_ns - self._looked_ns) >= STEP_NS:
+            if passed_ns >= 2 * STEP_NS:
+                self._asked.clear()  # too coarse to tell a delay by
+            self._looked_ns = t_ns
+            self._asked.appendleft(asked_N)
+            if self._is_following:
+                for i, earlier_N in enumerate(self._asked):
+                    self._sums[i] += (measured_N - earlier_N) ** 2
+                    self._counts[i] += 1
+
+    def made(self) -> FollowingReport | None:
+        """What is known; None where nothing was followed."""
+        if not self._count:
+            return None
+        rms_N = math.sqrt(self._sum / self._count)
+        means = [total / count for total, count in zip(self._sums, self._counts, strict=True) if count]
+        if not means:
+            return FollowingReport(rms_N, self._lasted_ns * 1e-9)
+        best = min(range(len(means)), key=means.__getitem__)
+        return FollowingReport(rms_N, self._lasted_ns * 1e-9, math.sqrt(means[best]), best * STEP_NS * 1e-6)
+
+
+def is_asked(message: Mapping[str, Any]) -> bool:
+    """Whether the force is to be the setpoint's; so it is where no state is recorded."""
+    state = message.get("operating_state")
+    return state in (None, "ENABLED") and AWAY.isdisjoint(message.get("limits") or ())

@@ -1,0 +1,53 @@
+"""Fewer ticks where nothing happens: all of them around a fault or a mark, one of some elsewhere."""
+
+from collections import deque
+from typing import Any
+
+AROUND_S = 10.0
+"All ticks are kept so long before and after."
+AROUND_NS = round(AROUND_S * 1e9)
+
+Tick = tuple[int, dict[str, Any]]
+"Its time, ns since 1970, and its message."
+
+
+class Thinning:
+    """Keeps one tick of `every`, and all around what happens. With 1 nothing waits, and all are kept."""
+
+    def __init__(self, every: int) -> None:
+        self.every = every
+        self._waiting: deque[Tick] = deque()
+        self._count = 0
+        self._full_to_ns = 0
+        self._faults: Any = ()
+
+    def happened(self, t_ns: int) -> None:
+        """Something that is worth all ticks around it."""
+        self._full_to_ns = max(self._full_to_ns, t_ns + AROUND_NS)
+
+    def take(self, tick: Tick) -> list[Tick]:
+        """One more; gives those that are to be written now, in their order."""
+        if self.every == 1:
+            return [tick]
+        t_ns, message = tick
+        faults = message.get("faults", ())
+        if faults != self._faults and faults:
+            self.happened(t_ns)
+        self._faults = faults
+        self._waiting.append(tick)
+        if t_ns <= self._full_to_ns:
+            return self.rest(1)
+        given = []
+        while self._waiting and self._waiting[0][0] < t_ns - AROUND_NS:
+            given += self._thinned(self._waiting.popleft(), self.every)
+        return given
+
+    def rest(self, every: int) -> list[Tick]:
+        """Those that wait: one of so many."""
+        given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
+        self._waiting.clear()
+        return given
+
+    def _thinned(self, tick: Tick, every: int) -> list[Tick]:
+        self._count += 1
+        return [] if self._count % every else [tick]
