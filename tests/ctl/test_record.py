@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import msgpack
 import pytest
@@ -72,6 +73,54 @@ def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, ct
     (file,) = tmp_path.iterdir()
     assert made["file"] == str(file)
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.mcap", file.name)
+
+
+def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon, tmp_path, ctl):
+    folder, config = tmp_path / "recordings", tmp_path / "t.toml"
+    folder.mkdir()
+    config.write_text(f'[recordings]\nfolder = "{folder}"\nmost_MB = 1.0\nsegment_MB = 0.1\nfree_MB = 1.0\n')
+    assert "at least twice" in ctl("--config", str(config), "recordings", "list").ended(2).err
+    config.write_text(config.read_text().replace("most_MB = 1.0", "most_MB = 1.3"))
+    command = ("--config", str(config), *fake_daemon.at, "--json")
+    made = ctl(*command, "record", str(folder), "--duration", "1.5").ended(0).result
+    listed = ctl(*command, "recordings", "list").ended(0).result
+    names = [row["name"] for row in listed["recordings"]]
+    assert len(names) > 1
+    assert names[-1] == Path(made["file"]).name
+    assert {row["is_marked"] for row in listed["recordings"]} == {False}
+    # what an operator keeps, stays; the copy says what its seals say
+    kept = ctl(*command, "recordings", "mark", str(folder / names[-1])).ended(0).result["file"]
+    copied = ctl(*command, "recordings", "export", kept, "--to", str(tmp_path)).ended(0).result
+    assert (copied["file"], copied["seal"]) == (str(tmp_path / Path(kept).name), "whole")
+    config.write_text(config.read_text() + "most_days = 1e-9\n")
+    assert ctl(*command, "recordings", "prune").ended(0).result["removed"] == names[:-1]
+    assert [path.name for path in folder.iterdir()] == [Path(kept).name]
+    for wrong in ("list /nowhere", "mark", f"export {kept}", f"mark {config}", "export /no --to /"):
+        assert ctl(*command, "recordings", *wrong.split()).ended(2).error["hint"]
+
+
+def test_a_mark_is_put_into_telemetry(fake_daemon, ctl):
+    fake_daemon.answers["mark"] = lambda: {"ok": True, "result": {"t_ns": 7, "text": "it stuck"}}
+    assert ctl(*fake_daemon.at, "mark", "it stuck").ended(0).out == "marked: it stuck\n"
+    assert fake_daemon.requests[-1]["args"] == {"text": "it stuck"}
+
+
+def test_a_report_is_one_page_of_one_recording_or_of_two(fake_daemon, tmp_path, ctl, file):
+    assert main(["--endpoint", fake_daemon.control, "record", str(file), "--duration", "0.3"]) == 0
+    other = tmp_path / "<b>.mcap"
+    other.write_bytes(file.read_bytes().replace(b"tormagd.Tick", b"tormagd.Tack"))
+    page = tmp_path / "a.html"
+    ctl("report", str(file), "-o", str(page)).ended(0)
+    alone = page.read_text()
+    assert f"{file.name} is whole: all {file.stat().st_size} bytes are as they were written." in alone
+    said = ctl("--json", "report", str(file), str(other), "-o", str(page)).ended(1).result["seals"]
+    assert list(said.values()) == ["whole", "altered or damaged"]
+    both = page.read_text()
+    assert both.count("data:image/png;base64,") == 2
+    # nothing is asked of elsewhere, and no name is taken for markup
+    assert ["<b>" in both, "&lt;b&gt;" in both, *re.findall("https?://|<script", both)] == [False, True]
+    assert ctl("--json", "report", str(file), str(tmp_path / "no.mcap"), "-o", str(page)).ended(2).error["hint"]
+    assert ctl("--json", "report", *[str(file)] * 3, "-o", str(page)).ended(2).error["hint"]
 
 
 def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, ctl):

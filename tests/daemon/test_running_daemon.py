@@ -627,6 +627,14 @@ def test_a_dispute_of_device_and_sensor_is_the_operators_to_settle(armed: Runnin
     assert sensor.is_doubted
 
 
+def test_a_mark_stands_in_every_snapshot_that_follows(armed: Running) -> None:
+    for text in ("", "a\nb", "x" * 201, 3):
+        assert armed.refused("mark", text=text) == "bad_mark"
+    told = armed.command("mark", text="it stuck")
+    assert told["text"] == "it stuck"
+    assert armed.until(lambda status: status["mark"] is not None, "the mark")["mark"] == told
+
+
 def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming(armed: Running) -> None:
     armed.ask(1.5)
     armed.until(lambda status: status["gap_mm"] < 85.0, "closing")

@@ -263,7 +263,8 @@ def test_the_picture_names_what_happened(written):
     # the sensor's noise is in the figure, and whoever reads it has to know
     said = ("a title", "while following 100 mN rms, 100 aligned by", "SKEW")
     assert [words for words in said if words not in drawn.get_suptitle()] == []
-    assert [label.get_text() for label in drawn.axes[-1].get_yticklabels()] == ["state", "limit RATE", "FAULT SKEW"]
+    lanes = [label.get_text() for label in drawn.axes[-1].get_yticklabels()]
+    assert lanes == ["state", "limit RATE 40.4%", "FAULT SKEW"]
     assert [line.get_label() for line in drawn.axes[0].lines] == ["measured", "asked"]
 
 

@@ -312,6 +312,15 @@ COMMANDS = {
             option("-o", "--output", dest="target", type=Path, required=True, metavar="FILE.png"),
         ),
     ),
+    "report": Command(
+        "one page to keep of a recording, or of two side by side: forces, limits, faults and remedies, belief, machine",
+        "report.report",
+        ("config",),
+        (
+            option("sources", type=Path, nargs="+", metavar="FILE.mcap"),
+            option("-o", "--output", dest="target", type=Path, required=True, metavar="FILE.html"),
+        ),
+    ),
     "dashboard": Command(
         "a page for the browser on this machine: the daemon live, or a recording to scrub through",
         "dashboard.dashboard",

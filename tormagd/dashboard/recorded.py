@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tormagd.dashboard.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
 from tormagd.recording.overview import BREAK_NS, BREAK_S
-from tormagd.recording.reader import Recording, RecordingFile
+from tormagd.recording.reader import Columns, Recording, RecordingFile
 from tormagd.recording.series import Band, Series, bands, series
 from tormagd.safety.codes import FAULTS, LIMITS
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
@@ -99,7 +99,7 @@ class Recorded:
             operating_state=next((band.name for band in states if _is_at(band, at_s)), ""),
             held=sorted(limits, key=lambda held: -held.share),
             faults=[band.name for band in faults if _is_at(band, at_s)],
-            belief=self._belief(shown, at_s),
+            belief=believed(shown.telemetry, at_ns),
             late_counts=late_counts(value for value in late_us if math.isfinite(value)),
         )
 
@@ -119,21 +119,6 @@ class Recorded:
     def _sampled(self, shown: Recording, name: str, times_s: np.ndarray) -> list[float | None]:
         return _sampled(self._series(shown, name), times_s)
 
-    def _belief(self, shown: Recording, at_s: float) -> dict[str, BeliefReport]:
-        """What the newest snapshot said; nothing where that is too old to be true, or said nothing."""
-        telemetry = shown.telemetry
-        numbers, words, at_ns = telemetry.numbers, telemetry.words, self._start_ns + round(at_s * 1e9)
-        row = int(np.searchsorted(telemetry.t_ns, at_ns, side="right")) - 1
-        if row < 0 or (at_ns - telemetry.t_ns[row]) * 1e-9 > BREAK_S:
-            return {}
-        told = {}
-        for name in (path.split(".")[1] for path in numbers if _BELIEVED.fullmatch(path)):
-            value, sd, acts = (_number(numbers, f"belief.{name}.{part}", row) for part in ("value", "sd", "acts"))
-            if value is not None:
-                unit = "".join(words[f"belief.{name}.unit"][row]) if f"belief.{name}.unit" in words else ""
-                told[name] = BeliefReport(value=value, sd=sd, unit=unit, acts=bool(acts))
-        return told
-
     def _glance(self) -> dict[str, Any]:
         """The least and greatest measured force of each stretch, and where faults and limits were."""
         known = self._overview.series("measured_cf") or self._overview.series("setpoint_cf")
@@ -146,6 +131,21 @@ class Recorded:
             [value if math.isfinite(value) else None for value in side.tolist()] for side in (known.low, known.high)
         )
         return {"t_s": known.t_s.tolist(), "low_N": low, "high_N": high, **spans}
+
+
+def believed(telemetry: Columns, at_ns: int) -> dict[str, BeliefReport]:
+    """What the newest snapshot before `at_ns` said; nothing where that is too old to be true, or said nothing."""
+    numbers, words = telemetry.numbers, telemetry.words
+    row = int(np.searchsorted(telemetry.t_ns, at_ns, side="right")) - 1
+    if row < 0 or (at_ns - telemetry.t_ns[row]) * 1e-9 > BREAK_S:
+        return {}
+    told = {}
+    for name in (path.split(".")[1] for path in numbers if _BELIEVED.fullmatch(path)):
+        value, sd, acts = (_number(numbers, f"belief.{name}.{part}", row) for part in ("value", "sd", "acts"))
+        if value is not None:
+            unit = "".join(words[f"belief.{name}.unit"][row]) if f"belief.{name}.unit" in words else ""
+            told[name] = BeliefReport(value=value, sd=sd, unit=unit, acts=bool(acts))
+    return told
 
 
 def _number(numbers: dict[str, NDArray[np.float64]], name: str, row: int) -> float | None:

@@ -10,6 +10,7 @@ import re
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from typing import Annotated, Any, TypedDict
 
 import msgspec
@@ -33,7 +34,7 @@ BREAK_NS = round(BREAK_S * 1e9)
 FIRST_WIDTH_NS = 1_000_000
 MOST_STRETCHES = 1_500
 MOST_SPANS = 1_000
-"Of one code: where there are more, those next to each other are drawn as one."
+"Of one code: where there are more, those nearest to each other are drawn as one."
 MOST_CODES, MOST_MARKS = 200, 1_000
 MOST_BYTES = 2_000_000
 CODE = re.compile(r"[A-Za-z0-9_.:?-]{1,64}")
@@ -291,6 +292,18 @@ class _Stretches:
         return Curves(self._numbers.tobytes(), *sides)
 
 
+def _joined(spans: list[list[int]]) -> list[list[int]]:
+    """Fewer spans: those that lie nearest to each other are one; the last stays."""
+    gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
+    near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
+    for span, gap_ns in zip(spans[1:-1], gaps, strict=True):
+        if gap_ns <= near_ns:
+            joined[-1][1] = span[1]
+        else:
+            joined.append(span)
+    return [*joined, spans[-1]]
+
+
 class _Codes:
     """The codes of one kind of message, and when each was there."""
 
@@ -332,7 +345,7 @@ class _Codes:
             if not spans or code not in self._last[kind] or spans[-1][1] != since_ns:
                 spans.append([since_ns, since_ns])
                 if len(spans) > MOST_SPANS:
-                    known[code] = [[a[0], b[1]] for a, b in zip(spans[::2], spans[1::2], strict=False)] + spans[-1:]
+                    known[code] = _joined(spans)
         self._last[kind] = codes
 
     def made(self) -> dict[str, dict[str, Codes]]:

@@ -65,7 +65,7 @@ def figure(overview: Overview, title: str, is_complete: bool = True) -> Figure:
         _dress(axes, label, quantity)
     duty.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
     duty.set_ylim(-1.08, 1.08)
-    _lanes(lane, states, limits, faults)
+    _lanes(lane, overview, states, limits, faults)
     for axes in (force, gap, duty):
         held = [(start, end - start) for spans in faults.values() for start, end in spans]
         place = axes.get_xaxis_transform()
@@ -150,12 +150,15 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
         axes.text(0.5, 0.5, f"no {quantity} recorded", transform=axes.transAxes, ha="center", va="center", color=GREY)
 
 
-def _lanes(axes: Axes, states: Spans, limits: Spans, faults: Spans) -> None:
-    """One lane for the operating state, one for every limit and fault that occurred, each with its name and share."""
+def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults: Spans) -> None:
+    """One lane for the operating state, one for every limit and fault that occurred, each with its name; limits with
+    their share of the time."""
+    held_s = {name: codes.held_ns * 1e-9 for name, codes in overview.codes["limits"].items()}
+    shares = {name: 100.0 * held_s[name] / max(overview.duration_s, 1e-3) for name in limits}
     rows: list[tuple[str, list[tuple[str, Spans, str]]]] = [
         *([("state", [(name, states, STATE_COLOURS.get(name, GREY)) for name in states])] if states else []),
         *(
-            (f"limit {name}", [(name, limits, colour)])
+            (f"limit {name} {shares[name]:.1f}%", [(name, limits, colour)])
             for name, colour in zip(limits, cycle(LIMIT_COLOURS), strict=False)
         ),
         *([(f"FAULT {name}", [(name, faults, RED)]) for name in faults] or [("no faults", [])]),
@@ -163,7 +166,8 @@ def _lanes(axes: Axes, states: Spans, limits: Spans, faults: Spans) -> None:
     for row, (_, parts) in enumerate(rows):
         for name, of, colour in parts:
             spans = of[name]
-            axes.broken_barh([(a, b - a) for a, b in spans], (row - 0.38, 0.76), facecolors=colour, linewidth=0)
+            # a moment in hours shows, too
+            axes.broken_barh([(a, b - a) for a, b in spans], (row - 0.38, 0.76), color=colour, linewidth=0.5)
             if row == 0 and states:
                 _name_spans(axes, name, spans, row)
     axes.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=9)

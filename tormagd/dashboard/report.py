@@ -1,0 +1,170 @@
+"""A recording as one page to keep, send and print: no script, and nothing asked of elsewhere. Two, side by side."""
+
+import base64
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from html import escape
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tormagd.dashboard.recorded import believed
+from tormagd.recording.overview import LATE_US, Codes
+from tormagd.recording.plot import figure, followed, picture
+from tormagd.recording.reader import RecordingFile
+from tormagd.recording.seal import Verdict
+from tormagd.recording.writer import CUT, THINNED
+from tormagd.safety.codes import FAULTS, LIMITS, Explanation
+
+STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:80rem;margin:2rem auto;padding:0 1rem}
+img{max-width:100%}table{border-collapse:collapse;margin:.5rem 0}h2{margin-top:2rem}
+th,td{padding:.25rem .8rem;text-align:left;vertical-align:top;border-bottom:1px solid #ddd}
+.bad{color:#b71c1c;font-weight:600}"""
+MOST_TOLD = 20
+"Moments of one fault that are listed."
+
+
+class Reported(NamedTuple):
+    """A recording, and what its seals say."""
+
+    file: RecordingFile
+    seal: Verdict
+
+
+def report(of: Sequence[Reported]) -> str:
+    """The page, as HTML. Raises ValueError for a recording without messages."""
+    names = [each.file.path.name for each in of]
+    parts = [
+        f"<h1>{escape(' and '.join(names))}</h1>",
+        *(_sealed(each) for each in of),
+        _table(["", *names], _figures(of)),
+        *(_picture(each) for each in of),
+        "<h2>What held the force back</h2>",
+        _codes(of, "limits", LIMITS, _held),
+        "<h2>Faults</h2>",
+        _codes(of, "faults", FAULTS, _moments),
+        "<h2>Marks</h2>",
+        _table(["", *names], _marks(of)),
+        "<h2>What was believed of the device at the end</h2>",
+        _table(["", *names], _belief(of)),
+        "<h2>The machine: how late control ticks began</h2>",
+        _table(["µs", *names], _lateness(of)),
+    ]
+    title = escape(f"tormagd: {', '.join(names)}")
+    head = f'<meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>\n'
+
+
+def _sealed(of: Reported) -> str:
+    kind = "" if of.seal.is_sound else ' class="bad"'
+    cut = of.file.metadata.get(CUT, "")
+    notes = [cut and f"cut by: {cut}", of.file.metadata.get(THINNED, "") and f"thinned: {of.file.metadata[THINNED]}"]
+    said = ". ".join([f"{of.file.path.name} is {of.seal.text()}", *filter(None, notes)])
+    return f"<p{kind}>{escape(said)}.</p>"
+
+
+def _figures(of: Sequence[Reported]) -> list[list[str]]:
+    def known(each: Reported) -> dict[str, str]:
+        overview, file = each.file.overview, each.file
+        scene = file.described("scene", dict[str, Any]) or {}
+        began = datetime.fromtimestamp(overview.start_ns * 1e-9, UTC)
+        states = overview.codes["operating_state"]
+        return {
+            "began": f"{began:%Y-%m-%d %H:%M:%S} UTC",
+            "lasts": f"{overview.duration_s:.1f} s",
+            "enabled": f"{states['ENABLED'].held_ns * 1e-9:.1f} s" if "ENABLED" in states else "never",
+            "followed for": f"{overview.following.seconds:.1f} s",
+            "how well": followed(overview.following) or "nothing was followed",
+            "asked": _range(each, "setpoint_cf"),
+            "felt": _range(each, "measured_cf"),
+            "ticks, snapshots": f"{overview.ticks:,}, {overview.snapshots:,}",
+            "scene": str(scene.get("name", "")),
+            "device": file.metadata.get("serial_number", ""),
+            "tormagd": f"{file.metadata.get('version', '')} {file.metadata.get('build', '')}",
+        }
+
+    return _rows([known(each) for each in of])
+
+
+def _range(of: Reported, name: str) -> str:
+    known = of.file.overview.series(name)
+    if known is None:
+        return "not recorded"
+    return f"{np.nanmin(known.low):.3f} to {np.nanmax(known.high):.3f} N"
+
+
+def _picture(of: Reported) -> str:
+    name = of.file.path.stem
+    png = base64.b64encode(picture(figure(of.file.overview, name, of.file.is_complete), "png")).decode()
+    return f'<p><img alt="force, gap, duty, limits and faults of {escape(name)}" src="data:image/png;base64,{png}"></p>'
+
+
+def _codes(
+    of: Sequence[Reported], kind: str, explained: Mapping[Any, Explanation], told: Callable[[Codes, float], str]
+) -> str:
+    """A table of the codes of a kind: of each recording when, then why, and what to do."""
+    names = dict.fromkeys(code for each in of for code in each.file.overview.codes[kind])
+    texts = {str(code): known for code, known in explained.items()}
+    rows = []
+    for code in names:
+        known = [(each.file.overview.codes[kind].get(code), each.file.overview.duration_s) for each in of]
+        why = texts.get(code)
+        when = ["" if codes is None else told(codes, lasts_s) for codes, lasts_s in known]
+        rows.append([code, *when, why.cause if why else "", why.remedy if why else ""])
+    return _table(["", *(each.file.path.name for each in of), "why", "what to do"], rows)
+
+
+def _held(codes: Codes, lasts_s: float) -> str:
+    held_s = codes.held_ns * 1e-9
+    return f"{held_s:.2f} s, {100.0 * held_s / max(lasts_s, 1e-3):.1f}%"
+
+
+def _moments(codes: Codes, _lasts_s: float) -> str:
+    more = f" and {len(codes.spans_ns) - MOST_TOLD} more" if len(codes.spans_ns) > MOST_TOLD else ""
+    return "at " + ", ".join(f"{begin * 1e-9:.2f}" for begin, _ in codes.spans_ns[:MOST_TOLD]) + f" s{more}"
+
+
+def _marks(of: Sequence[Reported]) -> list[list[str]]:
+    rows = []
+    for place, each in enumerate(of):
+        for mark in each.file.overview.marks:
+            cells = [""] * len(of)
+            cells[place] = mark.text
+            rows.append([f"{(mark.t_ns - each.file.overview.start_ns) * 1e-9:.2f} s", *cells])
+    return rows
+
+
+def _belief(of: Sequence[Reported]) -> list[list[str]]:
+    found = []
+    for each in of:
+        end_ns = each.file.overview.end_ns
+        last = each.file.between(end_ns - 1_000_000_000, end_ns, ("belief",))
+        told = believed(last.telemetry, end_ns)
+        found.append(
+            {
+                name: f"{it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'} {it.unit}"
+                for name, it in told.items()
+                if it.acts
+            }
+        )
+    return _rows(found)
+
+
+def _lateness(of: Sequence[Reported]) -> list[list[str]]:
+    bars = [f"under {LATE_US[0]:g}", *(f"{a:g} to {b:g}" for a, b in pairwise(LATE_US))]
+    counts = [each.file.overview.late_counts for each in of]
+    return [[bar, *(f"{of_one[i]:,}" for of_one in counts)] for i, bar in enumerate([*bars, f"over {LATE_US[-1]:g}"])]
+
+
+def _rows(columns: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """A row of each key, with what every column has of it."""
+    return [[key, *(column.get(key, "") for column in columns)] for key in dict.fromkeys(k for c in columns for k in c)]
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+    if not lines:
+        return "<p>None.</p>"
+    head = "".join(f"<th>{escape(each)}</th>" for each in heads)
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
