@@ -195,24 +195,24 @@ class BlackBox(Strict, frozen=True):
 
 
 class Recordings(Strict, frozen=True):
-    """What `tormagctl record` keeps in a folder, and the key of its seals."""
+    """What `tormagctl record` keeps in a folder, and with which seals."""
 
     folder: str = "/var/lib/tormag/recordings"
-    "That of `tormagctl recordings`, where none is named."
+    "Where `tormagctl recordings` looks."
     segment_MB: Annotated[float, Meta(ge=0.1, le=100_000.0)] = 250.0
-    "A recording in a folder goes on in a new file after so much."
+    "A recording in a folder goes on in a new file then,"
     segment_minutes: Annotated[float, Meta(ge=0.01, le=1_440.0)] = 10.0
-    "Or after so long."
+    "or after so long."
     most_MB: Annotated[float, Meta(gt=0.0, le=1e8)] = 20_000.0
-    "All recordings in the folder: the oldest unmarked ones go first."
+    "The folder's budget: the oldest unmarked go first."
     most_days: Annotated[float, Meta(gt=0.0, le=36_500.0)] = 30.0
-    "The same for their age."
+    "The same for age."
     free_MB: Annotated[float, Meta(ge=1.0, le=1e8)] = 500.0
-    "Stays free on the folder's disk, for black boxes and profiles."
+    "Stays free on that disk, for black boxes and profiles."
     one_tick_of: Annotated[int, Meta(ge=1, le=1_000)] = 1
-    "Of so many ticks one is recorded, and all within 10 s of a fault or a mark; 1: all."
+    "Of so many ticks one is recorded, and all within 10 s of a fault or a mark."
     key: str = ""
-    "A file of 16 to 64 bytes: with it recordings and black boxes are sealed, and a forged seal is told."
+    "A file of 16 to 64 bytes, which seals recordings and black boxes."
 
     def __post_init__(self) -> None:
         require(

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
 from tormagd.ctl.main import main
-from tormagd.recording.reader import read_recording
+from tormagd.recording.reader import Seen, read_recording
 
 pytestmark = pytest.mark.live
 
@@ -47,11 +48,13 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
     finally:
         recorder.kill()
         recorder.wait()
-    recording = read_recording(path)
+    seen: list[Seen] = []
+    recording = read_recording(path, dict[str, Any], seen.append)
     assert recording.is_complete
-    assert recording.ticks.t_ns[-1] >= newest["t_ns"]
-    for numbers in (recording.ticks.numbers["tick"], recording.telemetry.numbers["seq"]):
-        assert np.array_equal(np.diff(numbers), np.ones(numbers.size - 1))
+    assert max(each.t_ns for each in seen if each.is_tick) >= newest["t_ns"]
+    for is_tick, name in ((True, "tick"), (False, "seq")):
+        numbers = [each.message[name] for each in seen if each.is_tick is is_tick]
+        assert np.array_equal(np.diff(numbers), np.ones(len(numbers) - 1))
     about = recording.metadata
     assert json.loads(about["configuration"])["device"]["port"] == str(rig.port)
     assert json.loads(about["scene"])["name"] == "coronary"

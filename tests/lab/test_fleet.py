@@ -1,6 +1,5 @@
 """Many consoles' recordings: what each says, and all of them one by one, on Dask workers and from a bucket the same."""
 
-import io
 import json
 import os
 from collections.abc import Iterator
@@ -15,9 +14,8 @@ from distributed import LocalCluster
 
 from tormagd.lab.consoles.devices import Console, Drift, consoles
 from tormagd.lab.consoles.reading import files, read, read_all
-from tormagd.lab.consoles.summary import FIELDS, Summary, summarise
+from tormagd.lab.consoles.summary import Summary
 from tormagd.lab.main import main
-from tormagd.recording.reader import RecordingError, read_open_recording, read_recording
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
 
@@ -157,7 +155,7 @@ def written(tmp_path: Path) -> Path:
 
 
 def test_the_time_enabled_is_what_counts(written):
-    found = summarise(read_recording(written))
+    found = read(str(written))
     assert (found.serial_number, found.insert, found.scene, found.is_complete, found.start_s) == (
         1234,
         "MRE-50-40",
@@ -175,23 +173,10 @@ def test_the_time_enabled_is_what_counts(written):
     assert (found.clock_drift_ppm, found.current_A, found.temperature_C) == pytest.approx((20.0, 0.4, None))
 
 
-def test_what_is_not_kept_is_not_missed(written):
-    with written.open("rb") as file:
-        some = read_open_recording(file, "a.mcap", FIELDS)
-    assert "gap_mm" not in some.ticks.numbers
-    assert summarise(some) == summarise(read_recording(written))
-
-
 def test_metadata_of_another_making_are_not_known(tmp_path):
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, {"serial_number": "none", "scene": '{"insert": 3}'}) as writer:
         writer.ticks(TickBatch(v=1, columns=("t_ns",), rows=((START_NS,),)))
-    found = summarise(read_recording(path))
+    found = read(str(path))
     assert (found.serial_number, found.insert, found.scene) == (None, "", "")
     assert (found.tracking_rms_N, found.trim, found.enabled_s, found.limits_s) == (None, None, 0.0, {})
-
-
-def test_a_file_that_is_open_is_called_by_its_name(written):
-    torn = io.BytesIO(written.read_bytes()[1:])
-    with pytest.raises(RecordingError, match=r"^s3://there: not an intact"):
-        read_open_recording(torn, "s3://there")

@@ -1,7 +1,9 @@
-"""Messages as a daemon publishes them."""
+"""Messages as a daemon publishes them, and as a recording gives them back."""
 
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
+from tormagd.recording.reader import Seen, read_recording
 from tormagd.recording.ticks import TickBatch
 from tormagd_client.messages import Telemetry, Tick
 
@@ -18,3 +20,24 @@ def telemetry(ms: float, seq: int, **changes: Any) -> Telemetry:
     known |= {"v": 1, "t_ns": START_NS + int(ms * 1e6), "seq": seq, "operating_state": "ENABLED", "is_homed": True}
     known |= {"is_busy": False, "duty": (0.5, -0.5), "limits": (), "faults": (), "tick": Tick(20.0, 100.0)}
     return Telemetry(**(known | changes))
+
+
+class Back(NamedTuple):
+    """What a recording has: its ticks and its snapshots, and what its metadata say."""
+
+    ticks: list[Seen]
+    snapshots: list[Seen]
+    metadata: dict[str, str]
+    is_complete: bool
+
+    def ms(self) -> list[int]:
+        """When the ticks were."""
+        return [(each.t_ns - START_NS) // 1_000_000 for each in self.ticks]
+
+
+def back(path: Path) -> Back:
+    """Reads it all. Raises RecordingError."""
+    seen: list[Seen] = []
+    found = read_recording(path, dict[str, Any], seen.append)
+    ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
+    return Back(ticks, snapshots, found.metadata, found.is_complete)

@@ -8,8 +8,8 @@ from pathlib import Path
 import hostile
 
 READABLE = {
-    "a small message of brackets", "metadata of brackets", "ever new columns", "a million columns at once",
-    "a time beyond all", "a summary that is the file", "a chunk within a chunk",
+    "a small message of brackets", "a schema of brackets", "metadata of brackets", "ever new columns",
+    "a million columns at once", "a time beyond all", "a summary that is the file", "a chunk within a chunk",
 }  # fmt: skip
 "Of what is in these, nothing is shown: a picture of them is empty."
 MOST_MB = 200
@@ -17,14 +17,17 @@ READ = """
 import json, sys
 from pathlib import Path
 from tormagd.recording.black_box import read_black_box
-from tormagd.recording.reader import RecordingError, RecordingFile, read_recording
+from tormagd.recording.reader import RecordingError, RecordingFile, read_recording as read
+
+def read_recording(path):
+    read(path, dict[str, object], lambda seen: None)
 said = {}
 for path in map(Path, sys.argv[1:]):
-    for read in (read_black_box,) if path.name.startswith("black") else (RecordingFile, read_recording):
+    for look in (read_black_box,) if path.name.startswith("black") else (RecordingFile, read_recording):
         try:
-            read(path)
+            look(path)
         except RecordingError as error:
-            said[f"{read.__name__} {path}"] = str(error)
+            said[f"{look.__name__} {path}"] = str(error)
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1]
 print(json.dumps([int(peak) // 1024, said]))
 """

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sent import START_NS, batch, telemetry
+from sent import START_NS, back, batch, telemetry
 
-from tormagd.recording.overview import MOST_STRETCHES, OverviewBuilder, unpacked
-from tormagd.recording.reader import RecordingFile, read_recording
+from tormagd.recording.overview import MOST_STRETCHES, Glance, OverviewBuilder, unpacked
+from tormagd.recording.reader import RecordingFile
 from tormagd.recording.writer import THINNED, RecordingWriter
 from tormagd_client.messages import Mark
 
@@ -66,20 +66,19 @@ def test_neither_approach_nor_decay_is_in_how_well_a_force_was_followed(path: Pa
 
 
 def test_any_seconds_of_it_are_those_of_the_whole(path: Path) -> None:
-    known, whole = RecordingFile(path), read_recording(path).ticks
     from_ns, to_ns = START_NS + 7_000_000_000, START_NS + 9_500_000_000
-    some = known.between(from_ns, to_ns, ("measured_cf", "limits")).ticks
-    used = (whole.t_ns >= from_ns) & (whole.t_ns <= to_ns)
-    assert np.array_equal(some.t_ns, whole.t_ns[used])
-    assert np.array_equal(some.numbers["measured_cf"], whole.numbers["measured_cf"][used])
-    assert set(some.numbers) == {"measured_cf"}
+    some = [each for each in RecordingFile(path).between(from_ns, to_ns, Glance) if each.is_tick]
+    whole = [each for each in back(path).ticks if from_ns <= each.t_ns <= to_ns]
+    assert [each.t_ns for each in some] == [each.t_ns for each in whole]
+    assert [each.message["measured_cf"] for each in some] == [each.message["measured_cf"] for each in whole]
+    assert "tick" not in some[0].message
 
 
 def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_path: Path) -> None:
     path = write(tmp_path / "thin.mcap", every=50)
-    recording = read_recording(path)
+    recording = back(path)
     assert recording.metadata[THINNED].startswith("one tick of 50;")
-    at_ms = (recording.ticks.t_ns - START_NS) // 1_000_000
+    at_ms = np.array(recording.ms())
     # the mark is at 15 s, the fault at 25 s
     assert np.array_equal(at_ms[at_ms >= 5_020], np.arange(5_020, 30_000))
     assert len(at_ms[at_ms < 5_020]) == pytest.approx(100, abs=2)
@@ -90,7 +89,7 @@ def test_any_length_is_held_in_bounds() -> None:
     """A year of snapshots, with a limit in every other."""
     builder = OverviewBuilder()
     for k in range(20_000):
-        builder.add(k * 1_600_000_000_000, {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k)}, is_tick=False)
+        builder.add(k * 1_600_000_000_000, False, {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k)})
     made = builder.made()
     assert len(made.packed()) < 200_000
     gap = made.series("gap_mm")

@@ -15,7 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
 from machines.host import Host, HostWatch, processor_s
@@ -27,7 +27,7 @@ from rendering.following import RATE_HZ, Tracking, tracking
 from rendering.signals import with_approach
 from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile
-from tormagd.recording.reader import Columns, RecordingError, read_recording
+from tormagd.recording.reader import RecordingError, Seen, read_recording
 from tormagd.safety.codes import FAULTS, Fault
 from tormagd_client import Client, ClientError, UnreachableError
 from tormagd_client.messages import MessageError, Telemetry
@@ -240,7 +240,7 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
     watched.end()
     truth = told_truth()
     try:
-        spacings_s = np.diff(ticks_s(read_recording(RECORDING).ticks, start_s, end_s))
+        spacings_s = np.diff(between(ticks(), start_s, end_s))
     except RecordingError as error:
         raise unreadable(error) from error
     axis = (truth["t_ns"] - answer["result"]["start_ns"]) * 1e-9
@@ -278,9 +278,23 @@ def unreadable(error: Exception) -> ShowError:
     return ShowError(f"what was recorded cannot be read: {error}", f"look at the logs in {RUN_DIR}")
 
 
-def ticks_s(ticks: Columns, start_s: float, end_s: float) -> Array:
-    """The recorded ticks between two times of CLOCK_MONOTONIC."""
-    moments_s = ticks.numbers.get("monotonic_s", np.empty(0))
+class Tick(TypedDict, total=False):
+    """What is asked of a recorded tick."""
+
+    monotonic_s: float
+    faults: tuple[str, ...]
+
+
+def ticks() -> list[Tick]:
+    """Those of the recording. Raises RecordingError."""
+    seen: list[Seen] = []
+    read_recording(RECORDING, Tick, seen.append)
+    return [each.message for each in seen if each.is_tick and "monotonic_s" in each.message]
+
+
+def between(known: list[Tick], start_s: float, end_s: float) -> Array:
+    """When those ticks were that lie between two times of CLOCK_MONOTONIC."""
+    moments_s = np.array([tick["monotonic_s"] for tick in known])
     return moments_s[(moments_s >= start_s) & (moments_s <= end_s)]
 
 
@@ -288,13 +302,11 @@ def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
     """Of a show that ended early, by its recording: when the first fault was latched, for whoever saw it at `seen_s`
     may have been late, and the time between ticks that the fastest tenth of them keeps; 0 where none were recorded."""
     try:
-        ticks = read_recording(RECORDING).ticks
+        known = ticks()
     except RecordingError:
         return seen_s, 0.0
-    moments_s = ticks.numbers.get("monotonic_s", np.empty(0)).tolist()
-    faults = ticks.words.get("faults", ())
-    latched_s = next((at_s for at_s, codes in zip(moments_s, faults, strict=False) if codes), seen_s)
-    spacings_s = np.diff(ticks_s(ticks, start_s, seen_s))
+    latched_s = next((tick["monotonic_s"] for tick in known if tick.get("faults")), seen_s)
+    spacings_s = np.diff(between(known, start_s, seen_s))
     return latched_s, float(np.quantile(spacings_s, FASTEST)) if len(spacings_s) else 0.0
 
 

@@ -1,27 +1,19 @@
-"""A recording, at any moment of it, in the form in which the daemon is shown live."""
-
 import math
-import re
+from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from tormagd.dashboard.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
-from tormagd.recording.overview import BREAK_NS, BREAK_S
-from tormagd.recording.reader import Columns, Recording, RecordingFile
-from tormagd.recording.series import Band, Series, bands, series
+from tormagd.recording.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, Glance, codes_of, quantities
+from tormagd.recording.reader import RecordingFile, Seen
 from tormagd.safety.codes import FAULTS, LIMITS
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
 
 STEP_S = 0.02
 "Between two points of a curve, as live."
-FIELDS = (
-    "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "left_mm", "right_mm", "gap_setpoint_mm", "reference_gap_mm",
-    "field_mT", "operating_state", "limits", "faults", "lateness_us", "tick", "belief",
-)  # fmt: skip
-"Of a message, what a frame is made from."
 AHEAD_NS = 10_000_000_000
 "So much more is read than one frame shows: the next is near."
 CURVES = {
@@ -33,7 +25,49 @@ CURVES = {
     "field_mT": "field_mT",
 }
 "What the page calls a quantity, and what a recording does."
-_BELIEVED = re.compile(r"belief\.[^.]+\.value")
+
+
+class Believed(msgspec.Struct, frozen=True):
+    """A BeliefReport as it is recorded: without what is not known."""
+
+    value: float | None = None
+    sd: float | None = None
+    unit: str = ""
+    acts: bool = False
+
+
+class Moment(Glance, total=False):
+    """What a frame takes of a message: a snapshot tells the belief, too."""
+
+    belief: dict[str, Believed]
+
+
+class Moments:
+    """Messages of one kind: their times, s since the recording's start, and their quantities, of shape (n, 8)."""
+
+    def __init__(self, seen: Sequence[Seen], start_ns: int) -> None:
+        self.messages = [each.message for each in seen]
+        self.t_s = np.array([each.t_ns - start_ns for each in seen]) * 1e-9
+        known = np.array([quantities(each.message) for each in seen], float)
+        self._values = known if seen else np.empty((0, len(QUANTITIES)))
+
+    def newest(self, times_s: Floats) -> list[int]:
+        """Of each time the place of the newest message; -1 where that is too old to be true, or none was before."""
+        at = np.searchsorted(self.t_s, times_s, side="right") - 1
+        return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= BREAK_S, at, -1).tolist()
+
+    def curve(self, name: str, times_s: Floats) -> list[float | None] | None:
+        """The quantity's newest value at each time; None where nothing of it is known."""
+        values = self._values[:, QUANTITIES.index(name)]
+        if not np.isfinite(values).any():
+            return None
+        found = [values[place] if place >= 0 else math.nan for place in self.newest(times_s)]
+        return [float(value) if math.isfinite(value) else None for value in found]
+
+    def within(self, from_s: float, to_s: float) -> range:
+        """The places of the messages between two times."""
+        first, last = np.searchsorted(self.t_s, (from_s, to_s))
+        return range(int(first), int(last))
 
 
 class Recorded:
@@ -46,7 +80,7 @@ class Recorded:
             raise ValueError("the recording has no messages: was the daemon running?")
         self._file, self._overview, self._start_ns = file, overview, overview.start_ns
         self.duration_s = overview.duration_s
-        self._read: tuple[int, int, Recording] | None = None
+        self._read: tuple[int, int, list[Seen]] | None = None
 
     @property
     def about(self) -> dict[str, Any]:
@@ -77,47 +111,43 @@ class Recorded:
         from_s = max(at_s - SHOWN_S, 0.0)
         at_ns = self._start_ns + round(at_s * 1e9)
         # what was there at a moment stands in the message before it, and ends with the one after
-        shown = self._between(at_ns - round((SHOWN_S + BREAK_S) * 1e9), at_ns + BREAK_NS)
+        seen = self._between(at_ns - round((SHOWN_S + BREAK_S) * 1e9), at_ns + BREAK_NS)
+        ticks, snapshots = (
+            Moments([each for each in seen if each.is_tick is kind], self._start_ns) for kind in (True, False)
+        )
+        shown = ticks if ticks.messages else snapshots
         times_s = np.append(np.arange(from_s, at_s, STEP_S), at_s)
-        curves = {ours: self._sampled(shown, theirs, times_s) for ours, theirs in CURVES.items()}
-        states, faults = self._bands(shown, "operating_state"), self._bands(shown, "faults")
-        driven = [any(_is_at(band, t_s) for band in states if band.name in DRIVEN) for t_s in times_s]
-        if states:
+        nothing: list[float | None] = [None] * len(times_s)
+        curves = {
+            ours: ticks.curve(theirs, times_s) or snapshots.curve(theirs, times_s) or nothing
+            for ours, theirs in CURVES.items()
+        }
+        told = [shown.messages[place] if place >= 0 else {} for place in shown.newest(times_s)]
+        if told:
+            states = [message.get("operating_state") for message in told]
             curves["field_mT"] = [
-                known if is_driven else None for known, is_driven in zip(curves["field_mT"], driven, strict=True)
+                field_mT if state in (None, *DRIVEN) else None
+                for field_mT, state in zip(curves["field_mT"], states, strict=True)
             ]
-        late = self._series(shown, "lateness_us")
-        late_us = [] if late is None else late.values[_within(late, from_s, at_s)].tolist()
-        limits = [
-            Held(band.name, share, _is_at(band, at_s))
-            for band in self._bands(shown, "limits")
-            if (share := _share(band, from_s, at_s)) > 0.0
-        ]
+        now = told[-1] if told else {}
+        within = ticks.within(from_s, at_s)
+        late_us = [ticks.messages[place].get("lateness_us") for place in within]
         return Frame(
             t_s=(self._start_ns * 1e-9 + times_s).tolist(),
             **curves,
-            operating_state=next((band.name for band in states if _is_at(band, at_s)), ""),
-            held=sorted(limits, key=lambda held: -held.share),
-            faults=[band.name for band in faults if _is_at(band, at_s)],
-            belief=believed(shown.telemetry, at_ns),
-            late_counts=late_counts(value for value in late_us if math.isfinite(value)),
+            operating_state=now.get("operating_state") or "",
+            held=_held(shown, from_s, at_s, codes_of(now, "limits")),
+            faults=list(codes_of(now, "faults")),
+            belief=believed(snapshots, at_s),
+            late_counts=late_counts(each for each in late_us if each is not None),
         )
 
-    def _between(self, from_ns: int, to_ns: int) -> Recording:
+    def _between(self, from_ns: int, to_ns: int) -> list[Seen]:
         """What was recorded in this time, and somewhat more."""
         if self._read is None or not self._read[0] <= from_ns < to_ns <= self._read[1]:
             span = from_ns - AHEAD_NS, to_ns + AHEAD_NS
-            self._read = (*span, self._file.between(*span, FIELDS))
+            self._read = (*span, self._file.between(*span, Moment))
         return self._read[2]
-
-    def _bands(self, shown: Recording, name: str) -> tuple[Band, ...]:
-        return bands(shown, name, self._start_ns)
-
-    def _series(self, shown: Recording, name: str) -> Series | None:
-        return series(shown, name, self._start_ns)
-
-    def _sampled(self, shown: Recording, name: str, times_s: np.ndarray) -> list[float | None]:
-        return _sampled(self._series(shown, name), times_s)
 
     def _glance(self) -> dict[str, Any]:
         """The least and greatest measured force of each stretch, and where faults and limits were."""
@@ -133,44 +163,23 @@ class Recorded:
         return {"t_s": known.t_s.tolist(), "low_N": low, "high_N": high, **spans}
 
 
-def believed(telemetry: Columns, at_ns: int) -> dict[str, BeliefReport]:
-    """What the newest snapshot before `at_ns` said; nothing where that is too old to be true, or said nothing."""
-    numbers, words = telemetry.numbers, telemetry.words
-    row = int(np.searchsorted(telemetry.t_ns, at_ns, side="right")) - 1
-    if row < 0 or (at_ns - telemetry.t_ns[row]) * 1e-9 > BREAK_S:
-        return {}
-    told = {}
-    for name in (path.split(".")[1] for path in numbers if _BELIEVED.fullmatch(path)):
-        value, sd, acts = (_number(numbers, f"belief.{name}.{part}", row) for part in ("value", "sd", "acts"))
-        if value is not None:
-            unit = "".join(words[f"belief.{name}.unit"][row]) if f"belief.{name}.unit" in words else ""
-            told[name] = BeliefReport(value=value, sd=sd, unit=unit, acts=bool(acts))
-    return told
+def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
+    """What the newest snapshot said; nothing where that is too old to be true, or said nothing."""
+    place = (snapshots.newest(np.array([at_s])) or [-1])[0]
+    told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
+    return {
+        name: BeliefReport(value=each.value, sd=each.sd, unit=each.unit, acts=each.acts)
+        for name, each in told.items()
+        if each.value is not None
+    }
 
 
-def _number(numbers: dict[str, NDArray[np.float64]], name: str, row: int) -> float | None:
-    value = float(numbers[name][row]) if name in numbers else math.nan
-    return value if math.isfinite(value) else None
-
-
-def _sampled(known: Series | None, times_s: np.ndarray) -> list[float | None]:
-    """The newest value at each time; None where the newest is too old to be true, or none is known."""
-    if known is None:
-        return [None] * len(times_s)
-    at = np.searchsorted(known.t_s, times_s, side="right") - 1
-    values = np.where((at >= 0) & (times_s - known.t_s[at] <= BREAK_S), known.values[at], np.nan)
-    return [value if np.isfinite(value) else None for value in values.tolist()]
-
-
-def _within(known: Series, from_s: float, to_s: float) -> slice:
-    first, last = np.searchsorted(known.t_s, (from_s, to_s))
-    return slice(int(first), int(last) + 1)
-
-
-def _is_at(band: Band, at_s: float) -> bool:
-    return any(start <= at_s < end for start, end in band.spans_s)
-
-
-def _share(band: Band, from_s: float, to_s: float) -> float:
-    inside_s = sum(max(min(end, to_s) - max(start, from_s), 0.0) for start, end in band.spans_s)
-    return inside_s / max(to_s - from_s, STEP_S)
+def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
+    """The limits of this time, by their share of it."""
+    held_s: defaultdict[str, float] = defaultdict(float)
+    steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
+    for place in shown.within(from_s, at_s):
+        for code in codes_of(shown.messages[place], "limits"):
+            held_s[code] += float(steps_s[place])
+    found = [Held(code, each_s / max(at_s - from_s, STEP_S), code in now) for code, each_s in held_s.items()]
+    return sorted(found, key=lambda held: -held.share)

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tormagd.dashboard.recorded import believed
-from tormagd.recording.overview import LATE_US, Codes
+from tormagd.dashboard.recorded import Moment, Moments, believed
+from tormagd.recording.overview import BREAK_NS, LATE_US, Codes
 from tormagd.recording.plot import figure, followed, picture
 from tormagd.recording.reader import RecordingFile
 from tormagd.recording.seal import Verdict
@@ -139,8 +139,9 @@ def _belief(of: Sequence[Reported]) -> list[list[str]]:
     found = []
     for each in of:
         end_ns = each.file.overview.end_ns
-        last = each.file.between(end_ns - 1_000_000_000, end_ns, ("belief",))
-        told = believed(last.telemetry, end_ns)
+        last = each.file.between(end_ns - BREAK_NS, end_ns, Moment)
+        snapshots = Moments([seen for seen in last if not seen.is_tick], each.file.overview.start_ns)
+        told = believed(snapshots, each.file.overview.duration_s)
         found.append(
             {
                 name: f"{it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'} {it.unit}"

@@ -168,14 +168,14 @@ class OverviewBuilder:
         self._late = [0] * (len(LATE_US) + 1)
         self._marks: list[Mark] = []
 
-    def add(self, t_ns: int, message: Mapping[str, Any], *, is_tick: bool) -> None:
+    def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
         """One message, in the order in which they were written."""
         if self._start_ns is None:
             self._start_ns = self._end_ns = t_ns
         since_ns = t_ns - self._start_ns
         self._end_ns = max(self._end_ns, t_ns)
         self._counts[is_tick] += 1
-        values = _values(message)
+        values = quantities(message)
         self._stretches[is_tick].add(since_ns, values)
         self._spans[is_tick].add(since_ns, message)
         self._following[is_tick].add(since_ns, values[0], values[2], message)
@@ -208,8 +208,8 @@ class OverviewBuilder:
         )
 
 
-def _values(message: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """The quantities, as ticks or snapshots spell them."""
+def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
+    """QUANTITIES of a message, as ticks or snapshots spell them."""
     get = message.get
     gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
     if gap_mm is None and left_mm is not None and right_mm is not None:
@@ -230,6 +230,11 @@ def _values(message: Mapping[str, Any]) -> tuple[float | None, ...]:
 
 def _number(value: object) -> float | None:
     return value if value.__class__ is float or value.__class__ is int else None
+
+
+def codes_of(message: Mapping[str, Any], kind: str) -> tuple[str, ...]:
+    """A message's codes of this kind."""
+    return _codes(message.get(kind))
 
 
 def _codes(told: object) -> tuple[str, ...]:

@@ -1,30 +1,15 @@
-"""Reading a recording: all of it at a glance, some seconds of it in columns, or the whole in columns."""
+"""Reading a recording: all of it at a glance, some seconds of it, or message by message."""
 
 import contextlib
-import math
 import struct
-from array import array
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TypedDict
+from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
-import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Footer,
-    Metadata,
-    MetadataIndex,
-    Schema,
-)
-from numpy.typing import NDArray
+from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, Metadata, MetadataIndex
 from zstandard import ZstdError
 
 from tormagd.recording.overview import Glance, Overview, OverviewBuilder, unpacked
@@ -33,15 +18,12 @@ from tormagd.recording.writer import ABOUT, CUT, OVERVIEW, TELEMETRY_TOPIC, TICK
 from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
-MAX_NESTING = 3
-MAX_COLUMNS = 512
-MAX_WORDS, MAX_CHARACTERS = 256, 4_096
-"In one value: of a list, and of a text."
-MAX_VALUES, MAX_SOME_VALUES = 16_000_000, 64_000_000
-"Of all columns together: of all fields, and of those alone that somebody wants."
 MAX_INDEX = 1_000_000
 "Chunks, some days of them."
+MAX_SEEN = 400_000
+"Messages of some seconds: at 4 kHz more than a minute."
 TAIL_BYTES = HEAD.size + 20 + len(MAGIC)
+TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
     McapError, ZstdError, ValueError, OverflowError, MemoryError, RecursionError, struct.error, msgspec.MsgspecError,
 )  # fmt: skip
@@ -52,41 +34,13 @@ class RecordingError(ValueError):
     """A file that is not a readable recording: the text names the file and what is wrong with it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """The messages of one topic, one row each, in the order they were written.
+class Seen(NamedTuple):
+    """A control tick or a snapshot: when, ns since 1970, which it is, and its fields, as far as they are wanted. What
+    was not known is not there."""
 
-    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known; true and false are 1 and 0.
-    `words[name]` holds a tuple of strings for each row. An object's or a list's members get names of their own:
-    `tick.exec_us`, `duty.0`. What the file's schemas name has a column, known or not.
-    """
-
-    t_ns: NDArray[np.int64]
-    numbers: dict[str, NDArray[np.float64]]
-    words: dict[str, list[tuple[str, ...]]]
-
-
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """One file, or some seconds of it. `is_complete` is false where the recorder was killed or the disk was full: what
-    was written before that is there."""
-
-    telemetry: Columns
-    ticks: Columns
-    metadata: dict[str, str] = field(default_factory=dict)
-    is_complete: bool = True
-
-    def described(self, name: str, kind: Any) -> Any:
-        """What its metadata say of `name`, a value of this type; None where they do not, or say something else."""
-        return described(self.metadata, name, kind)
-
-
-def described(metadata: dict[str, str], name: str, kind: Any) -> Any:
-    """What metadata say of `name`, a value of this type; None where they do not, or say something else."""
-    try:
-        return msgspec.json.decode(metadata[name], type=kind)
-    except (KeyError, msgspec.MsgspecError, RecursionError):
-        return None
+    t_ns: int
+    is_tick: bool
+    message: Any
 
 
 @contextlib.contextmanager
@@ -125,34 +79,6 @@ def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Cal
     return last == END
 
 
-class Topics:
-    """The channels of a file, as its records tell them."""
-
-    def __init__(self) -> None:
-        self._schemas: dict[int, bytes] = {}
-        self.known: dict[int, str] = {}
-        self.expected: dict[str, list[object]] = {TELEMETRY_TOPIC: [], TICKS_TOPIC: []}
-        "By topic, the schemas of its messages."
-
-    def take(self, record: Record) -> None:
-        """A schema or a channel; any other record is passed over. Raises UNREADABLE."""
-        if record.opcode == Opcode.SCHEMA:
-            schema = record.read(Schema)
-            self._schemas[schema.id] = schema.data
-        elif record.opcode == Opcode.CHANNEL:
-            channel = record.read(Channel)
-            if channel.topic in self.expected and channel.id not in self.known and channel.schema_id in self._schemas:
-                self.expected[channel.topic].append(msgspec.json.decode(self._schemas[channel.schema_id]))
-            self.known[channel.id] = channel.topic
-
-    def require(self, name: str) -> None:
-        """Raises RecordingError where the file has neither topic."""
-        if set(self.known.values()).isdisjoint(self.expected):
-            raise RecordingError(
-                f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
-            )
-
-
 class Place(NamedTuple):
     """A chunk: its messages' times, ns since 1970, and where it begins in the file."""
 
@@ -161,8 +87,76 @@ class Place(NamedTuple):
     at: int
 
 
+class Contents:
+    """What the records of a file tell, as they come: hands each tick and snapshot to `each`, decoded as the type
+    `wanted`, which may leave fields out. Raises UNREADABLE."""
+
+    def __init__(self, wanted: Any, each: Callable[[Seen], None]) -> None:
+        self._decoder, self._each = msgspec.json.Decoder(wanted), each
+        self._topics: dict[int, str] = {}
+        self.metadata: dict[str, str] = {}
+        self.places: list[Place] = []
+        self.is_complete = True
+        "False where the recorder was killed or the disk was full: what was written before that is there."
+
+    def take(self, record: Record) -> None:
+        """A record that is no message."""
+        if record.opcode == Opcode.CHANNEL:
+            channel = record.read(Channel)
+            self._topics[channel.id] = channel.topic
+        elif record.opcode == Opcode.METADATA:
+            known = record.read(Metadata)
+            if known.name == ABOUT:
+                self.metadata.update(known.metadata)
+        elif record.opcode == Opcode.CHUNK and len(self.places) < MAX_INDEX:
+            chunk = record.read(Chunk)
+            self.places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
+
+    def message(self, sent: Sent) -> None:
+        """A message."""
+        topic = self._topics.get(sent.channel)
+        if topic in TOPICS:
+            self._each(Seen(sent.t_ns, topic == TICKS_TOPIC, self._decoder.decode(sent.data)))
+
+    def again(self, wanted: Any, each: Callable[[Seen], None]) -> "Contents":
+        """For some of the same file's messages, which are wanted otherwise."""
+        other = Contents(wanted, each)
+        other._topics = self._topics
+        return other
+
+    def require(self, name: str) -> None:
+        """Raises RecordingError where the file, which is called `name`, has neither topic."""
+        if set(self._topics.values()).isdisjoint(TOPICS):
+            raise RecordingError(
+                f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
+            )
+
+    def described(self, name: str, kind: Any) -> Any:
+        """What the metadata say of `name`, a value of this type; None where they do not, or say something else."""
+        try:
+            return msgspec.json.decode(self.metadata[name], type=kind)
+        except (KeyError, msgspec.MsgspecError, RecursionError):
+            return None
+
+
+def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
+    """Reads the recording in `file`, wherever that is, which errors call `name`, as Contents say. Raises
+    RecordingError: not MCAP, damaged, or not written by tormagd; and OSError."""
+    found = Contents(wanted, each)
+    is_whole = scan(file, name, found.take, found.message)
+    found.require(name)
+    found.is_complete = is_whole and CUT not in found.metadata
+    return found
+
+
+def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
+    """Reads the recording in `path`, as Contents say. Raises RecordingError, also where it is not readable."""
+    with opened(path) as file:
+        return read_open(file, str(path), wanted, each)
+
+
 class RecordingFile:
-    """A recording on the disk, of any length: all of it at a glance, and any seconds of it in columns.
+    """A recording on the disk, of any length: all of it at a glance, and any seconds of it.
 
     Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd. Of a file whose recorder was
     killed, or of an older one, the overview is made from all of its messages; without `is_scanned` it is refused.
@@ -170,103 +164,69 @@ class RecordingFile:
 
     def __init__(self, path: Path, *, is_scanned: bool = True) -> None:
         self.path = path
-        self.metadata: dict[str, str] = {}
-        self._topics = Topics()
-        self._places: list[Place] = []
-        self._builder = OverviewBuilder()
-        self.is_complete = True
         with opened(path) as file:
             with readable(str(path)):
-                found = self._from_summary(file)
+                found = _from_summary(file)
+            if found is None and not is_scanned:
+                raise RecordingError(f"{path}: it has no overview: its recorder did not end it, or is older")
             if found is None:
-                if not is_scanned:
-                    raise RecordingError(f"{path}: it has no overview: its recorder did not end it, or is older")
                 file.seek(0)
-                self._places.clear()
-                self.is_complete = scan(file, str(path), self._take, self._glance)
-                found = self._builder.made()
-        self.overview: Overview = found
-        self._topics.require(str(path))
-        self.is_complete &= CUT not in self.metadata
+                builder = OverviewBuilder()
+                known = read_open(file, str(path), Glance, lambda seen: builder.add(*seen))
+                found = known, builder.made()
+        self._contents, self.overview = found
+        self._contents.require(str(path))
+        self.metadata, self.described = self._contents.metadata, self._contents.described
+        self.is_complete = self._contents.is_complete
 
-    def described(self, name: str, kind: Any) -> Any:
-        """As `Recording.described`."""
-        return described(self.metadata, name, kind)
+    def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
+        """What was recorded in this time, decoded as the type `wanted`. Raises RecordingError."""
+        found: list[Seen] = []
 
-    def between(self, from_ns: int, to_ns: int, only: Collection[str] | None = None) -> Recording:
-        """What was recorded in this time, in columns; its metadata are the file's. Raises RecordingError."""
-        builders = _Builders(self._topics, only)
+        def keep(seen: Seen) -> None:
+            if from_ns <= seen.t_ns <= to_ns:
+                found.append(seen)
+                if len(found) > MAX_SEEN:
+                    raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
 
-        def message(sent: Sent) -> None:
-            if from_ns <= sent.t_ns <= to_ns:
-                builders.add(sent)
-
-        unpacker = Unpacker()
+        reading, unpacker = self._contents.again(wanted, keep), Unpacker()
         with opened(self.path) as file, readable(str(self.path)):
-            for place in self._places:
+            for place in self._contents.places:
                 if place.from_ns <= to_ns and place.to_ns >= from_ns:
-                    file.seek(place.at)
-                    chunk = record_at(file, place.at)
-                    if chunk is None or chunk.opcode != Opcode.CHUNK:
-                        raise ValueError(f"no chunk at byte {place.at}, where its index has one")
-                    for _ in unpacker.records(chunk, message):
+                    for _ in unpacker.records(_at(file, place.at, Opcode.CHUNK), reading.message):
                         pass
-        return builders.recording(self.metadata, self.is_complete)
+        return found
 
-    def _from_summary(self, file: BinaryIO) -> Overview | None:
-        """What stands at the end of a finished file; None where there is nothing."""
-        at = file.seek(0, 2) - TAIL_BYTES
-        file.seek(max(0, at))
-        if at < 0 or not file.read().endswith(MAGIC):
-            return None
-        file.seek(at)
-        footer = record_at(file, at)
-        if footer is None or footer.opcode != Opcode.FOOTER:
-            return None
-        start = footer.read(Footer).summary_start
-        overview: Overview | None = None
-        told: list[int] = []
-        file.seek(start)
-        for record in following(file, start) if start else ():
-            if record.opcode == Opcode.CHUNK_INDEX and len(self._places) < MAX_INDEX:
-                index = record.read(ChunkIndex)
-                self._places.append(Place(index.message_start_time, index.message_end_time, index.chunk_start_offset))
-            elif record.opcode == Opcode.METADATA_INDEX:
-                told.append(record.read(MetadataIndex).offset)
-            elif record.opcode == Opcode.ATTACHMENT_INDEX:
-                attached = record.read(AttachmentIndex)
-                if attached.name == OVERVIEW:
-                    back = file.tell()
-                    overview = unpacked(_at(file, attached.offset, Opcode.ATTACHMENT).read(Attachment).data)
-                    file.seek(back)
-            else:
-                self._topics.take(record)
-        if overview is not None:
-            for at in told:
-                self._describe(_at(file, at, Opcode.METADATA))
-        return overview
 
-    def _take(self, record: Record) -> None:
-        if record.opcode == Opcode.METADATA:
-            self._describe(record)
-        elif record.opcode == Opcode.CHUNK and len(self._places) < MAX_INDEX:
-            chunk = record.read(Chunk)
-            self._places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
+def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
+    """What stands at the end of a finished file; None where there is no overview."""
+    at = file.seek(0, 2) - TAIL_BYTES
+    file.seek(max(0, at))
+    if at < 0 or not file.read().endswith(MAGIC):
+        return None
+    file.seek(at)
+    footer = record_at(file, at)
+    start = footer.read(Footer).summary_start if footer is not None and footer.opcode == Opcode.FOOTER else 0
+    found = Contents(None, lambda seen: None)
+    overview_at, told = None, []
+    file.seek(start)
+    for record in following(file, start) if start else ():
+        if record.opcode == Opcode.CHUNK_INDEX and len(found.places) < MAX_INDEX:
+            index = record.read(ChunkIndex)
+            found.places.append(Place(index.message_start_time, index.message_end_time, index.chunk_start_offset))
+        elif record.opcode == Opcode.METADATA_INDEX:
+            told.append(record.read(MetadataIndex).offset)
+        elif record.opcode == Opcode.ATTACHMENT_INDEX:
+            attached = record.read(AttachmentIndex)
+            overview_at = attached.offset if attached.name == OVERVIEW else overview_at
         else:
-            self._topics.take(record)
-
-    def _describe(self, record: Record) -> None:
-        known = record.read(Metadata)
-        if known.name == ABOUT:
-            self.metadata.update(known.metadata)
-
-    def _glance(self, sent: Sent) -> None:
-        topic = self._topics.known.get(sent.channel)
-        if topic in self._topics.expected:
-            self._builder.add(sent.t_ns, _GLANCE.decode(sent.data), is_tick=topic == TICKS_TOPIC)
-
-
-_GLANCE = msgspec.json.Decoder(Glance)
+            found.take(record)
+    if overview_at is None:
+        return None
+    for at in told:
+        found.take(_at(file, at, Opcode.METADATA))
+    found.is_complete = CUT not in found.metadata
+    return found, unpacked(_at(file, overview_at, Opcode.ATTACHMENT).read(Attachment).data)
 
 
 def _at(file: BinaryIO, at: int, opcode: Opcode) -> Record:
@@ -275,163 +235,3 @@ def _at(file: BinaryIO, at: int, opcode: Opcode) -> Record:
     if record is None or record.opcode != opcode:
         raise ValueError(f"its index points to byte {at}, where something else is")
     return record
-
-
-def read_recording(path: Path) -> Recording:
-    """The recording in `path`, all in memory. Raises RecordingError: not readable, not MCAP, damaged, too large for
-    that, or not written by tormagd."""
-    with opened(path) as file:
-        return read_open_recording(file, str(path))
-
-
-def read_open_recording(file: BinaryIO, name: str, only: Collection[str] | None = None) -> Recording:
-    """The recording in `file`, wherever that is, which errors call `name`; where `only` some fields of its messages are
-    wanted, no others are kept. Raises RecordingError as `read_recording`; and OSError.
-    """
-    topics, metadata = Topics(), dict[str, str]()
-    builders = _Builders(topics, only)
-
-    def take(record: Record) -> None:
-        if record.opcode == Opcode.METADATA:
-            known = record.read(Metadata)
-            if known.name == ABOUT:
-                metadata.update(known.metadata)
-        else:
-            topics.take(record)
-
-    is_whole = scan(file, name, take, builders.add)
-    topics.require(name)
-    with readable(name):
-        return builders.recording(metadata, is_whole and CUT not in metadata)
-
-
-def some_of(names: Collection[str]) -> Any:
-    """The type of a message of which these fields alone are wanted."""
-    return TypedDict("Wanted", dict.fromkeys(names, Any), total=False)  # type: ignore[operator]
-
-
-class _Builders:
-    """The rows of both topics on their way to columns."""
-
-    def __init__(self, topics: Topics, only: Collection[str] | None) -> None:
-        self._topics = topics
-        most = MAX_VALUES if only is None else MAX_SOME_VALUES
-        # what nobody wants is passed over by the decoder, which takes most of the time
-        self._decoder = msgspec.json.Decoder(Any if only is None else some_of(only))
-        self._builders = {topic: _Builder(only, most) for topic in topics.expected}
-
-    def add(self, sent: Sent) -> None:
-        """One message. Raises UNREADABLE."""
-        builder = self._builders.get(self._topics.known.get(sent.channel, ""))
-        if builder is not None:
-            builder.add(sent.t_ns, self._decoder.decode(sent.data))
-
-    def recording(self, metadata: dict[str, str], is_complete: bool) -> Recording:
-        """All of them. Raises UNREADABLE."""
-        for topic, builder in self._builders.items():
-            for schema in self._topics.expected[topic]:
-                builder.expect(schema)
-        telemetry, ticks = (self._builders[topic].columns() for topic in (TELEMETRY_TOPIC, TICKS_TOPIC))
-        return Recording(telemetry, ticks, metadata, is_complete)
-
-
-class _Builder:
-    """Rows of one topic on their way to columns; a column that first shows in a later row is filled up before it."""
-
-    def __init__(self, only: Collection[str] | None, most_values: int) -> None:
-        self._only, self._most_values = only, most_values
-        self._t_ns = array("q")
-        self._numbers: dict[str, array[float]] = {}
-        self._words: dict[str, list[tuple[str, ...]]] = {}
-        self._same: dict[tuple[str, ...], tuple[str, ...]] = {}
-
-    def add(self, t_ns: int, message: object) -> None:
-        if not isinstance(message, dict):
-            raise ValueError(f"message of {t_ns} ns is {type(message).__name__}: allowed is an object")
-        row = len(self._t_ns)
-        self._t_ns.append(t_ns)
-        for name, value in _flat("", message, MAX_NESTING):
-            if isinstance(value, tuple):
-                words = self._words.get(name)
-                if words is None:
-                    words = self._words[name] = self._filled([], row, ())
-                elif len(words) < row:
-                    words.extend([()] * (row - len(words)))
-                words.append(self._same.setdefault(value, value))
-            else:
-                numbers = self._numbers.get(name)
-                if numbers is None:
-                    numbers = self._numbers[name] = self._filled(array("d"), row, math.nan)
-                elif len(numbers) < row:
-                    numbers.extend([math.nan] * (row - len(numbers)))
-                numbers.append(value)
-        self._require(row)
-
-    def expect(self, schema: object) -> None:
-        """The columns that the schema names are there, whether anything is ever known of them or not."""
-        for name, kind in _columns("", schema, MAX_NESTING):
-            if self._only is None or name.partition(".")[0] in self._only:
-                if kind in ("number", "integer", "boolean"):
-                    self._numbers.setdefault(name, array("d"))
-                elif kind in ("string", "array"):
-                    self._words.setdefault(name, [])
-                self._require(len(self._t_ns))
-
-    def columns(self) -> Columns:
-        rows = len(self._t_ns)
-        for numbers in self._numbers.values():
-            numbers.extend([math.nan] * (rows - len(numbers)))
-        for words in self._words.values():
-            words.extend([()] * (rows - len(words)))
-        return Columns(
-            np.array(self._t_ns, dtype=np.int64),
-            # a column that was null until its first word (a text not known yet) is a column of words
-            {n: np.array(v, dtype=np.float64) for n, v in self._numbers.items() if n not in self._words},
-            self._words,
-        )
-
-    def _filled(self, column: Any, rows: int, value: object) -> Any:
-        self._require(rows)
-        column.extend([value] * rows)
-        return column
-
-    def _require(self, rows: int) -> None:
-        """Raises ValueError where there are too many columns, or values in them."""
-        columns = len(self._numbers) + len(self._words)
-        if columns > MAX_COLUMNS or columns * rows > self._most_values:
-            raise ValueError(
-                f"{columns} columns of {rows} rows: allowed are {MAX_COLUMNS} columns, and {self._most_values} values "
-                "in memory at once"
-            )
-
-
-def _columns(prefix: str, schema: object, depth: int) -> Iterator[tuple[str, object]]:
-    """The columns in a plain JSON schema, each with its dotted name and type; of lists, those of words."""
-    properties = schema.get("properties") if isinstance(schema, dict) else None
-    for name, inner in (properties if isinstance(properties, dict) else {}).items():
-        if not isinstance(inner, dict):
-            continue
-        if inner.get("type") == "object" and depth > 0:
-            yield from _columns(f"{prefix}{name}.", inner, depth - 1)
-        elif inner.get("type") != "array" or inner.get("items") == {"type": "string"}:
-            yield f"{prefix}{name}", inner.get("type")
-
-
-def _flat(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, float | tuple[str, ...]]]:
-    """The numbers and words in `value`, each with its dotted name. A list without numbers is a row's words."""
-    match value:
-        case str() if len(value) <= MAX_CHARACTERS:
-            yield prefix, (value,)
-        case None:
-            yield prefix, math.nan
-        case bool() | int() | float():
-            yield prefix, float(value)
-        case list() if len(value) <= MAX_WORDS and all(
-            isinstance(item, str) and len(item) <= MAX_CHARACTERS for item in value
-        ):
-            yield prefix, tuple(value)
-        case dict() | list() if depth > 0:
-            for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
-                yield from _flat(f"{prefix}.{name}" if prefix else str(name), inner, depth - 1)
-        case _:
-            raise ValueError(f"{prefix} = {str(value)[:80]}: allowed are numbers, strings and short lists of them")

@@ -149,7 +149,7 @@ class RecordingWriter:
             self._thinning.happened(message.t_ns)
         known = _known(msgspec.to_builtins(message))
         self._add(self._telemetry_channel, message.t_ns, msgspec.json.encode(known), self.telemetry_count)
-        self._overview.add(message.t_ns, known | {"mark": message.mark}, is_tick=False)
+        self._overview.add(message.t_ns, False, known | {"mark": message.mark})
         self.telemetry_count += 1
 
     def ticks(self, batch: TickBatch) -> None:
@@ -174,7 +174,7 @@ class RecordingWriter:
                 self._last_tick = number
             message = known_values(batch.columns, row)
             self._write(self._thinning.take((t_ns, message)))
-            self._overview.add(t_ns, message, is_tick=True)
+            self._overview.add(t_ns, True, message)
             self.tick_count += 1
         if before_ns is not None and self._last_tick_ns is not None:
             self._batch_ns = self._last_tick_ns - before_ns

@@ -161,8 +161,8 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
 
     `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion. `belief` has the
     believed values of the device by name. `search_age_ms` is how long ago the search for `field_mT` began, where it
-    runs beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest setpoint's, `mark` the newest since
-    the start. A
+    runs beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest
+    setpoint's, `mark` the newest since the start. A
     value that is not known (no device, no setpoint) is null.
     """
 

@@ -4,9 +4,8 @@ from concurrent.futures import Executor
 
 import fsspec
 
-from tormagd.lab.consoles.summary import FIELDS, Summary, summarise
+from tormagd.lab.consoles.summary import Summary, summarise
 from tormagd.lab.executors import finished
-from tormagd.recording.reader import read_open_recording
 
 SUFFIX = ".mcap"
 
@@ -33,7 +32,7 @@ def read(url: str) -> Summary | str:
         if not system.isfile(path):
             return "it is no regular file"
         with system.open(path, "rb") as file:
-            return summarise(read_open_recording(file, name, FIELDS))
+            return summarise(file, name)
     except (OSError, ValueError) as error:
         return str(error).removeprefix(f"{name}: ")
 

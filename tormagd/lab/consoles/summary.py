@@ -1,39 +1,38 @@
 """What one recording says of its console: how well forces were followed, what held them back, how the device is."""
 
+from array import array
 from collections.abc import Callable
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
 
 from tormagd.lab.arrays import rms
-from tormagd.recording.overview import Floats
-from tormagd.recording.reader import Recording
-from tormagd.recording.series import bands, end_ns, is_enabled, series, start_ns, tracking_rms_N
+from tormagd.recording.overview import Floats, Glance, OverviewBuilder
+from tormagd.recording.reader import Seen, read_open
 
-FIELDS = (
-    "setpoint_cf",
-    "measured_cf",
-    "operating_state",
-    "limits",
-    "faults",
-    "lateness_us",
-    "tick",
-    "trim",
-    "device_clock_drift",
-    "device_temperature_C",
-    "left_current_A",
-    "right_current_A",
-)
-"Fields of a recording's messages that a summary needs."
+FIGURES = (
+    "trim", "device_clock_drift", "device_temperature_C", "left_current_A", "right_current_A", "lateness_us",
+)  # fmt: skip
+"Of a tick, the numbers that a summary has figures of."
+
+
+class Wanted(Glance, total=False):
+    """What a summary takes of a message."""
+
+    trim: float | None
+    device_clock_drift: float | None
+    device_temperature_C: float | None
+    left_current_A: float | None
+    right_current_A: float | None
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of one recording; what was not recorded is null, or an empty text.
 
-    `trim` is the device's force over its model's, `current_A` the RMS of the motor that needed more. `clock_drift_ppm`
-    is how much the device's clock runs fast. These and `tracking_rms_N`, with the sensor's noise and the approach in
-    it, are over the time ENABLED. Trim, clock and temperature are medians.
+    `trim` is the device's force over its model's, `current_A` the RMS of the motor that needed more, `clock_drift_ppm`
+    by how much the device's clock runs fast: each over the time ENABLED. `tracking_rms_N` is that of while following,
+    with the sensor's noise in it. Of a trim, a clock and a temperature it is the median.
     """
 
     serial_number: int | None
@@ -57,38 +56,46 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     current_A: float | None
 
 
-def summarise(recording: Recording) -> Summary:
-    """Return the summary of a recording. Raises ValueError for one without messages."""
-    begin_ns = start_ns(recording)
+def summarise(file: BinaryIO, name: str) -> Summary:
+    """Of the recording in `file`, which errors call `name`. Raises RecordingError, OSError, and ValueError for a
+    recording without messages."""
+    builder, enabled = OverviewBuilder(), {name: array("d") for name in FIGURES}
+
+    def take(seen: Seen) -> None:
+        builder.add(*seen)
+        if seen.is_tick and seen.message.get("operating_state") in (None, "ENABLED"):
+            for name, values in enabled.items():
+                value = seen.message.get(name)
+                if value is not None:
+                    values.append(value)
+
+    recording = read_open(file, name, Wanted, take)
+    overview = builder.made()
+    if not overview.ticks and not overview.snapshots:
+        raise ValueError(f"{name}: the recording has no messages")
     scene = recording.described("scene", dict[str, Any]) or {}
-    insert = scene.get("insert", {})
-    states = {band.name: band.spans_s for band in bands(recording, "operating_state")}
-    currents_A = [_enabled(recording, name, rms) for name in ("left_current_A", "right_current_A")]
-    drift = _enabled(recording, "device_clock_drift", np.median)
+    insert, codes = scene.get("insert", {}), overview.codes
+
+    def figure(name: str, of: Callable[[Floats], Any]) -> float | None:
+        return float(of(np.array(enabled[name]))) if enabled[name] else None
+
+    currents_A = [figure(name, rms) for name in ("left_current_A", "right_current_A")]
+    drift = figure("device_clock_drift", np.median)
     return Summary(
         serial_number=recording.described("serial_number", int),
         insert=str(insert.get("name", "")) if isinstance(insert, dict) else "",
         scene=str(scene.get("name", "")),
         version=recording.metadata.get("version", ""),
-        start_s=begin_ns * 1e-9,
-        duration_s=(end_ns(recording) - begin_ns) * 1e-9,
-        enabled_s=sum(end - start for start, end in states.get("ENABLED", ())),
+        start_s=overview.start_ns * 1e-9,
+        duration_s=overview.duration_s,
+        enabled_s=codes["operating_state"]["ENABLED"].held_ns * 1e-9 if "ENABLED" in codes["operating_state"] else 0.0,
         is_complete=recording.is_complete,
-        tracking_rms_N=tracking_rms_N(recording),
-        late_p99_us=_enabled(recording, "lateness_us", lambda values: np.percentile(values, 99.0)),
-        limits_s={band.name: sum(end - start for start, end in band.spans_s) for band in bands(recording, "limits")},
-        faults_at_s={band.name: band.spans_s[0][0] for band in bands(recording, "faults")},
-        trim=_enabled(recording, "trim", np.median),
+        tracking_rms_N=overview.following.rms_N,
+        late_p99_us=figure("lateness_us", lambda values: np.percentile(values, 99.0)),
+        limits_s={name: each.held_ns * 1e-9 for name, each in codes["limits"].items()},
+        faults_at_s={name: each.spans_ns[0][0] * 1e-9 for name, each in codes["faults"].items()},
+        trim=figure("trim", np.median),
         clock_drift_ppm=None if drift is None else drift * 1e6,
-        temperature_C=_enabled(recording, "device_temperature_C", np.median),
+        temperature_C=figure("device_temperature_C", np.median),
         current_A=max((each for each in currents_A if each is not None), default=None),
     )
-
-
-def _enabled(recording: Recording, name: str, figure: Callable[[Floats], Any]) -> float | None:
-    """Return a figure of all finite values of the quantity `name` while ENABLED; None where there are none."""
-    known = series(recording, name)
-    if known is None:
-        return None
-    values = known.values[np.isfinite(known.values) & is_enabled(recording, known.t_s)]
-    return float(figure(values)) if values.size else None
