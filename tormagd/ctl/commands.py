@@ -226,13 +226,13 @@ COMMANDS = {
         ),
     ),
     "mark": Command(
-        "put an event into telemetry and recordings; what is recorded around it is kept",
+        "put an event into telemetry and recordings, and keep what is recorded there",
         "recordings.mark",
         ("client",),
         (option("text", metavar="TEXT", help="what happened, in 1..200 characters"),),
     ),
     "recordings": Command(
-        "list a folder of recordings, prune it to its budget, keep one of it (mark), or copy one and check its seals",
+        "list a folder of recordings, prune it to its budget, keep one (mark), or copy one and check it (export)",
         "recordings.recordings",
         ("config",),
         (
@@ -313,7 +313,7 @@ COMMANDS = {
         ),
     ),
     "report": Command(
-        "one page to keep of a recording, or of two side by side: forces, limits, faults and remedies, belief, machine",
+        "one page to keep of a recording, or of two side by side",
         "report.report",
         ("config",),
         (

@@ -80,7 +80,7 @@ class Recorded:
             raise ValueError("the recording has no messages: was the daemon running?")
         self._file, self._overview, self._start_ns = file, overview, overview.start_ns
         self.duration_s = overview.duration_s
-        self._read: tuple[int, int, list[Seen]] | None = None
+        self._read: tuple[int, int, Moments, Moments] | None = None
 
     @property
     def about(self) -> dict[str, Any]:
@@ -111,10 +111,7 @@ class Recorded:
         from_s = max(at_s - SHOWN_S, 0.0)
         at_ns = self._start_ns + round(at_s * 1e9)
         # what was there at a moment stands in the message before it, and ends with the one after
-        seen = self._between(at_ns - round((SHOWN_S + BREAK_S) * 1e9), at_ns + BREAK_NS)
-        ticks, snapshots = (
-            Moments([each for each in seen if each.is_tick is kind], self._start_ns) for kind in (True, False)
-        )
+        ticks, snapshots = self._between(at_ns - round((SHOWN_S + BREAK_S) * 1e9), at_ns + BREAK_NS)
         shown = ticks if ticks.messages else snapshots
         times_s = np.append(np.arange(from_s, at_s, STEP_S), at_s)
         nothing: list[float | None] = [None] * len(times_s)
@@ -142,12 +139,12 @@ class Recorded:
             late_counts=late_counts(each for each in late_us if each is not None),
         )
 
-    def _between(self, from_ns: int, to_ns: int) -> list[Seen]:
-        """What was recorded in this time, and somewhat more."""
+    def _between(self, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
+        """The ticks and the snapshots of this time, and somewhat more."""
         if self._read is None or not self._read[0] <= from_ns < to_ns <= self._read[1]:
             span = from_ns - AHEAD_NS, to_ns + AHEAD_NS
-            self._read = (*span, self._file.between(*span, Moment))
-        return self._read[2]
+            self._read = (*span, *moments(self._file, *span))
+        return self._read[2:]
 
     def _glance(self) -> dict[str, Any]:
         """The least and greatest measured force of each stretch, and where faults and limits were."""
@@ -161,6 +158,13 @@ class Recorded:
             [value if math.isfinite(value) else None for value in side.tolist()] for side in (known.low, known.high)
         )
         return {"t_s": known.t_s.tolist(), "low_N": low, "high_N": high, **spans}
+
+
+def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
+    """The ticks and the snapshots that were recorded in this time. Raises RecordingError."""
+    seen, start_ns = file.between(from_ns, to_ns, Moment), file.overview.start_ns
+    ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
+    return Moments(ticks, start_ns), Moments(snapshots, start_ns)
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:

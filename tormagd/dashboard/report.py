@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tormagd.dashboard.recorded import Moment, Moments, believed
+from tormagd.dashboard.recorded import believed, moments
 from tormagd.recording.overview import BREAK_NS, LATE_US, Codes
 from tormagd.recording.plot import figure, followed, picture
 from tormagd.recording.reader import RecordingFile
@@ -139,8 +139,7 @@ def _belief(of: Sequence[Reported]) -> list[list[str]]:
     found = []
     for each in of:
         end_ns = each.file.overview.end_ns
-        last = each.file.between(end_ns - BREAK_NS, end_ns, Moment)
-        snapshots = Moments([seen for seen in last if not seen.is_tick], each.file.overview.start_ns)
+        _, snapshots = moments(each.file, end_ns - BREAK_NS, end_ns)
         told = believed(snapshots, each.file.overview.duration_s)
         found.append(
             {

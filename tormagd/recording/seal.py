@@ -216,7 +216,9 @@ class _Check:
     def verdict(self, size: int, *, ends: bool) -> Verdict:
         """The verdict; `ends` says whether the file's last bytes are those of one that was finished."""
         if not self._by and not self._seals and (self._is_over or not self._head):
-            return Verdict(State.UNSEALED, "nothing says whether it was changed; tormagd before 0.1 wrote it")
+            return Verdict(
+                State.UNSEALED, "nothing says whether it was changed: an older tormagd, or another program, wrote it"
+            )
         if self._by == KEYED and not self._key:
             return Verdict(State.OTHER_KEY, "[recordings] key in the configuration names the key's file", self._follows)
         unsealed = size - self._sealed_to

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from firmware_protocol.build import settle
+from tormagd.assembly.build import sources_hash
 from tormagd.config import load_config
 from tormagd.output import write_line
 from tormagd.recording.black_box import BlackBoxFile, read_black_box
@@ -53,7 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
                 done = rerun(rebuilt(known), known.columns, box.entries, options.from_s)
                 result["rerun"] = msgspec.to_builtins(done)
         except ReplayError as error:
-            raise ReplayError(f"{options.file}: {error}") from error
+            other = box.header.get("sources_sha256", "") not in ("", sources_hash())
+            hint = "; another tormagd wrote it: replay it with that one" if other else ""
+            raise ReplayError(f"{options.file}: {error}{hint}") from error
     except (ConfigError, RecordingError, ReplayError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
