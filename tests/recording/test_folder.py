@@ -106,6 +106,20 @@ def test_the_former_name_is_a_segment_too(tmp_path: Path) -> None:
     assert mark(mark(path)) == tmp_path / "2026-11-26T05-09-27-marked.mcap"
 
 
+def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, {}, SETTINGS, b"", clock)
+    mark(recorder.writer.path)  # by somebody else: the recorder goes on
+    (tmp_path / "another.mcap").write_bytes(b"x" * 1_900_000)
+    newest = Mark(t_ns=START_NS + 10, text="here")
+    with pytest.raises(OSError, match="nothing unmarked is left"), recorder.writer as writer:  # noqa: PT012
+        recorder.telemetry(telemetry(0, 0, mark=newest))
+        recorder.ticks(batch((0, 1.0, 1.0, 35.0, 36.0, 0.25), (3.7e6, 1.0, 1.0, 35.0, 36.0, 0.25)))
+    known = RecordingFile(writer.path)
+    assert (known.is_complete, [each.text for each in known.overview.marks]) == (False, ["here"])
+    assert verified(writer.path).state is State.WHOLE
+
+
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
     """Through the recorder, as it goes on for so long: a batch a minute, now and then a mark; the marks."""
     recorder = Recorder(path, {}, SETTINGS, b"", clock)

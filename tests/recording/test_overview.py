@@ -4,11 +4,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from sent import START_NS, back, batch, telemetry
 
-from tormagd.recording.overview import MOST_STRETCHES, Glance, OverviewBuilder, unpacked
+from tormagd.recording.overview import MOST_STRETCHES, Codes, Curves, Glance, OverviewBuilder, unpacked
 from tormagd.recording.reader import RecordingFile
 from tormagd.recording.writer import THINNED, RecordingWriter
 from tormagd_client.messages import Mark
@@ -83,6 +84,24 @@ def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_p
     assert np.array_equal(at_ms[at_ms >= 5_020], np.arange(5_020, 30_000))
     assert len(at_ms[at_ms < 5_020]) == pytest.approx(100, abs=2)
     assert RecordingFile(path).overview.ticks == 30_000
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"late_counts": [1]},
+        {"codes": {}},
+        {"width_ns": 0},
+        {"codes": {"limits": {"$\\frac{": Codes([], 0)}, "faults": {}, "operating_state": {}}},
+        {"codes": {"limits": {"RATE": Codes([(0, 1)] * 2_000, 0)}, "faults": {}, "operating_state": {}}},
+        {"of_ticks": Curves(b"12345678", {"gap_mm": b"1234"}, {"gap_mm": b""})},
+        {"marks": [Mark(t_ns=0, text="x")] * 2_000},
+    ],
+)
+def test_an_overview_that_no_tormagd_writes_is_refused(path: Path, change: dict[str, Any]) -> None:
+    odd = msgspec.structs.replace(RecordingFile(path).overview, **change)
+    with pytest.raises(ValueError, match="its overview: "):
+        unpacked(odd.packed())
 
 
 def test_any_length_is_held_in_bounds() -> None:

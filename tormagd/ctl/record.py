@@ -54,7 +54,11 @@ class Recorder:
         writer, folder = self.writer, self._folder
         writer.ticks(batch)
         if folder is not None and folder.is_due(writer.size, writer.lasted_s):
-            writer.rotate(folder.new())
+            try:
+                path = folder.new()
+            except OSError as error:
+                writer.give_up(str(error.strerror))
+            writer.rotate(path)
 
     def telemetry(self, message: Telemetry) -> None:
         """Writes a snapshot; where it tells of a new mark, the segment is one that is kept. Raises OSError."""

@@ -38,6 +38,7 @@ def report(of: Sequence[Reported]) -> str:
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
         *(_sealed(each) for each in of),
+        *_following(of),
         _table(["", *names], _figures(of)),
         *(_picture(each) for each in of),
         "<h2>What held the force back</h2>",
@@ -62,6 +63,13 @@ def _sealed(of: Reported) -> str:
     notes = [cut and f"cut by: {cut}", of.file.metadata.get(THINNED, "") and f"thinned: {of.file.metadata[THINNED]}"]
     said = ". ".join([f"{of.file.path.name} is {of.seal.text()}", *filter(None, notes)])
     return f"<p{kind}>{escape(said)}.</p>"
+
+
+def _following(of: Sequence[Reported]) -> list[str]:
+    """That a segment is the next of the other, where its beginning says so."""
+    names = {each.seal.last: each.file.path.name for each in of if each.seal.last}
+    known = [(each.file.path.name, names[each.seal.follows]) for each in of if each.seal.follows in names]
+    return [f"<p>{escape(name)} begins where {escape(before)} ends.</p>" for name, before in known]
 
 
 def _figures(of: Sequence[Reported]) -> list[list[str]]:

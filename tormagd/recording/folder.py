@@ -68,7 +68,12 @@ def mark(path: Path) -> Path:
     if named is None or named[3]:
         return path
     target = path.with_name(f"{named[1]}{named[2] or ''}{MARKED}.mcap")
-    return path.rename(target)
+    try:
+        return path.rename(target)
+    except FileNotFoundError:
+        if not target.exists():  # or somebody else has just marked it
+            raise
+    return target
 
 
 class RecordingFolder:
@@ -121,7 +126,7 @@ class RecordingFolder:
         """Marks a segment, and the one before it where that ended shortly before now; returns its new name."""
         marked = mark(segment)
         known = self.segments()
-        place = next(i for i, each in enumerate(known) if each.path == marked)
+        place = [each.path for each in known].index(marked)
         began_s = known[place].began_s
         if place and began_s is not None and self._clock() - began_s < BEFORE_MARK_S:
             with contextlib.suppress(OSError, ValueError):  # it has another name, or has been taken away

@@ -150,8 +150,11 @@ def unpacked(data: bytes) -> Overview:
         if len(curves.stretches) % 8 or not sizes <= {4 * count} or set(curves.low) != set(curves.high):
             raise ValueError("its overview: curves of unequal length")
     names = [code for kind in found.codes.values() for code in kind]
-    if len(names) > MOST_CODES or not all(map(CODE.fullmatch, names)) or not found.width_ns > 0:
-        raise ValueError("its overview: codes or a width that no tormagd writes")
+    longest = max((len(codes.spans_ns) for kind in found.codes.values() for codes in kind.values()), default=0)
+    sizes = len(names) <= MOST_CODES, longest <= MOST_SPANS, len(found.marks) <= MOST_MARKS
+    forms = set(found.codes) == set(KINDS), len(found.late_counts) == len(LATE_US) + 1, found.width_ns > 0
+    if not (all(sizes) and all(forms) and all(map(CODE.fullmatch, names))):
+        raise ValueError("its overview: there is more in it than any tormagd writes, or other things")
     return found
 
 

@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import msgspec
 from mcap.writer import CompressionType, Writer
@@ -134,6 +134,12 @@ class RecordingWriter:
         self._end()
         self._begin(path, self._sealing.digest)
 
+    def give_up(self, reason: str) -> NoReturn:
+        """Ends the file in order before its end, which it says. Raises OSError."""
+        self.describe({CUT: reason})
+        self._end()
+        raise OSError(errno.ENOSPC, reason)
+
     def describe(self, metadata: dict[str, str]) -> None:
         """Write down what is recorded: names and values. Of a name that is described twice, the later one counts."""
         self._about |= metadata
@@ -250,9 +256,7 @@ class RecordingWriter:
     def _require_room(self) -> None:
         reason = self._room(self.path, self.size // INDEX_SHARE)
         if reason:
-            self.describe({CUT: reason})
-            self._end()
-            raise OSError(errno.ENOSPC, reason)
+            self.give_up(reason)
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
