@@ -73,7 +73,7 @@ class Rates(Strict, frozen=True):
 
     control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
     "Ticks: the position loop's gains are for it, and a serial line and a CAN bus carry it."
-    inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 250
+    inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 500
     "Plans that are made at the least; a setpoint is planned for in the next tick. Below 83 the thesis was faster."
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
     "Messages: as often as an eye sees, and no load."

@@ -156,8 +156,8 @@ def test_a_refusal_names_file_key_value_and_what_is_allowed(
         ({"insert__model": '"no_such_model"'}, ("no_such_model",)),
         ({"insert__model": '"mine.safetensors"'}, ("mine.safetensors: ",)),
         ({"bandwidth__control_hz": "2000"}, ("rates.control_hz = 1000: allowed is at least 2000",)),
-        ({"bandwidth__inference_hz": "500"}, ("rates.inference_hz = 250: allowed is at least 500",)),
-        ({"bandwidth__inference_hz": "1000"}, ("rates.inference_hz = 250: allowed is at least 1000",)),
+        ({"bandwidth__inference_hz": "750"}, ("rates.inference_hz = 500: allowed is at least 750",)),
+        ({"bandwidth__inference_hz": "1000"}, ("rates.inference_hz = 500: allowed is at least 1000",)),
         (
             {"force__most_release_N_s": "3.0"},
             ("allowed is at least 6.56: position.gap_speed_mm_s opens the gap by 38",),

@@ -125,7 +125,7 @@ def test_the_ends_are_those_of_the_configuration_the_insert_and_the_device() -> 
     ("end", "kind", "why"),
     [
         (End("motor", "supply_V", 60.0), "refused", "gain margin of -0.5 dB: allowed is at least 30 and 4"),
-        (End("rates", "control_hz", 83), "refused", "rates.inference_hz = 250: allowed is at most"),
+        (End("rates", "control_hz", 83), "refused", "rates.inference_hz = 500: allowed is at most"),
         (End("insert", "gap_closed_mm", 300.0), "refused", "gap"),
         (End("limits", "skew_fault_mm", 10.0), "ran", ""),
         (End("plant", "encoder_counts_per_rev", 1_000_000), "ran", ""),
