@@ -278,11 +278,15 @@ class Played:
         return self._ticks
 
 
-def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monkeypatch, ctl):
+def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, tmp_path, monkeypatch, ctl):
     monkeypatch.setattr(ctl_calibrate_motors, "armed", lambda *_: contextlib.nullcontext(Played(ticks(300))))
-    fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0)
+    rates = status_with()["rates"]
+    slow = {name: rate | {"hz": 500.0} for name, rate in rates.items()}
+    fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0, rates=slow)
     out = tmp_path / "right.csv"
     arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--motors", "--side", "right"]
+    assert ctl(*arguments, "--out", str(out)).ended(1).error["code"] == "slow_control"
+    fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0)
     assert ctl(*arguments, "--out", str(out)).ended(0).result["rows"] == 299
     with out.open(newline="") as file:
         written = list(csv.DictReader(file))

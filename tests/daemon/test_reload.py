@@ -18,7 +18,7 @@ def test_what_something_was_built_from_is_named_and_stays():
         {
             "scene": "pulse",
             "device": {"port": "/dev/other", "options": {"baud": 9600}},
-            "rates": {"inference_hz": 500},
+            "rates": {"inference_hz": 250},
             "realtime": {"fifo_priority": 50, "watchdog_ms": 800.0},
             "endpoints": {"curve": {"server_secret": "s"}},
         },

@@ -9,7 +9,7 @@ import pytest
 
 from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import SEARCH_S, ClosedLoop
-from tormagd.config import Config
+from tormagd.config import Config, Rates
 from tormagd.control.aim.aim import OLDEST_ANSWER_S
 from tormagd.control.aim.floors import LAW_SHARE
 from tormagd.control.records import TimedSetpoint
@@ -31,7 +31,7 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Core:
     scene = tmp_path_factory.mktemp("scenes") / "thesis.toml"
     text = SHIPPED.read_text(encoding="utf-8").replace("step_mT = 1.0", "step_mT = 10.0")
     scene.write_text(text, encoding="utf-8")
-    return build_core(Config(scene=str(scene)))
+    return build_core(Config(rates=Rates(inference_hz=250), scene=str(scene)))
 
 
 @pytest.fixture(scope="module")

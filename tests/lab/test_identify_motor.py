@@ -157,8 +157,8 @@ def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, fl
 
 @pytest.fixture(scope="module")
 def sample_log():
-    """Half of what `tormagctl calibrate --motors` records, on simulated sample 3, in virtual time."""
-    columns = motor_log(record("sample_3", rounds=1), "left")
+    """What `tormagctl calibrate --motors` records, on simulated sample 3, in virtual time."""
+    columns = motor_log(record("sample_3"), "left")
     return Log(columns["t_s"], columns["input_V"], columns["position_mm"] * 1e-3, None, columns["current_A"])
 
 

@@ -42,6 +42,8 @@ JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.0
 JUMP_S = 0.6
 ROUNDS = 2
 "The whole is done twice: one half is fitted, the other judges."
+LEAST_HZ = 900.0
+"Of control. A log of 500 Hz tells a motor's delay wrong, and the rest two to three times less exactly."
 LONGEST_HOLE_S = 0.02
 "A longer silence of the device is not bridged."
 
@@ -62,6 +64,14 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         waveform = excitation(reach(client, scene_most_N))
+        hz = client.status().rates["control"].hz
+        if hz < LEAST_HZ:
+            raise CommandError(
+                Exit.REFUSED,
+                "slow_control",
+                f"the daemon controls {hz:.0f} times a second: allowed for a motor log is 1000",
+                "state control_hz = 1000 under [rates] in its configuration, and start it again",
+            )
         with (
             armed(endpoints, client, COLUMNS, wait_s) as run,
             seconds_bar(waveform.duration_s, "motors") as bar,
