@@ -188,7 +188,7 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
         pytest.approx(0.01),
     )
     assert msgspec.to_builtins(about["portrait"]) == {name: tuple(values) for name, values in PORTRAIT.items()}
-    assert about["overview"]["limits"] == [pytest.approx((5.0, 7.0))]
+    assert (about["overview"]["limits"], about["overview"]["marks"]) == ([pytest.approx((5.0, 7.0))], [])
     assert max(known for known in about["overview"]["high_N"] if known is not None) == pytest.approx(1.81, abs=1e-3)
     # a limit and a fault of one name are two things
     assert about["explained"]["limits"][Limit.SKEW].remedy == LIMITS[Limit.SKEW].remedy

@@ -147,11 +147,13 @@ class Recorded:
         return self._read[2:]
 
     def _glance(self) -> dict[str, Any]:
-        """The least and greatest measured force of each stretch, and where faults and limits were."""
-        known = self._overview.series("measured_cf") or self._overview.series("setpoint_cf")
-        spans = {
-            name: [span for of in self._overview.spans_s(name).values() for span in of] for name in ("limits", "faults")
+        """The least and greatest measured force of each stretch, where faults and limits were, and marks."""
+        overview = self._overview
+        known = overview.series("measured_cf") or overview.series("setpoint_cf")
+        spans: dict[str, Any] = {
+            name: [span for of in overview.spans_s(name).values() for span in of] for name in ("limits", "faults")
         }
+        spans["marks"] = [((mark.t_ns - overview.start_ns) * 1e-9, mark.text) for mark in overview.marks]
         if known is None:
             return {"t_s": [], "low_N": [], "high_N": [], **spans}
         low, high = (

@@ -151,9 +151,9 @@ def unpacked(data: bytes) -> Overview:
             raise ValueError("its overview: curves of unequal length")
     names = [code for kind in found.codes.values() for code in kind]
     longest = max((len(codes.spans_ns) for kind in found.codes.values() for codes in kind.values()), default=0)
-    sizes = len(names) <= MOST_CODES, longest <= MOST_SPANS, len(found.marks) <= MOST_MARKS
+    bounds = len(names) <= MOST_CODES, longest <= MOST_SPANS, len(found.marks) <= MOST_MARKS
     forms = set(found.codes) == set(KINDS), len(found.late_counts) == len(LATE_US) + 1, found.width_ns > 0
-    if not (all(sizes) and all(forms) and all(map(CODE.fullmatch, names))):
+    if not (all(bounds) and all(forms) and all(map(CODE.fullmatch, names))):
         raise ValueError("its overview: there is more in it than any tormagd writes, or other things")
     return found
 

@@ -263,13 +263,18 @@ function recording() {
     bands: [{series: [2, 1], fill: COLOURS.orange}],
     hooks: {
       drawClear: [(u) => { spans(u, overview.limits, "#fff3d6"); spans(u, overview.faults, "#f6b9b4"); }],
-      draw: [(u) => spans(u, [[Number(slider.value), Number(slider.value)]], COLOURS.black)],
+      draw: [(u) => {
+        spans(u, overview.marks.map(([at_s]) => [at_s, at_s]), COLOURS.blue);
+        spans(u, [[Number(slider.value), Number(slider.value)]], COLOURS.black);
+      }],
     },
   }, [overview.t_s, overview.low_N, overview.high_N]);
 
   async function seek(at_s) {
     slider.value = at_s;
-    at("moment").textContent = `${Number(slider.value).toFixed(2)} of ${duration_s.toFixed(2)} s`;
+    const marked = overview.marks.filter(([mark_s]) => mark_s <= slider.value && mark_s > slider.value - about.shown_s);
+    at("moment").textContent = [`${Number(slider.value).toFixed(2)} of ${duration_s.toFixed(2)} s`,
+      ...marked.map(([mark_s, text]) => `${mark_s.toFixed(2)} s: ${text}`)].join("; ");
     strip.redraw(false, false);
     const number = ++asked, frame = await (await fetch(`frame?at_s=${slider.value}`)).json();
     if (number !== asked) return;  // a newer one is on its way
