@@ -103,7 +103,7 @@ def test_the_former_name_is_a_segment_too(tmp_path: Path) -> None:
     path = tmp_path / "2026-11-26T05-09-27.mcap"
     path.touch()
     assert (segment_of(path).began_s, segment_of(path).is_marked) == (1_795_669_767.0, False)
-    assert mark(mark(path)) == tmp_path / "2026-11-26T05-09-27-marked.mcap"
+    assert mark(mark(path)) == tmp_path / "2026-11-26T05-09-27.marked.mcap"
 
 
 def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str
 
 def marks_in(path: Path) -> set[str]:
     """What the recordings that are kept tell."""
-    kept = [RecordingFile(each) for each in path.glob("*-marked.mcap")]
+    kept = [RecordingFile(each) for each in path.glob("*.marked.mcap")]
     return {known.text for each in kept for known in each.overview.marks}
 
 

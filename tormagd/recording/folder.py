@@ -19,11 +19,11 @@ from tormagd_client.printable import require
 
 END_BYTES = 500_000
 "A segment ends with its last chunk, its overview and its index: so much more than its size when it is due."
-MARKED = "-marked"
-"Behind the time in a name."
+MARKED = ".marked"
+"Behind the time in a name; black boxes, which their keeper takes away, have another form."
 BEFORE_MARK_S = 60.0
 "The segment before is marked, too, where the one with the mark is younger."
-_NAME = re.compile(rf"(\d{{4}}-\d\d-\d\dT\d\d-\d\d-\d\d)(\.\d{{3}}Z)?({MARKED})?\.mcap")
+_NAME = re.compile(rf"(\d{{4}}-\d\d-\d\dT\d\d-\d\d-\d\d)(\.\d{{3}}Z)?({re.escape(MARKED)})?\.mcap")
 _FORM = "%Y-%m-%dT%H-%M-%S"
 
 
