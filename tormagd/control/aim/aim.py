@@ -221,8 +221,7 @@ class Aim:
         return limits
 
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
-        """Return speed, mm/s, and acceleration, mm/s^2, of the gap at the beginning of the forces `path_N` (7) at
-        PATH_S.
+        """Return the gap's speed, mm/s, and acceleration, mm/s^2, at the beginning of the path `path_N` (7) of forces.
 
         Both are held within what the configuration lets the gap do.
         """
