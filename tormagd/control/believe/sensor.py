@@ -125,7 +125,7 @@ class SensorTrust:
 
         The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1. `reading_N` is the force against this
         motion, less the sensor's zero, which is known to within `zero_sd_N`. The model's force is `model_N`. The
-        reading stands for `dt_s` > 0. All arguments are finite.
+        reading stands for `dt_s` > 0. All arguments are finite. In a dispute, updates `lead_N`.
         """
         if self.is_disputed:
             zero_sd_N = 0.0  # a reversal has to tell the zero first

@@ -115,7 +115,8 @@ class Homing:
     def _end(self, now_s: float, measurement: Measurement) -> None:
         """Judge a homing that has ended: done, given up by the device, or ended by a request to open.
 
-        A homed device must have shown both open switches. One that latched must not have gone the wrong way.
+        A homed device that has not shown both open switches has the fault HOMING. One that latched after a carriage
+        went towards closed has WRONG_DIRECTION.
         """
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN

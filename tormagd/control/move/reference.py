@@ -118,7 +118,7 @@ class Expected:
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """Follow `reference` for `dt_s`, with the time constant `lag_s`.
+        """Follow `reference` for `dt_s`, with the time constant `lag_s`, and filter the speed as the measured ones are.
 
         `filter_s` is the time constant of the measured speeds' filter.
         """

@@ -137,7 +137,7 @@ class Watch:
 
         `leap` is an encoder step that no carriage makes, None without one: ENCODER shows once a later Status has come.
         `sensor_doubted_s` is how long the force sensor has not been believed. Faults of link and motion show only while
-        `safety.is_driven`.
+        `safety.is_driven`, those of motion not during a leap.
         """
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
@@ -251,7 +251,8 @@ class Watch:
         return faults
 
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
-        """Tell whether a carriage that is driven stands."""
+        """Tell whether a carriage stands while its duty is over `limits.no_motion_duty`, the same way as a step
+        before."""
         # a duty that turns round before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
         is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
