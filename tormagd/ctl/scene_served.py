@@ -28,7 +28,7 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
     ways = [
         (tried, share_of) for tried in measured_as(scene, file).tried if (share_of := file.share(tried.way)) is not None
     ]
-    tried, taken = _within_share(ways, share) if share is not None else _within_error(ways, tolerance_N or 0.0)
+    tried, taken = _most_wanted(ways, share, tolerance_N or 0.0)
     text = (
         f"{scene.name}: {told(tried.way)}: {1e3 * tried.worst_N:.1f} mN RMS at worst on samples 1 to 3, "
         f"the daemon takes {taken.daemon:.1%} of a processor"
@@ -40,28 +40,31 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
     return Outcome(result | {"daemon_share": taken.daemon, "file": None if out is None else str(out)}, text)
 
 
-Ways = list[tuple[Tried, Share]]
+Served = tuple[Tried, Share]
 
 
-def _within_share(ways: Ways, share: float) -> tuple[Tried, Share]:
-    fits = [way for way in ways if way[1].daemon <= share]
+def _most_wanted(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
+    """Return the most exact way that takes at most `share`, or without one the cheapest within `tolerance_N`. Raises
+    CommandError where no way does."""
+
+    def price(way: Served) -> float:
+        return way[1].daemon
+
+    def error_N(way: Served) -> float:
+        return way[0].worst_N
+
+    asked, most, limited, best, unit = "--tolerance", tolerance_N, error_N, price, "N"
+    if share is not None:
+        asked, most, limited, best, unit = "--share", share, price, error_N, "of a processor"
+    fits = [way for way in ways if limited(way) <= most]
     if not fits:
-        least = min(taken.daemon for _, taken in ways)
-        raise _no_way(f"--share = {share:g}", f"at least {least:.3g} of a processor")
-    return min(fits, key=lambda way: way[0].worst_N)
-
-
-def _within_error(ways: Ways, tolerance_N: float) -> tuple[Tried, Share]:
-    fits = [way for way in ways if way[0].worst_N <= tolerance_N]
-    if not fits:
-        least_N = min(tried.worst_N for tried, _ in ways)
-        raise _no_way(f"--tolerance = {tolerance_N:g}", f"at least {least_N:.3g} N")
-    return min(fits, key=lambda way: way[1].daemon)
-
-
-def _no_way(asked: str, allowed: str) -> CommandError:
-    hint = "tormagctl scene explain shows every way that was measured"
-    return CommandError(Exit.REFUSED, "no_way", f"{asked}: allowed is {allowed}", hint)
+        raise CommandError(
+            Exit.REFUSED,
+            "no_way",
+            f"{asked} = {most:g}: allowed is at least {min(map(limited, ways)):.3g} {unit}",
+            "tormagctl scene explain shows every way that was measured",
+        )
+    return min(fits, key=best)
 
 
 def _write(name: str, way: Way, out: Path) -> None:
