@@ -44,7 +44,7 @@ SETPOINT: dict[str, Any] = {
     "v": 1,
     "source": "hostile",
     "seq": 7,
-    "stamp_ns": 1_800_000_000_000_000_000,
+    "stamp_ns": time.time_ns(),
     "servo_cf": 1.0,
     "valid_for_ms": 50.0,
 }
