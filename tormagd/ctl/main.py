@@ -68,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(options.command, missing, options.json)
         return exit_code(missing)
     except KeyboardInterrupt:
-        write_line(f"tormagctl {options.command}: interrupted; the daemon goes on", sys.stderr)
+        daemon = "it is told to disable" if options.command == "arm" else "the daemon goes on"
+        write_line(f"tormagctl {options.command}: interrupted; {daemon}", sys.stderr)
         return 130
     return print_outcome(options.command, outcome, options.json)
 
