@@ -148,6 +148,7 @@ NOISE_N = np.random.default_rng(0).normal(0.0, 0.01, 100_000)
             "handle_still",
             ("0% of sweep 3", "30%"),
         ),
+        ("handle_mm", lambda it: np.linspace(0.0, 1.9, len(it["sweep"])), "handle_still", ("turn or go 2 mm",)),
         *(
             ("force_N", lambda it, dead_N=dead_N: np.full_like(it["sweep"], dead_N), "force_dead", ())
             for dead_N in (0.0, 1.3)

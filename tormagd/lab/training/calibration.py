@@ -90,6 +90,12 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
             )
     displacement_mm = np.concatenate([displacement(handle_mm[sweep == number]) for number in np.unique(sweep)])
     kept = is_moving & np.isfinite(displacement_mm)
+    if not kept.any():
+        raise CalibrationError(
+            "handle_still",
+            f"in no sweep did the handle turn or go {MOBILISED_MM:g} mm at the roller: needed is either",
+            "turn the handle to and fro for as long as the sweep runs",
+        )
     displacement_mm, rate_mm_s, table = displacement_mm[kept], rate_mm_s[kept], table[kept]
     low, high = np.percentile(rate_mm_s, (5.0, 95.0))
     if high - low < STEADY_MM_S:
