@@ -11,11 +11,13 @@ import pytest
 
 from tormagd.assembly.build import build_core
 from tormagd.config import Config
+from tormagd.lab.errors import LabError
 from tormagd.lab.tactile import branches, experiment, models, report, shipped
 from tormagd.lab.tactile.models import QUICK
 from tormagd.lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
 from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
-from tormagd.model.model_file import save_model
+from tormagd.model.model_file import load_model, save_model
+from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.scenes.scene import scene_path
 from tormagd.simulation.tactile_pad import TactilePad, cycling_program, worked_pad
@@ -203,6 +205,14 @@ def test_neighbours_decide_on_the_pad_and_nothing_on_the_brake(monkeypatch: pyte
     assert all(row["worst_force_error_N"] < 1e-3 for row in pad.values())
     assert all(row["other_answers"] == 0.0 for row in brake.values())
     assert len(pad) == len(brake) == len(branches.NEIGHBOURS)
+
+
+def test_a_model_whose_force_rises_everywhere_has_no_contact_where_it_falls(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(branches, "MOST_DRAWS", 50)
+    name, element, range_mT = branches.MODELS["brake"]
+    model = load_model(model_path(name, Path()), element=element)
+    with pytest.raises(LabError, match="at 0 of 50 contacts: needed are 60"):
+        branches.contacts(model, range_mT, model.feature_ranges[0][1])
 
 
 def test_a_pads_model_is_trained_and_taken_by_a_scene(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.lab.errors import LabError
 from tormagd.lab.training.metrics import not_rising_share
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
@@ -21,6 +22,8 @@ NEIGHBOURS = (1, 2, 4, 8, 16, 64)
 SHALLOW_MM = 1.0
 "Depth beyond which the pad's force rises, but for fractions of a millinewton."
 CONTACTS, STEPS, SEED = 60, 400, 3
+MOST_DRAWS = 6_000
+"Of contacts, before a model counts as one whose force rises with the field everywhere."
 JUMP_MT = 20.0
 MODELS = {"pad": ("tactile_mre_c", "tactile", (0.0, 365.0)), "brake": ("torque_mre_50_40", "torque", (330.0, 740.0))}
 
@@ -29,17 +32,19 @@ def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float
     """Draw CONTACTS contacts from the model's box: displacement, mm, and rate, mm/s.
 
     With `shallow_mm` displacements end there, and only contacts at which the force falls with the field somewhere are
-    kept.
+    kept. Raises LabError where MOST_DRAWS do not give as many.
     """
     draw, fields = np.random.default_rng(SEED), np.linspace(*range_mT, 366)
     (low_mm, high_mm), rates, _, (cip_percent, _) = model.feature_ranges
     found: list[tuple[float, float]] = []
-    while len(found) < CONTACTS:
+    for _ in range(MOST_DRAWS):
         displacement_mm, rate_mm_s = draw.uniform(low_mm, shallow_mm or high_mm), draw.uniform(*rates)
         forces_N = model.curve(displacement_mm, rate_mm_s, cip_percent).forces_N(fields)
         if shallow_mm is None or (np.diff(forces_N) <= 0.0).any():
             found.append((displacement_mm, rate_mm_s))
-    return found
+        if len(found) == CONTACTS:
+            return found
+    raise LabError(f"the force falls with the field at {len(found)} of {MOST_DRAWS} contacts: needed are {CONTACTS}")
 
 
 def followed(
