@@ -82,9 +82,9 @@ def test_a_bad_value_is_named(tmp_path: Path, column: str, value: str) -> None:
         (("",), "row 1: header"),
         ((HEADER,), "0 rows"),
         ((HEADER, GOOD), "1 rows"),
-        ((HEADER + ",colour", GOOD + ",1"), "row 1: header"),
-        ((HEADER + ",cycle,cycle", GOOD + ",1,1"), "row 1: header"),
-        (("rate_mm_s,displacement_mm,field_mT,cip_percent,force_N", GOOD, GOOD), "row 1: header"),
+        ((HEADER + ",colour", GOOD + ",1"), "row 1: header: 'colour' is not known; needed is"),
+        ((HEADER + ",cycle,cycle", GOOD + ",1,1"), "row 1: header: 'cycle' stands twice"),
+        ((HEADER.removesuffix(",force_N") + ",time_s", GOOD, GOOD), "row 1: header: 'force_N' is missing"),
         ((HEADER, GOOD, "1,2,3"), "row 3: 3 values; needed are 5"),
         ((HEADER, GOOD, GOOD + ",1"), "row 3: 6 values; needed are 5"),
         ((HEADER, GOOD, ""), "row 3: 0 values"),
@@ -97,6 +97,13 @@ def test_a_bad_value_is_named(tmp_path: Path, column: str, value: str) -> None:
 def test_a_malformed_file_is_refused(tmp_path: Path, lines: tuple[str, ...], message: str) -> None:
     with pytest.raises(LabError, match=message):
         read_csv(write(tmp_path / "d.csv", *lines))
+
+
+def test_columns_may_stand_in_any_order(tmp_path: Path) -> None:
+    known = read_csv(write(tmp_path / "known.csv", HEADER + ",cycle,time_s", GOOD + ",1,2", GOOD + ",3,4"))
+    rows = [",".join(reversed(f"{GOOD},{ends}".split(","))) for ends in ("1,2", "3,4")]
+    header = ",".join(reversed((*HEADER.split(","), "cycle", "time_s")))
+    assert read_csv(write(tmp_path / "other.csv", header, *rows)).sha256() == known.sha256()
 
 
 def test_a_file_that_is_no_text_or_missing_is_refused(tmp_path: Path) -> None:

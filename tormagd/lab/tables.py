@@ -26,11 +26,12 @@ def read_columns(
     allowed: Mapping[str, tuple[float, float]] | None = None,
     is_exact: bool = False,
 ) -> dict[str, Array]:
-    """Read the columns `names` of a CSV file, and the `optional` ones that it has; `allowed` bounds some.
+    """Return the columns `names` of a CSV file and its `optional` ones, in this order; `allowed` bounds some.
 
-    The header is the first row with all `names`. Rows before it (many testing machines write a preamble), other columns
-    and empty rows are skipped; with `is_exact` they are refused. Raises `LabError` for an unreadable file, a missing
-    header, no rows or over MAX_ROWS. So does a cell that is no finite number within its bounds, with its row.
+    The header is the first row with all `names`, in any order. Rows before it (many testing machines write a preamble),
+    other columns and empty rows are skipped; with `is_exact` they are refused. Raises `LabError` for an unreadable
+    file, a missing header, no rows or over MAX_ROWS. So does a cell that is no finite number within its bounds, with
+    its row.
     """
     try:
         require_regular(path, MOST_TABLE_BYTES)
@@ -60,11 +61,13 @@ def _columns(
     for _, header in rows:
         if is_exact or set(names) <= set(header):
             break
-    known = [name for name in header if name in (*names, *optional)]
-    is_other = is_exact and (tuple(header[: len(names)]) != names or known != header)
-    if is_other or not set(names) <= set(header) or len(set(known)) < len(known):
-        told = f"; then optionally {' and '.join(optional)}" if optional else ""
-        raise LabError(f"{path}: row 1: header is {','.join(header)[:200]!r}; needed is {','.join(names)!r}{told}")
+    known = [name for name in (*names, *optional) if name in header]
+    wrong = [f"{name!r} is missing" for name in names if name not in header]
+    wrong += [f"{name!r} stands twice" for name in known if header.count(name) > 1]
+    wrong += [f"{name!r} is not known" for name in header if is_exact and name not in known]
+    if wrong:
+        told = f", and optionally {' and '.join(optional)}" if optional else ""
+        raise LabError(f"{path}: row 1: header: {', '.join(wrong)[:200]}; needed is {','.join(names)}{told}")
     places = [(name, header.index(name), allowed.get(name)) for name in known]
     columns = {name: array("d") for name in known}
     for line, row in rows:
