@@ -73,12 +73,14 @@ TRAIN = ("train-model", "--element", "torque", "--insert", "MRE-50-40", "--hidde
 REFUSED: list[tuple[tuple[str, ...], str, str]] = [
     (("characterise", "compression", "absent"), "", "absent: cannot be read: No such file"),
     (("optimise-design", "--region", "1", "1", "1", "1"), "", "most_N = 1"),
+    (("optimise-design", "--region", "1", "1", "2", "2", "--dask", "no://one"), "", "--dask no://one: unknown address"),
     (("tune-position", "--config", "absent.toml"), "", "absent.toml"),
     (("bench-sweep", "--plant", "absent", "--out", "x.csv"), "", "absent"),
     (("wire-log", "virtual", "session.mp3"), "", ".mp3"),
     (("tactile-experiment", "--out", "none"), "", "not a directory"),
     (("fleet", "/nowhere"), "", "/nowhere: no such folder or file"),
     (("fleet", "nothing://there"), "", "Protocol not known: nothing"),
+    (("tactile-hold", "--plant", "sample_1"), "", "plant sample_1: allowed is one with a [pad]"),
     (("fleet", "."), "", "no .mcap in it; `tormagctl record` makes them"),
     *(
         (("bound", "given", *more), FORCES + text, reason)
@@ -128,6 +130,39 @@ def test_what_cannot_be_used_is_one_line_and_exit_2(arguments, given, reason, ca
     assert reason in told.err
     assert (told.out, told.err.count("\n")) == ("", 1)
     assert [path.name for path in tmp_path.iterdir()] == ["given"] * bool(given)
+
+
+DESIGN, SWEEP = ("optimise-design", "--region", "1", "1", "2", "2"), ("bench-sweep", "--out", "x.csv")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "allowed"),
+    [
+        *((("wire-log", "virtual", "x.log", "--seconds", text), "a finite number") for text in ("nan", "inf")),
+        (("wire-log", "virtual", "x.log", "--seconds", "-1"), "0..86400 s"),
+        (("wire-log", "tap", "x.log", "--baud", "-5"), "1..12000000"),
+        *(((*DESIGN, "--starts", text), "1..10000") for text in ("-1", "0", "1.5", "x")),
+        ((*DESIGN, "--off", "nan"), "a finite number"),
+        *(
+            ((*one, "--seed", "-1"), "0..2147483648")
+            for one in (DESIGN, SWEEP, (*TRAIN, "x", "--out", "m"), ("reproduce-thesis",))
+        ),
+        *(
+            ((*one, "--workers", text), "1..1024")
+            for one in (DESIGN, ("fleet", "."), ("reproduce-thesis",), ("tactile-hold",))
+            for text in ("0", "99999")
+        ),
+        (("reproduce-thesis", "--gap-speed", "0"), "mm/s"),
+        (("tactile-hold", "--seconds", "0"), "1..1e+06 s"),
+        (("characterise", "tension", "x", "--delimiter", "ab"), "';'"),
+    ],
+)
+def test_an_option_outside_its_range_is_refused_before_anything_runs(arguments, allowed, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert allowed in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_console_without_torch_has_the_light_commands():

@@ -104,10 +104,11 @@ def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
 
 def test_what_cannot_be_kept_is_told_after_what_was_found(folder, scheduler, capsys, tmp_path):
     (tmp_path / "file").touch()
-    assert main(["fleet", str(folder / "1"), "--dask", scheduler, "--out", str(tmp_path / "file" / "a.parquet")]) == 2
-    out, err = capsys.readouterr()
-    assert "MRE-50-40" in out
-    assert str(tmp_path / "file") in err
+    for url, reason in ((f"{tmp_path}/file/a.parquet", f"{tmp_path}/file"), ("nothing://a", "not known: nothing")):
+        assert main(["fleet", str(folder / "1"), "--dask", scheduler, "--out", url]) == 2
+        out, err = capsys.readouterr()
+        assert "MRE-50-40" in out
+        assert reason in err
 
 
 def test_a_bucket_is_read_like_a_folder(folder):

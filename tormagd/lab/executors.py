@@ -9,13 +9,16 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
+from tormagd.lab.errors import LabError
+from tormagd.lab.options import WORKERS
+
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
 
 def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> None:
     """Add `--workers` and `--dask` to `parser`; `needed` says what a cluster's workers must have installed."""
-    parser.add_argument("--workers", type=int, default=workers, help="processes on this machine (%(default)s)")
+    parser.add_argument("--workers", type=WORKERS, default=workers, help="processes on this machine (%(default)s)")
     parser.add_argument(
         "--dask", metavar="ADDRESS", help=f"scheduler of a Dask cluster instead; its workers need {needed}"
     )
@@ -25,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
     """Give the executor that the options ask for, and shut it down at the end.
 
-    Raises OSError where no scheduler answers at the address, ValueError for no worker at all.
+    Raises OSError where no scheduler answers at the address, LabError for one that is no address.
     """
     if options.dask is None:
         # a fork of this process would inherit the locks of libraries' threads, but not the threads
@@ -35,7 +38,11 @@ def chosen(options: argparse.Namespace) -> Iterator[Executor]:
     # only a cluster needs it installed
     from distributed import Client
 
-    with Client(options.dask) as client, client.get_executor() as cluster:
+    try:
+        client = Client(options.dask)
+    except ValueError as error:
+        raise LabError(f"--dask {options.dask}: {error}") from error
+    with client, client.get_executor() as cluster:
         yield cluster
 
 

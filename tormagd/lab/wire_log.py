@@ -30,6 +30,7 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.interrupt import interrupted_by
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
+from tormagd.lab.options import whole, within
 from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -154,9 +155,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     ways.add_parser("viewer", help="print the messages' formats for python-can's viewer")
     for way in (virtual, tapped):
         way.add_argument("file", type=Path, help="its ending says which format: .log, .asc, .blf, ...")
-    virtual.add_argument("--seconds", type=float, default=5.0, help="after homing and enabling")
+    virtual.add_argument("--seconds", type=within(0.0, 86_400.0, "s"), default=5.0, help="after homing and enabling")
     tapped.add_argument("--port", default="/dev/tormag", help="the device's port")
-    tapped.add_argument("--baud", type=int, default=DEFAULT_BAUD)
+    tapped.add_argument("--baud", type=whole(1, 12_000_000), default=DEFAULT_BAUD)
 
 
 def run(options: argparse.Namespace) -> Found:

@@ -40,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         elif name == "tension":
             kind.add_argument("--strain", default="Engineering Strain", help="column of engineering strain")
             kind.add_argument("--stress-mpa", default="Engineering Stress (MPa)", help="column of engineering stress")
-            kind.add_argument("--delimiter", default=",")
+            kind.add_argument("--delimiter", default=",", choices=(",", ";", "\t", "|", " "))
             kind.add_argument("--from-strain", type=float, default=0.05, help="leaves out the slack of the grips")
             kind.add_argument("--to-strain", type=float, default=0.5)
         else:

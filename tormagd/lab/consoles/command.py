@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> Found:
     try:
         if options.out is not None:
             write_parquet(summaries, options.out)
-    except OSError as error:  # the consoles are told all the same
+    except (OSError, ValueError, ImportError) as error:  # the consoles are told all the same
         write_line(f"tormag-lab fleet: {printable(str(error))}", sys.stderr)
         exit_code = 2
     found = consoles(summaries.values())

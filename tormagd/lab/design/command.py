@@ -15,6 +15,7 @@ from tormagd.lab.design.optimisation import Design, Problem, Run, coverage_as_ma
 from tormagd.lab.design.phase_portrait import Region
 from tormagd.lab.design.sweep import sweep
 from tormagd.lab.main import Found
+from tormagd.lab.options import GAP_SPEED, SEED, whole, within
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -30,11 +31,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--measure", choices=("true", "trapezoid", "corners"), default="true")
     parser.add_argument("--solver", choices=("global", "local"), default="global")
     parser.add_argument(
-        "--gap-speed", type=float, default=Position().gap_speed_mm_s, help="mm/s (what the controller was measured at)"
+        "--gap-speed",
+        type=GAP_SPEED,
+        default=Position().gap_speed_mm_s,
+        help="mm/s (what the controller was measured at)",
     )
-    parser.add_argument("--off", type=float, default=1.0, help="how far off a dimension may be made, percent (1)")
-    parser.add_argument("--starts", type=int, default=5, help="random ones")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--off",
+        type=within(0.0, 50.0, "percent"),
+        default=1.0,
+        help="how far off a dimension may be made, percent (1)",
+    )
+    parser.add_argument("--starts", type=whole(1, 10_000), default=5, help="random ones")
+    parser.add_argument("--seed", type=SEED, default=1)
     executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[lab]")
 
 

@@ -25,12 +25,13 @@ from tormagd.config import Config, Rates
 from tormagd.control.move.watch import SENSOR_FAULT_S
 from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
 from tormagd.lab.main import Found
+from tormagd.lab.options import WORKERS, within
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Fault
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
-from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd.simulation.plant import ForceSensor
 from tormagd.simulation.pressed_pad import PressedPad
 
@@ -94,6 +95,8 @@ class _Prepared:
         terms = stated.terms if case.relaxation else stated.terms.without("memory")
         self.core = build_core(self.config, msgspec.structs.replace(stated, terms=terms))
         self.hand, self.plant = PressingHand(stated.finger.depth_mm), load_plant(case.plant)
+        if self.plant.pad is None:
+            raise PlantError(f"plant {case.plant}: allowed is one with a [pad]")
         self.begins_s = PRESSES_AT_S + stated.finger.depth_mm / PRESSING_MM_S + LEARN_S
 
 
@@ -142,10 +145,11 @@ def _coarse(case: Case) -> Iterator[Moment]:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab tactile-hold`."""
-    parser.add_argument("--seconds", type=float, default=3600.0, help="of each hold, virtual (default: 3600)")
+    seconds = within(1.0, 1e6, "s")
+    parser.add_argument("--seconds", type=seconds, default=3600.0, help="of each hold, virtual (default: 3600)")
     parser.add_argument("--plant", nargs="+", default=PLANTS, metavar="PLANT", help="default: pad_1 pad_2 pad_3")
     parser.add_argument("--coarse", action="store_true", help="the plans alone, fifty a second")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--workers", type=WORKERS, default=1, help="processes")
 
 
 def run(options: argparse.Namespace) -> Found:

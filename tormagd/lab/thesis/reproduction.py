@@ -19,6 +19,7 @@ from tormagd.lab.design.range_fit import RangeFit, fit_exponent, fit_friction, l
 from tormagd.lab.design.sweep import sweep
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.main import Found
+from tormagd.lab.options import GAP_SPEED, SEED, WORKERS
 from tormagd.lab.pages import write_page
 from tormagd.lab.thesis import page
 from tormagd.lab.thesis.errata import errata, table_2_4_errors
@@ -49,9 +50,9 @@ PULSE_S, PULSE_HZ = 20.0, 500
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `tormag-lab reproduce-thesis`."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="write reproduction.md and its pictures there")
-    parser.add_argument("--gap-speed", type=float, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--gap-speed", type=GAP_SPEED, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
+    parser.add_argument("--workers", type=WORKERS, default=os.cpu_count() or 1)
+    parser.add_argument("--seed", type=SEED, default=1)
     parser.add_argument("--quick", action="store_true", help="one start, few rows and epochs: shows only that it runs")
     parser.add_argument("--table-2-5", action="store_true", help="print table 2.5 in both its readings, and no more")
 

@@ -30,6 +30,7 @@ from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.records import Plan
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.main import Found
+from tormagd.lab.options import SEED
 from tormagd.lab.training.dataset import Dataset, write_csv
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.physics.field import PowerFieldLaw
@@ -86,7 +87,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", default="coronary", help="whose insert and gap range are swept")
     parser.add_argument("--insert", nargs="+", metavar="NAME", help="other inserts, one after the other")
     parser.add_argument("--out", type=Path, required=True, help="training CSV to write")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=SEED, default=1)
 
 
 def run(options: argparse.Namespace) -> Found:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
+from tormagd.lab.options import SEED
 from tormagd.lab.training.dataset import Dataset, read_csv
 from tormagd.lab.training.fitting import fit_model
 from tormagd.lab.training.levenberg_marquardt import Training
@@ -32,7 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
     parser.add_argument("--hidden", type=int, default=50, help="hidden units (default: 50)")
     parser.add_argument("--epochs", type=int, default=200, help="most epochs (default: 200)")
-    parser.add_argument("--seed", type=int, default=0, help="decides the split and the initial weights (default: 0)")
+    parser.add_argument("--seed", type=SEED, default=0, help="decides the split and the initial weights (default: 0)")
     parser.add_argument("--validation-share", type=float, default=0.3, help="rows or cycles held out (default: 0.3)")
     parser.add_argument(
         "--without-memory", action="store_true", help="take out what relaxation and hysteresis did; needs time_s"
