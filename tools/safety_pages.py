@@ -24,19 +24,19 @@ HELD = {"named": "named", "safe": "ended safe", "in_time": "reacted in their sta
 
 _STATES_HEAD = """# Operating states, faults and limits
 
-Written by `python tools/safety_pages.py` from the tables that the daemon itself runs on. Beyond this process:
-[safety](safety.md). What each fault comes to: the [fault matrix](fault-matrix.md).
+Look up a state, a fault or a limit, and what to do. Beyond this process: [safety](safety.md). What each fault comes to:
+the [fault matrix](fault-matrix.md). `python tools/safety_pages.py` writes this page from the daemon's own tables.
 
 """
 _MATRIX_HEAD = """# Fault matrix
 
-Written by `python tools/safety_pages.py` from [evidence/faults.json](evidence/faults.json), a run of `tools/faults.py
---json`, which also has all times. All of it is virtual time and simulated devices.
+What each fault comes to, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
+[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`, which also has all times.
 
 Faults are put in while 1.8 ± 0.1 N are rendered at a turning handle; those of homing and of the start are there from
 the beginning. A row is of both buses, where they agree. *Safe after* is when the gap was open or at rest, or the limit
-was told. *Leads out* are the commands that the daemon names itself, once the cause has gone; afterwards the force is
-followed again within 0.15 N, and before that they came to nothing.
+was told. *Leads out* are the commands that the daemon names, once the cause has gone. Then the force is followed again
+within 0.15 N.
 
 """
 
@@ -99,8 +99,8 @@ def _transitions() -> str:
         asked = "-" if row.request is DeviceRequest.NONE else str(row.request)
         rows.append((f"*{event}*" if event is Event.FAULT else f"`{event}`", *leads, guards, asked))
     return (
-        "## Events\n\nWhere every event leads from every state, or what it is refused with. Without a device every "
-        "command but `stop` is refused with `not_connected`, whatever else is in its way.\n\n"
+        "## Events\n\nWhere an event leads, or what it is refused with. Without a device every command but `stop` is "
+        "refused with `not_connected`.\n\n"
         + table(("event", *OperatingState, "guards, in their order", "device is asked"), rows)
         + "\n"
     )
@@ -132,9 +132,8 @@ def _faults() -> str:
     stay = ", ".join(f"`{fault}`" for fault in Fault if "home" not in FAULTS[fault].clears)
     return (
         "## Faults\n\nLatched until `clear-fault`, and then `home`; no homing is wanted after "
-        f"{stay}. Several that show at once are named in this order: causes before what follows of them. The reaction "
-        "is on its way by so many ms from when the fault is there and shows; 50 are the device's own timeout. "
-        "At 500 Hz of control it is up to 4 ms later.\n\n"
+        f"{stay}. Several at once are named in this order, causes first. *By* counts from when the fault shows: 50 ms "
+        "are the device's own timeout, and control at 500 Hz adds up to 4 ms.\n\n"
         + table(("fault", "means", "reaction", "by, ms", "remedy"), rows)
         + "\n"
     )
