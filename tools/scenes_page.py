@@ -115,15 +115,15 @@ def taken(file: Measured, way: Way) -> str:
 
 def _ways(file: Measured) -> str:
     rows = [
-        [told(share.way), f"{100.0 * share.daemon:.1f}", f"{share.step_us:.0f}", f"{share.plan_us:.0f}"]
+        [told(share.way), f"{100.0 * share.daemon:.1f}", f"{share.tick_us:.0f}", f"{share.plan_us:.0f}"]
         for share in file.shares
     ]
     every = [share.way for share in file.shares]
     errors = [[f"`{scene.name}`", *(_error(scene, way) for way in every)] for scene in file.scenes]
     return (
-        "## Every way\n\nWhat a daemon takes of a processor, and the core's own step and plan in the median. Setpoints "
+        "## Every way\n\nWhat a daemon takes of a processor, and a control tick and a plan in the median. Setpoints "
         "come as often as plans are made. 83 Hz is the thesis's own rate.\n\n"
-        + table(["control / plans, search", "daemon, %", "step, us", "plan, us"], rows)
+        + table(["control / plans, search", "daemon, %", "tick, us", "plan, us"], rows)
         + "\n\nRMS on the worst of samples 1 to 3, mN:\n\n"
         + table(["scene", *map(told, every)], errors)
     )
@@ -144,7 +144,7 @@ def _judged(file: Measured) -> str:
     return (
         "## In every situation\n\nThe worst device of each group, chosen/usual, RMS in mN. Steps, contacts and "
         "creeping handles are bound by the carriages and the element, not by a way: what counts is the difference. "
-        "Samples, draws 80 to 89 and the second plant decide; draws 100 to 119 judge.\n\n"
+        f"Samples, {file.draws} drawn devices and the second plant decide; {2 * file.draws} others judge.\n\n"
         + table(["scene", *heads], rows)
     )
 

@@ -54,7 +54,7 @@ FIRST_DECIDING, FIRST_JUDGING = 80, 100
 DRAWS = 10
 SETTLES_S = 3.0
 SHARED_SCENE, FIFO = "coronary", 50
-KEYS = "daemon", "step_us", "plan_us"
+KEYS = "daemon", "tick_us", "plan_us"
 
 Runs = Callable[[Collection[Case]], dict[Case, float]]
 
@@ -85,7 +85,9 @@ def measure(options: argparse.Namespace) -> Json:
             for name in options.live or shipped_scenes():
                 found = measured_scene(name, runs, options.draws)
                 scenes = {scene.name: scene for scene in (*file.scenes, found)}
-                file = msgspec.structs.replace(file, scenes=tuple(scenes[name] for name in sorted(scenes)))
+                file = msgspec.structs.replace(
+                    file, draws=options.draws, scenes=tuple(scenes[name] for name in sorted(scenes))
+                )
                 store(file, options.store)
     return {"scenes": [figures(scene, file) for scene in file.scenes], "measured_machine_us": file.machine_us}
 
@@ -109,8 +111,8 @@ def figures(scene: MeasuredScene, file: Measured) -> Json:
         "rms_N": scene.of(scene.chosen).rms_N[0],
         "rms_full_N": scene.usual.rms_N[0],
         "tolerance_N": scene.tolerance_N,
-        "cost_us_per_s": chosen and chosen.core_us_s,
-        "cost_full_us_per_s": usual and usual.core_us_s,
+        "cost_us_per_s": chosen and chosen.ticks_us_s,
+        "cost_full_us_per_s": usual and usual.ticks_us_s,
         "daemon_share": chosen and chosen.daemon,
         "daemon_share_full": usual and usual.daemon,
         "plan_us": chosen and chosen.plan_us,

@@ -18,18 +18,19 @@ class Share(Struct, frozen=True):
     """The processor time of a daemon that serves a scene in one way, live on the simulated device.
 
     daemon             the share of wall time that all its processes take
-    step_us, plan_us   the core's own time for a step and for a plan, medians
+    tick_us            what a control tick takes, with the plan that it may make; median
+    plan_us            what a plan takes; median
     """
 
     way: Way
     daemon: float
-    step_us: float
+    tick_us: float
     plan_us: float
 
     @property
-    def core_us_s(self) -> float:
-        """The core's own processor time in a second of control, us."""
-        return self.way.control_hz * self.step_us + self.way.inference_hz * self.plan_us
+    def ticks_us_s(self) -> float:
+        """The processor time of the control ticks of one second, us."""
+        return self.way.control_hz * self.tick_us
 
 
 class Tried(Struct, frozen=True):
@@ -99,6 +100,8 @@ class Measured(Struct, frozen=True):
     "Of the machine that the shares are of: see `tormagd.headroom.machine_loop`."
     pairs: int
     "Runs of each way that a share is the median of."
+    draws: int
+    "Devices drawn from the plant card that decided; twice as many judged."
     shares: tuple[Share, ...]
     scenes: tuple[MeasuredScene, ...]
 
