@@ -72,7 +72,7 @@ log = logging.getLogger(__name__)
 
 
 class _Connections:
-    """The connections of one endpoint, as its monitor tells of them."""
+    """The connections of one endpoint, counted from the events of its socket monitor."""
 
     def __init__(self, name: str, endpoint: "zmq.Socket[bytes]", is_guarded: bool) -> None:
         self.name, self.endpoint, self.is_guarded = name, endpoint, is_guarded
@@ -90,7 +90,12 @@ class _Connections:
         self.cut: set[int] = set()
 
     def told(self) -> str | None:
-        """libzmq turns one away. The address of another that had left in the handshake and was taken for this one."""
+        """Note that libzmq has rejected a peer for its key.
+
+        Normally returns None: that peer was counted when its key was refused. Otherwise another connection, which broke
+        off its handshake, had been counted in its place. Returns the address of that other connection, empty where it
+        is not known.
+        """
         if self.untold:
             self.untold -= 1
             return None
@@ -99,7 +104,11 @@ class _Connections:
         return address
 
     def left_untold(self, address: str) -> bool:
-        """Whether a connection that was closed in the handshake is one whose key was refused."""
+        """Tell whether a connection that broke off its handshake is counted as a refused key.
+
+        It is where the key of a peer at `address` was refused and libzmq has not rejected it yet. One such key is then
+        used up.
+        """
         if not self.untold or (taken := self.left(address)) is None:
             return False
         self.untold -= 1
@@ -107,7 +116,10 @@ class _Connections:
         return True
 
     def left(self, address: str) -> str | None:
-        """The address of the one whose key was refused, if this connection was its."""
+        """Remove a peer whose key was refused from `turned_away`, and return its address; None where there is none.
+
+        An empty `address`, of a peer that was gone before it was seen, stands for the oldest refused one.
+        """
         if not address and self.turned_away:  # it had gone before it was seen
             return self.turned_away.popleft()
         if address not in self.turned_away:
@@ -117,7 +129,10 @@ class _Connections:
 
 
 class Admission:
-    """Guards sockets while they are made, then watches them."""
+    """Decides who may connect to the daemon's sockets: by CURVE key, and by the number of connections of an address.
+
+    `keys` is None where no endpoint is guarded. Create it before any guarded socket is bound.
+    """
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
         self._keys, self._arrivals = keys, arrivals
@@ -135,7 +150,10 @@ class Admission:
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
-        """To be called before the socket is bound."""
+        """Set the options of the endpoint `name` on its socket, and begin to watch its connections. Call before `bind`.
+
+        A guarded socket asks for CURVE keys. Raises OSError where `is_guarded` and the daemon has no keys.
+        """
         if is_guarded:
             if self._keys is None:
                 raise OSError("CURVE keys are needed: endpoints.curve.server_secret")
@@ -150,7 +168,10 @@ class Admission:
         self._arrivals.watch(known.monitor)
 
     def update(self) -> bool:
-        """Takes a few of the events that wait, of one socket; False where there were none."""
+        """Handle up to AT_ONCE waiting events of one socket; return False where none waits.
+
+        Answers libzmq's questions about keys, counts refusals, and cuts off connections beyond the allowed number.
+        """
         if self._arrivals.has(self._zap):
             self._admit()
             return True
@@ -161,26 +182,33 @@ class Admission:
         return False
 
     def close(self) -> None:
-        """Watches no more; the sockets are the context's to close."""
+        """Stop watching the connections. The sockets themselves stay open: the context closes them."""
         for known in self._endpoints.values():
             # or ZeroMQ's thread would wait for ever for a monitor that has gone
             known.endpoint.disable_monitor()
 
     def has_role(self, public: str, roles: frozenset[str]) -> bool:
-        """Whether the key is listed for one of these now: one that was let in may have been taken off the list."""
+        """Tell whether the key `public` is now listed for at least one of `roles`.
+
+        Ask for each message: a peer may have been taken off the list after it was let in.
+        """
         return public in self.allowed and not roles.isdisjoint(self.allowed[public].roles)
 
     def name(self, public: str) -> str:
-        """A key as people know it: its fingerprint, and the name of its file."""
+        """Return a key as people know it: its fingerprint, and the name of its file where the key is listed."""
         listed = self.allowed.get(public)
         return fingerprint(public) if listed is None else f"{fingerprint(public)} ({listed.name})"
 
     def connections(self) -> dict[str, int]:
-        """How many connections each endpoint has."""
+        """Return the number of connections of each endpoint."""
         return {name: len(known.addresses) for name, known in self._endpoints.items()}
 
     def let_in(self, allowed: Allowed) -> None:
-        """From now on these keys are let in."""
+        """Replace the list of allowed keys by `allowed`, and log it.
+
+        Where a key has lost a role, all peers of the guarded telemetry and recording endpoints are cut off. Peers that
+        are still allowed reconnect by themselves.
+        """
         before, self.allowed = self.allowed, allowed
         roles = Counter(role for listed in allowed.values() for role in listed.roles)
         log.info("%d keys are let in: %s", len(allowed), ", ".join(f"{role} {roles[role]}" for role in ROLES))
@@ -197,12 +225,16 @@ class Admission:
                     self.cut_off(name)
 
     def cut_off(self, name: str, whose: str = "") -> None:
-        """Ends the connections that an address has to an endpoint, or all; whoever may connect comes back."""
+        """End the connections of the address `whose` to the endpoint `name`; an empty `whose` ends all.
+
+        A peer that may connect comes back by itself.
+        """
         for descriptor, address in self._endpoints[name].addresses.items():
             if address == whose or not whose:
                 _end(descriptor, address)
 
     def _admit(self) -> None:
+        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most."""
         for _ in range(AT_ONCE):
             if not self._arrivals.has(self._zap):
                 return
@@ -216,6 +248,10 @@ class Admission:
             self._arrivals.touch(self._zap)
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
+        """Tell whether the key `public` may use the endpoint `name`, and count the answer.
+
+        A refused key is counted with the reason and noted: its connection is closed soon.
+        """
         known = self._endpoints[name]
         if self.has_role(public, MAY[name]):
             self._came(name, address)
@@ -229,6 +265,10 @@ class Admission:
         return False
 
     def _watch(self, known: _Connections) -> None:
+        """Handle the waiting events of one endpoint's monitor, AT_ONCE at most: connected, closed, handshake failed.
+
+        Counts refused peers, and cuts off connections beyond the allowed number.
+        """
         for _ in range(AT_ONCE):
             if not self._arrivals.has(known.monitor):
                 return
@@ -249,6 +289,10 @@ class Admission:
                 known.failed = PLAIN if known.is_guarded else "left in the handshake"
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
+        """Note a new connection, and end it where its address or its endpoint has too many.
+
+        On an open endpoint its peer counts as come, for `_came`.
+        """
         address = known.addresses[descriptor] = _address(descriptor)
         if not address:
             return
@@ -260,6 +304,10 @@ class Admission:
             self._came(known.name, address)
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
+        """Forget a closed connection, and count a refusal where its peer never got in and was not counted before.
+
+        A publisher that had got in is noted in `left`: it may come back at once.
+        """
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
         was_asked = (
@@ -279,6 +327,7 @@ class Admission:
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
     def _came(self, name: str, address: str) -> None:
+        """Count a message that was too long where a publisher's address returns within RECONNECT_S of leaving."""
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
         # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
         # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
@@ -293,7 +342,10 @@ class Admission:
 
 
 def _address(descriptor: int) -> str:
-    """The peer as libzmq names it: its host, or `localhost:USER:GROUP:PROCESS`; empty where it has gone."""
+    """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`.
+
+    Empty where the peer has gone.
+    """
     try:
         with socket.socket(fileno=os.dup(descriptor)) as connection:
             if connection.family == socket.AF_UNIX:
@@ -306,7 +358,7 @@ def _address(descriptor: int) -> str:
 
 
 def _end(descriptor: int, address: str) -> None:
-    """Ends the connection of this address, unless its number has gone to another one since."""
+    """Shut down the connection `descriptor`, unless its peer is no longer `address`: descriptors are used again."""
     with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
         if _address(connection.fileno()) == address:
             connection.shutdown(socket.SHUT_RDWR)

@@ -7,7 +7,7 @@ PEERS = 256
 
 
 class Allowance:
-    """A token bucket for each peer. No sockets, no clock."""
+    """A token bucket for each peer: `per_s` messages a second, and a `burst` at once. No sockets, no clock."""
 
     def __init__(self, per_s: float, burst: float) -> None:
         self._per_s, self._burst = per_s, burst
@@ -15,7 +15,10 @@ class Allowance:
         "When each was last filled, and what was left then."
 
     def grants(self, peer: Peer, now_s: float) -> bool:
-        """Whether a message that this peer sent is read."""
+        """Tell whether one more message of `peer` may be read at `now_s`, and count it if so.
+
+        Of more than PEERS peers, the one heard longest ago is forgotten; it begins again with a full burst.
+        """
         if peer not in self._buckets and len(self._buckets) >= PEERS:
             del self._buckets[min(self._buckets, key=self._buckets.__getitem__)]
         filled_s, left = self._buckets.get(peer, (now_s, self._burst))

@@ -24,11 +24,14 @@ WAITS = frozenset({"busy", "device_latched", "not_homed", "not_fresh"})
 
 
 class Arming:
-    """What one `arm` has done so far. It gives each command once, and ends at every fault that was not there when it
-    was asked for: nothing is cleared or closed that the person has not seen. No clock."""
+    """Progress of one `arm`: gives each command that leads to ENABLED once, as soon as the state allows it.
+
+    Ends with a refusal at every fault that was not latched when it began: a person clears only faults that they have
+    seen. No clock.
+    """
 
     def __init__(self, now_s: float, faults: tuple[Fault, ...]) -> None:
-        """Begin at `now_s`, with the person's word for going on after these `faults`."""
+        """Begin at `now_s`. `faults` are those latched now, which the person has agreed to clear."""
         self.given: tuple[str, ...] = ()
         self.is_over = False
         self.refusal: RefusedError | None = None
@@ -37,12 +40,17 @@ class Arming:
         self._given_s = self._moved_s = now_s
 
     def end(self, refusal: RefusedError | None = None) -> None:
-        """End it; what it ended for first stays."""
+        """End the arming, with the reason where it failed; None where the force follows now. Later calls do nothing."""
         if not self.is_over:
             self.is_over, self.refusal = True, refusal
 
     def advance(self, now_s: float, safety: SafetyState, present: Conditions, give: Callable[[str], None]) -> None:
-        """Give the next command by `give`, which raises RefusedError, if its time has come."""
+        """Give the next command by calling `give`, once its time has come; end in ENABLED or at a refusal.
+
+        `give` raises RefusedError. Refusals named in WAITS are tried again for PATIENCE_S; any other ends the arming.
+        So does a device that is still busy MOVES_S after a command. Nothing is raised: `refusal` says why the arming
+        ended.
+        """
         if self.is_over:
             return
         try:
@@ -60,11 +68,16 @@ class Arming:
             self.end(error)
 
     def _require_no_news(self, safety: SafetyState) -> None:
+        """Raise RefusedError where a fault is latched that the person has not seen, or any after `clear-fault`."""
         news = [fault for fault in safety.faults if fault not in self._faults or Event.CLEAR_FAULT in self.given]
         if news:
             raise RefusedError("fault", f"a fault came while arming: {', '.join(news)}", "tormagctl status")
 
     def _attempt(self, now_s: float, command: Event, give: Callable[[str], None]) -> None:
+        """Give `command` and note it; a refusal in WAITS is passed over for PATIENCE_S.
+
+        Raises RefusedError for any other refusal, and for a command that was given and has not led on by then.
+        """
         try:
             if command in self.given:
                 raise RefusedError("busy", f"{command} was taken, and has not come to its end", "tormagctl status")
@@ -78,6 +91,7 @@ class Arming:
 
 
 def _next(safety: SafetyState, present: Conditions) -> Event:
+    """Return the next command towards ENABLED; `clear-fault` first where only the device has latched a fault."""
     if present.device_latched and safety.operating_state is OperatingState.DISABLED:
         return Event.CLEAR_FAULT
     return next_commands(safety, present.homed)[0]

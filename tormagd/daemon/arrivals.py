@@ -8,10 +8,10 @@ _EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 
 
 class Arrivals:
-    """Watches ZeroMQ's sockets by their descriptors.
+    """Knows which ZeroMQ sockets hold messages, by polling their descriptors once a beat.
 
-    Such a descriptor tells once that something has come, and whatever is done with the socket takes that word away
-    (zmq_getsockopt, ZMQ_FD). So a socket that has told counts as ready until it was found empty.
+    A descriptor signals new messages once, and any use of its socket clears the signal (zmq_getsockopt, ZMQ_FD). So a
+    socket that has signalled counts as ready until it is found empty.
     """
 
     def __init__(self) -> None:
@@ -20,23 +20,26 @@ class Arrivals:
         self._ready: set[zmq.Socket[bytes]] = set()
 
     def watch(self, socket: "zmq.Socket[bytes]") -> None:
-        """Watches this socket, too. Its first message may come without a word: it is ready until found empty."""
+        """Watch `socket`, too. It counts as ready at once: its first message may come without a signal."""
         self._ready.add(socket)
         descriptor = int(socket.fileno())
         self._sockets[descriptor] = socket
         self._poll.register(descriptor, select.POLLIN)
 
     def look(self) -> None:
-        """Asks which sockets have news: once a beat."""
+        """Poll all watched sockets without waiting, and note which have signalled. Call once a beat."""
         for descriptor, _ in self._poll.poll(0):
             self._ready.add(self._sockets[descriptor])
 
     def touch(self, socket: "zmq.Socket[bytes]") -> None:
-        """Something was sent through this socket: what has come meanwhile does not tell any more."""
+        """Count `socket` as ready after a send through it: the send has cleared its signal."""
         self._ready.add(socket)
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
-        """Whether a message waits in this socket."""
+        """Tell whether a message waits in a watched socket.
+
+        A message that came after the last `look` is seen only where the socket counts as ready.
+        """
         if socket not in self._ready:
             return False
         if is_readable(socket):
@@ -46,5 +49,5 @@ class Arrivals:
 
 
 def is_readable(socket: "zmq.Socket[bytes]") -> bool:
-    """Whether a message waits in a socket that nobody watches. Asking takes a third of what an exception does."""
+    """Tell whether a message waits in `socket`, watched or not. Costs a third of an exception of `recv`."""
     return bool(int(socket.get(_EVENTS)) & _POLLIN)

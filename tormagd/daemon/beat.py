@@ -35,7 +35,7 @@ Part = tuple[str, Callable[[Beat], object]]
 
 
 class Delay(NamedTuple):
-    """How long after it was due a beat had driven the device, and what most of that time went into."""
+    """Delay of a late beat: from when it was due until it drove the device, and the part that took most of it."""
 
     took_ns: int
     culprit: str
@@ -43,7 +43,10 @@ class Delay(NamedTuple):
 
 
 class Phases:
-    """Runs all phases in their order, then one slice: the slices take turns. An error ends its phase alone."""
+    """Runs the parts of every beat: all phases in order, then one of the slices, which take turns.
+
+    An exception ends only its own part of that beat; it is logged, unless its message is that part's last one.
+    """
 
     def __init__(
         self,
@@ -51,7 +54,10 @@ class Phases:
         clock_ns: Callable[[], int] = monotonic_ns,
         cpu_ns: Callable[[], int] = thread_time_ns,
     ) -> None:
-        """A beat that drives later than `stall_ns` after it was due is an error in the log."""
+        """Begin with no parts. A beat that drives the device later than `stall_ns` is logged as an error.
+
+        `clock_ns` gives the time, `cpu_ns` the processor time of this thread.
+        """
         self._stall_ns, self._clock_ns, self._cpu_ns = stall_ns, clock_ns, cpu_ns
         self._phases: list[Part] = []
         self._slices: list[Part] = []
@@ -69,12 +75,16 @@ class Phases:
         self._tell_ns = clock_ns()
 
     def begin(self, phases: list[Part], slices: list[Part]) -> None:
-        """From now on a beat is this."""
+        """Set the phases and slices of every beat from now on, each name with its function."""
         self._phases, self._slices = phases, slices
         self.spent = {name: Histogram() for name, _ in (*phases, *slices)}
 
     def run(self, due_ns: int, merged: int) -> None:
-        """One beat that was due at `due_ns`, and stands for `merged` missed ones too."""
+        """Run one beat that was due at `due_ns`, and stands for `merged` missed ones, too.
+
+        Runs all phases, then one slice. Where the last beat's slice had work, slices run in turn until one has work
+        again. The times of every COUNTED-th beat go into `spent`.
+        """
         beat = Beat(due_ns, self._clock_ns(), merged)
         self._last_ran, self._ran = self._ran, []
         for name, phase in self._phases:
@@ -91,14 +101,15 @@ class Phases:
                 self.spent[name].add(end_ns * 1e-9, (end_ns - start_ns) * 1e-3)
 
     def on_time(self) -> None:
-        """The device was driven in time: what ran before does not matter any more."""
+        """Note that the device was driven in time: processor time for the next `blame` counts from now."""
         self._cpu_before_ns = self._cpu_ns()
 
     def blame(self, due_ns: int) -> Delay:
-        """The device was driven just now, too late for `due_ns`. What most of the time since then went into.
+        """Return the delay of the device since `due_ns`, and the part that took most of it. Call in the phase that
+        drives.
 
-        A phase in whose midst the kernel gave the processor to somebody else is charged with that too, unless that was
-        most of the delay: `cpu_ns` counts what the thread really ran.
+        Where the thread did not run for more than half of the delay, by `cpu_ns`, KERNEL is to blame. A shorter pause
+        counts for the part in which it fell. Counts the part in `blamed`, and keeps the worst delay for `tell`.
         """
         done_ns = self._clock_ns()
         took_ns = done_ns - due_ns
@@ -120,7 +131,7 @@ class Phases:
         return delay
 
     def tell(self) -> None:
-        """Says in the log how many beats were late, and of the worst why: some times a second."""
+        """Log the number of late beats and the worst of them since the last line, at most once in NEWS_NS."""
         now_ns = self._clock_ns()
         if self._late and now_ns >= self._tell_ns:
             took_ns, culprit, share_ns = self._worst
@@ -133,7 +144,10 @@ class Phases:
             self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
-        """Runs one part; whether it had something to do."""
+        """Run one part, and return whether it had something to do: it did not return False, or it raised.
+
+        An exception is logged and ends here.
+        """
         start_ns = self._clock_ns()
         try:
             is_done = part(beat) is not False

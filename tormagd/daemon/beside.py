@@ -10,7 +10,10 @@ MOST_PACKET = 65_536
 
 
 def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
-    """`python -m module DESCRIPTOR`."""
+    """Start `python -m module DESCRIPTOR`, with the socket `its_end` as that descriptor, and return the process.
+
+    It gets no signal of our process group: it is to end once our end of the socket is closed. Raises OSError.
+    """
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
     # no signal for our group is meant for it: it ends when we have ended
@@ -18,9 +21,10 @@ def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes
 
 
 class Beside:
-    """Our end. To be made before this process becomes a real-time one, whose processors the other would have.
+    """Our end of a process that runs `module`, and of the packet socket to it. Sends never wait.
 
-    Raises OSError where it does not start; from then on nothing does, and nothing waits.
+    Create it before this process becomes a real-time one: the other would inherit its processors. Raises OSError where
+    the process does not start; no method does.
     """
 
     def __init__(self, module: str) -> None:
@@ -32,7 +36,10 @@ class Beside:
         "Whether it was found to have ended, or this end was closed."
 
     def send(self, data: bytes) -> bool:
-        """Whether it was taken: not where no more fits in now, or where it is more than a packet holds."""
+        """Send one packet, and return whether the socket took it.
+
+        False where the socket is full, the packet is too long, or the process has ended; the last sets `is_gone`.
+        """
         try:
             self.socket.send(data)
         except ConnectionError:
@@ -42,7 +49,10 @@ class Beside:
         return not self.is_gone
 
     def receive(self, wait_s: float = 0.0) -> bytes | None:
-        """The next packet; None where there is none, for `wait_s` or now."""
+        """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process has ended.
+
+        The end of the process sets `is_gone`.
+        """
         try:
             if wait_s:
                 select.select([self.socket], [], [], wait_s)
@@ -55,6 +65,6 @@ class Beside:
         return data or None
 
     def close(self) -> None:
-        """Closes this end, by which the other sees that it is over."""
+        """Close our end of the socket, which tells the process to end. Does not wait for it."""
         self.is_gone = True
         self.socket.close()

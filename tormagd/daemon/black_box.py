@@ -45,7 +45,10 @@ log = logging.getLogger(__name__)
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
-    """What a black box says of the core besides: all that it takes to build it again, and hashes to know it by."""
+    """Return the header of a black box of `core`.
+
+    It holds what a replay needs to build the core again, and versions and hashes to check that it is the same one.
+    """
     configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
         "format": str(FORMAT),
@@ -64,7 +67,11 @@ def header(config: Config, core: Core) -> dict[str, str]:
 
 
 class BlackBox:
-    """Hands over what the journal has. Without a `folder` nothing is kept, and `report` says so."""
+    """Hands the core's journal to the keeper, a process that writes black boxes into `folder`.
+
+    Nothing is kept where `folder` is None, where mcap is not installed, or where the keeper does not start. `report`
+    then says why. `key` names the file with the key that seals black boxes; empty for none.
+    """
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int, key: str = "") -> None:
         self._folder = folder
@@ -92,13 +99,16 @@ class BlackBox:
         self._asked: deque[Write] = deque(maxlen=MOST_ASKED)
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
-        """With these states the first tick is run, and with what comes through this connection."""
+        """Begin the journal with the states before the first tick. It also takes what passes through `connection`."""
         if self._beside is not None:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
-        """From now on it is of another core: what was kept of the one before is forgotten."""
+        """Begin anew with the core of another scene, from these states. Does nothing without a keeper.
+
+        The keeper gets the new `header` and forgets all entries of the scene before.
+        """
         if self._beside is None or self._folder is None:
             return
         self.journal.take()
@@ -107,7 +117,11 @@ class BlackBox:
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
-        """A control period is over, with these states."""
+        """Add the record of a control period to the journal, with the states after it.
+
+        Every PART_TICKS periods the entries go to the keeper. What its socket does not take is lost and counted, and a
+        snapshot follows. An entry that cannot be encoded ends the black box. Does nothing without a keeper.
+        """
         if self._beside is None:
             return
         self.journal.ticked(record)
@@ -128,7 +142,11 @@ class BlackBox:
             self._snapshot(stepper, planner)
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
-        """Asks for a black box, and says where it will be. Raises RefusedError."""
+        """Ask the keeper to write a black box, and return the path that it will have.
+
+        `reason` becomes part of its name, `details` of its contents. It also holds what comes in the next `after_s`.
+        Clears the last refusal. Raises RefusedError without a keeper.
+        """
         if self._folder is None or self._beside is None:
             raise RefusedError(
                 "no_black_box",
@@ -144,7 +162,10 @@ class BlackBox:
         return self._folder / name
 
     def look(self) -> None:
-        """Takes what the other process has said: some times a second."""
+        """Send the keeper the requests that wait, and note its answers in `report` and in the log. Never waits.
+
+        A keeper that has ended ends the black box.
+        """
         self._ask()
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
@@ -157,7 +178,7 @@ class BlackBox:
         self._see_to()
 
     def report(self) -> BlackBoxReport:
-        """For `status`."""
+        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost."""
         return BlackBoxReport(
             folder="" if self._folder is None else str(self._folder),
             newest=self._newest,
@@ -166,7 +187,7 @@ class BlackBox:
         )
 
     def close(self) -> None:
-        """Lets the other process end, once it has written what it was asked for."""
+        """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most."""
         beside = self._beside
         if beside is not None:
             self._say(End())
@@ -178,7 +199,7 @@ class BlackBox:
                 log.info("the black box is still being written")
 
     def _ask(self) -> None:
-        """Passes on what it has not heard yet: it may have been held up."""
+        """Send the keeper the requests that wait; those that the socket does not take wait on."""
         while self._asked and self._say(self._asked[0]):
             self._asked.popleft()
 
@@ -186,16 +207,21 @@ class BlackBox:
         self.journal.snapshot(stepper, planner, None if self._connection is None else self._connection.memory())
 
     def _say(self, what: Said) -> bool:
-        """Whether the socket took it."""
+        """Send one message to the keeper, and return whether the socket took it. A dead keeper ends the black box."""
         is_taken = self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
         self._see_to()
         return is_taken
 
     def _see_to(self) -> None:
+        """End the black box where the keeper has ended."""
         if self._beside is not None and self._beside.is_gone:
             self._lose("the process that keeps it has ended")
 
     def _lose(self, reason: str) -> None:
+        """End the black box: close the socket, and empty and stop the journal. Control goes on.
+
+        `reason` goes into the log and into `report`.
+        """
         self._refusal = reason
         log.error("no black box any more: %s", reason)
         if self._beside is not None:

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class Causes:
-    """Remembers the newest stall, and of each fault what made it."""
+    """Remembers the newest stall of the control loop, and the cause of each latched fault in figures."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -25,13 +25,19 @@ class Causes:
         self._told: dict[str, str] = {}
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:
-        """A tick was late. Only what the step took for a stall, too, is one; of two close together the longer stays."""
+        """Note a stall in `stall`, where the step that just ran has taken its own delay for one.
+
+        `delay` says what to blame. A stall whose length, ms, is the known one's changes nothing.
+        """
         sight, known, stall_ms = stepper.measure.sight, self.stall, round(stepper.measure.sight.stall_s * 1e3, 1)
         if sight.stalled_s == stepper.time_s and (known is None or known.ms != stall_ms):
             self.stall = StallReport(stall_ms, delay.culprit)
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
-        """Says which faults are new, and remembers what is known of their causes now."""
+        """Log the newly latched `faults` with cause and remedy, and remember the figures of their causes.
+
+        `measurement` is None without a device: only HOST_STALL then has figures.
+        """
         figures = {} if measurement is None else _figures(stepper, measurement)
         for fault in faults:
             self._told.pop(fault, None)
@@ -51,7 +57,7 @@ class Causes:
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
-        """Each fault with its cause and remedy."""
+        """Return each fault with its cause, in the figures of when it was latched, and its remedy."""
         return explanations(faults, FAULTS, self._told)
 
     def of_limits(
@@ -61,8 +67,11 @@ class Causes:
         of_sources: Mapping[Limit, Explanation],
         measurement: Measurement | None,
     ) -> tuple[Explained, ...]:
-        """Each limit with its cause and remedy; `replaced` says what the model was not asked, `of_sources` what is
-        known of those that publish, `measurement` is the newest."""
+        """Return each limit with its cause in figures, and its remedy.
+
+        `replaced` names the inputs that the model was held to its range in. `of_sources` are explanations of limits
+        about publishers. `measurement` is the newest; None without a device.
+        """
         told = {Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered"}
         told |= {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"}
         if measurement is not None:
@@ -76,7 +85,7 @@ class Causes:
 
 
 def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
-    """Of the causes that have some: the measurement's, or what the step has remembered of it."""
+    """Return figures for the faults that have any, from the measurement and from what the step remembers."""
     leap, homing, opening = stepper.measure.leap, stepper.homing, stepper.opening
     return {
         Fault.SENSE_STALE: f"for {(stepper.time_s - measurement.sensed_s) * 1e3:.0f} ms",
@@ -93,5 +102,5 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
 def explanations(
     codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str] = MappingProxyType({})
 ) -> tuple[Explained, ...]:
-    """Each code with its cause and remedy; `told` has causes with the figures of this very time."""
+    """Return each code with its cause and remedy from `table`; a cause in `told` goes before the table's."""
     return tuple(Explained(str(code), told.get(code, table[code].cause), table[code].remedy) for code in codes)

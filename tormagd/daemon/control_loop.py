@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 
 class ControlLoop:
-    """Carries the newest measurement through `step` to the device, once a period."""
+    """The control loop: each period, step the core on the newest measurement and drive the device."""
 
     def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
         self.stepper, self._connection, self._journal = stepper, connection, journal
@@ -32,7 +32,10 @@ class ControlLoop:
         self._known_faults: tuple[Fault, ...] = ()
 
     def drive(self, beat: Beat, plan: Plan) -> None:
-        """Steps along `plan`, and sends the duties."""
+        """Step the core along `plan` with the newest measurement, and send its output to the device.
+
+        Keeps output, plan and measurement for telemetry, and records the tick in journal and timing.
+        """
         now_s = time.monotonic()  # of this very moment: a stall within the beat is one, too
         self.used, self.measurement = plan, self._connection.measurement
         self._journal.stepped()
@@ -44,13 +47,19 @@ class ControlLoop:
         self.timing.record(beat.due_ns, beat.start_ns, time.monotonic_ns(), beat.merged)
 
     def command(self, name: str, conditions: Conditions) -> None:
-        """An operator's command, which ends an arming that is under way. Raises RefusedError."""
+        """Carry out an operator's command. Raises RefusedError where `conditions` or the state do not allow it.
+
+        An arming under way ends first, as overtaken, whether or not the command is then refused.
+        """
         if self.arming is not None:
             self.arming.end(RefusedError("overtaken", f"{name} came before it was armed", "tormagctl arm"))
         self._give(name, conditions)
 
     def arm(self, conditions: Conditions) -> None:
-        """Begins to arm, unless that is under way. Raises RefusedError where it ends at once."""
+        """Begin an arming, or go on with the one under way, and give its next command.
+
+        Raises RefusedError where the arming ends refused in this call.
+        """
         if self.arming is None or self.arming.is_over:
             self.arming = Arming(time.monotonic(), self.stepper.safety.faults)
         self.go_on_arming(conditions)
@@ -58,7 +67,10 @@ class ControlLoop:
             raise self.arming.refusal
 
     def go_on_arming(self, conditions: Conditions) -> None:
-        """Gives the next command of an arming that is under way, if its time has come."""
+        """Give the next command of an arming under way, if its time has come; else do nothing.
+
+        A refusal ends the arming and is logged, not raised.
+        """
         arming = self.arming
         if arming is None or arming.is_over:
             return
@@ -67,6 +79,7 @@ class ControlLoop:
             log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
 
     def _give(self, name: str, conditions: Conditions) -> None:
+        """Give a command to the core; note it in the journal, and log it if taken. Raises RefusedError if refused."""
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
             self.stepper.command(name, now_s, conditions)
@@ -77,17 +90,17 @@ class ControlLoop:
         log.info("%s: %s", name, reason(name, source))
 
     def latch(self, fault: Fault) -> None:
-        """Latches a fault that was found outside the step."""
+        """Latch a fault that was found outside the step, and note it in the journal."""
         self._journal.latched(fault)
         self.stepper.latch(fault)
 
     def lose_link(self) -> None:
-        """Tells the core that the device is gone."""
+        """Tell the core that the link to the device broke, and note it in the journal."""
         self._journal.lost_link()
         self.stepper.lose_link()
 
     def new_faults(self) -> tuple[Fault, ...]:
-        """The faults that were latched since this was last asked."""
+        """Return the faults latched since the last call."""
         faults, known = self.stepper.safety.faults, self._known_faults
         self._known_faults = faults
         return tuple(fault for fault in faults if fault not in known)

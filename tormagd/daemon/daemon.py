@@ -50,7 +50,13 @@ log = logging.getLogger(__name__)
 
 
 class Daemon:
-    """Runs one scene on one device until it is told to end. `read_again` gives the configuration as it is now."""
+    """The daemon: runs one scene on one device until it is told to end. Create it inside the event loop.
+
+    `read_again` returns the configuration as its file is now, and raises ConfigError. `refused` lists what the kernel
+    did not grant at the start.
+
+    Raises OSError where an endpoint cannot be bound.
+    """
 
     def __init__(
         self,
@@ -64,8 +70,11 @@ class Daemon:
         beside: SearchProcess | None = None,
         config_file: str | None = None,
     ) -> None:
-        """`box` is one whose process runs already; without it none is kept. `beside` is there where the core's search
-        runs beside the plans. `config_file` is where `config` is from, None for the defaults."""
+        """Bind the endpoints and put the loops together; the device is opened in `run`.
+
+        `keys` is None where no endpoint is guarded. `box` has its keeper running already; None: no black box is kept.
+        `beside` is the search where it runs in a process of its own. `config_file` is None for the defaults.
+        """
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
@@ -124,12 +133,17 @@ class Daemon:
         self._ended = asyncio.Event()
 
     def _profiles_of(self, core: Core) -> Profiles:
+        """Return the profiles for a core's insert and model; without a folder they keep nothing."""
         folder, bounds = state_folder(core.config.device.profiles, "profiles"), device_bounds(core.config.trim)
         of_insert = None if folder is None else ProfileFolder(folder, core.scene.insert.name, core.model, bounds)
         return Profiles(of_insert, self._inference.planner.believe, self._inference.teach)
 
     async def run(self) -> None:
-        """Runs until SIGTERM or SIGINT; opens the gap before it returns."""
+        """Open the device and run until SIGTERM or SIGINT; then open the gap, keep the profile and close everything.
+
+        SIGHUP reads keys and configuration again. Freezes the garbage collector and shortens the interpreter's switch
+        interval, both for the whole process.
+        """
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, self._ended.set)
         self._loop.add_signal_handler(signal.SIGHUP, self._begin_reload)
@@ -177,6 +191,11 @@ class Daemon:
         self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
 
     def _drive(self, beat: Beat) -> None:
+        """Drive the device along the newest plan.
+
+        A late tick is put down to the part that delayed it. New faults are explained in the log, and a black box is
+        written.
+        """
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
         if timing.delay_ns > timing.period_ns:
@@ -190,7 +209,11 @@ class Daemon:
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
 
     async def _build(self, scene: str) -> Core:
-        """The core for a scene at the rates that run. Raises ConfigError."""
+        """Build the core of another scene at the running rates, and wait until the profile is on the disk.
+
+        Raises ConfigError for a scene that is refused. It also does where the search of either scene runs in its own
+        process.
+        """
         # in a thread: no beat waits for it
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
         if core.element.is_beside or self._inference.beside is not None:
@@ -199,12 +222,15 @@ class Daemon:
         return core
 
     def _require_disabled(self) -> None:
-        """Raises RefusedError where the scene may not be changed now."""
+        """Check that the scene may be changed now. Raises RefusedError; an arming under way ends in any case."""
         self._control.command("use-scene", self._telemetry.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
-        """Goes on with another core, between two beats. The device stays homed, and what is known of it where insert
-        and model are the same."""
+        """Replace the running core by `core`, made for `scene`, between two beats.
+
+        Operating state, faults and homing stay. What was learned of the device stays where insert and model do. The
+        newest setpoint is forgotten, profiles are read again, and the black box begins anew.
+        """
         control, inference, before, now_s = self._control, self._inference, self._core, time.monotonic()
         learned, safety = inference.planner.believe.learned(), control.stepper.safety
         stepper, planner = core.stepper(now_s), core.planner(now_s)
@@ -226,6 +252,10 @@ class Daemon:
         self._reloading.add_done_callback(asyncio.Task.result)
 
     async def _reload(self) -> None:
+        """Read keys and configuration again, and take over what may change while control runs.
+
+        Logs which keys changed and which wait for a restart. A file that is refused leaves everything as it was.
+        """
         # in threads: reading a file is nothing that a beat should wait for
         try:
             if self._keys is None:
@@ -249,7 +279,11 @@ class Daemon:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     async def _open_gap(self) -> None:
-        """Asks the device to open and waits until it has; what it cannot do in time it goes on doing without us."""
+        """Command the device to open, and wait for it, LONGEST_RETRACT_S at most.
+
+        In FAULT or without a device nothing is commanded. A gap that is still closed is waited for NAMED_S more: its
+        fault is then logged.
+        """
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S

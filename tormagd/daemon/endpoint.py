@@ -65,8 +65,10 @@ Answer = Callable[[Request], Any]
 
 
 class Endpoint:
-    """The daemon's sockets. With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO.
-    `priority` is the inbox's.
+    """The daemon's four sockets: takes setpoints, publishes telemetry and recording, answers requests.
+
+    With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO. `priority` lists the sources
+    that may take the brake, the foremost first. `keys` is None where no endpoint is guarded.
 
     Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
     """
@@ -106,7 +108,11 @@ class Endpoint:
         self.listeners = Listeners()
 
     def take_setpoints(self) -> bool:
-        """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
+        """Read the waiting setpoints, DRAIN messages at most; return True if one became the newest setpoint.
+
+        What a publisher sends beyond its allowance, or with a key that is off the list, is dropped and counted. A
+        message of several parts is refused. Nothing is raised.
+        """
         is_newer = False
         for _ in range(DRAIN):
             if not self.arrivals.has(self._setpoints):
@@ -129,21 +135,22 @@ class Endpoint:
         return is_newer
 
     def publish(self, telemetry: Telemetry) -> None:
-        """Sends one telemetry message to whoever listens."""
+        """Send one telemetry message to all subscribers. Never waits: a subscriber that is too slow misses it."""
         self._send(self._telemetry, "telemetry", encode(telemetry))
 
     def publish_topic(self, topic: bytes, message: Motion | Verdict) -> None:
-        """Sends one message to whoever listens to this topic."""
+        """Send one message to the subscribers of `topic`. Never waits."""
         self._send(self._telemetry, "telemetry", topic, encode(message))
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
-        """Sends the control ticks since the last time, a row each."""
+        """Send control ticks to all subscribers of the recording, a row each with the fields `columns`. Never waits."""
         self._send(self._recording, "recording", encode_ticks(rows, columns))
 
     def take_requests(self, answer: Answer) -> None:
-        """Takes what has arrived, at most TAKEN in TAKEN_NS; answers `stop` and `disable`, the rest waits for `serve`.
+        """Take waiting requests from the socket: TAKEN at most, for TAKEN_NS. Answer `stop` and `disable` at once.
 
-        `answer` returns the result or raises RefusedError.
+        All others wait for `serve`; what is more than may wait is dropped and counted. `answer` returns the result of a
+        request, or raises RefusedError.
         """
         until_ns = time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
@@ -159,7 +166,10 @@ class Endpoint:
                 return
 
     def serve(self, answer: Answer, most: int) -> int:
-        """Answers the waiting requests, for ANSWERS_NS and not more than `most`; how many there were."""
+        """Answer the waiting requests, `most` at most, for ANSWERS_NS; return the number answered.
+
+        `answer` returns the result of a request, or raises RefusedError.
+        """
         until_ns = time.monotonic_ns() + ANSWERS_NS
         for number in range(most):
             if time.monotonic_ns() > until_ns or (waiting := self.requests.next()) is None:
@@ -168,13 +178,13 @@ class Endpoint:
         return most
 
     def tell(self, now_s: float) -> None:
-        """Counts and tells what was not read: some times a second."""
+        """Log the newly refused and dropped messages, and update the inbox's count of oversize ones."""
         self.inbox.oversize = self.admission.oversize
         self._drops.tell(now_s)
         self.admission.refusals.tell(now_s)
 
     def report(self) -> PeersReport:
-        """Who connects, who was refused, who sent too much."""
+        """Return the connections of each endpoint, refused peers, and peers whose messages were dropped."""
         return PeersReport(
             connections=self.admission.connections(),
             refused=self.admission.refusals.total,
@@ -184,13 +194,15 @@ class Endpoint:
         )
 
     def close(self) -> None:
-        """Closes the sockets without waiting for anybody."""
+        """Close all sockets and remove their files, without waiting for anybody."""
         self.admission.close()
         for file in self._files:
             file.close()
         self._context.destroy(linger=0)
 
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
+        """Return a new socket of this kind, guarded where it has to be, and bound. Raises OSError naming the
+        endpoint."""
         made = self._context.socket(kind)
         options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
         if kind == zmq.XPUB:
@@ -212,7 +224,10 @@ class Endpoint:
         return made
 
     def _send(self, to: "zmq.Socket[bytes]", name: str, *parts: bytes) -> None:
-        """Sends to all subscribers, and cuts off who says more than subscribers need to."""
+        """Send to all subscribers, then read their subscriptions, DRAIN at most.
+
+        Topics are counted in `listeners`. A subscriber that says more than its allowance is cut off and counted.
+        """
         # drops for a subscriber that does not keep up; it never blocks
         with contextlib.suppress(zmq.Again):
             to.send_multipart(parts, zmq.NOBLOCK)
@@ -231,14 +246,14 @@ class Endpoint:
                 self.admission.cut_off(name, peer.address)
 
     def _sender(self, frame: zmq.Frame, name: str) -> Peer:
-        """Who sent a message."""
+        """Return the peer that sent a message, with its key where the endpoint is guarded."""
         key = str(frame.get("User-Id")) if name in self._guarded else ""
         return Peer(str(frame.get("Peer-Address")), key)
 
     def _next_request(self) -> Waiting | None:
-        """The next message, which there has to be; None for a further part of one that had too many.
+        """Read the next message, which must be waiting; None for a further part of a message read before.
 
-        A message that is no request has nothing in it, and is answered as what is no request.
+        A message of too many parts is returned without data, so that it is answered as no request.
         """
         if self._is_in_parts_of_request:
             self._is_in_parts_of_request = self._control.recv(zmq.NOBLOCK, copy=False).more
@@ -253,6 +268,10 @@ class Endpoint:
         return Waiting(envelope, data, self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
+        """Carry out and answer a `stop` or `disable`; return False, with nothing done, for anything else.
+
+        Where it succeeds, requests that came before it count as overtaken.
+        """
         try:
             request = decode(waiting.data, Request)
         except MessageError:
@@ -265,6 +284,7 @@ class Endpoint:
         return True
 
     def _answered(self, waiting: Waiting, answer: Answer) -> Reply:
+        """Carry out a request, and return the reply. What cannot be decoded is answered with `bad_request`."""
         try:
             request = decode(waiting.data, Request)
         except MessageError as error:
@@ -273,6 +293,7 @@ class Endpoint:
         return self._carried_out(request, waiting, answer)
 
     def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:
+        """Carry out a request that is permitted, and return the reply. Any RefusedError becomes the reply."""
         try:
             self._require_permitted(request, waiting)
             return Reply(v=VERSION, id=request.id, ok=True, result=answer(request))
@@ -280,6 +301,10 @@ class Endpoint:
             return Reply(v=VERSION, id=request.id, ok=False, error=ErrorReply(error.code, error.message, error.hint))
 
     def _require_permitted(self, request: Request, waiting: Waiting) -> None:
+        """Raise RefusedError where the peer's key lacks the role for a request; count it as dropped.
+
+        Also raise it where a `stop` or `disable` came later and was carried out before. Questions are never overtaken.
+        """
         is_observed, key = request.command in OBSERVED, waiting.peer.key
         if key and not self.admission.has_role(key, MAY["control"] if is_observed else OPERATOR):
             self._drops.add("control", waiting.peer, NOT_ALLOWED)
@@ -297,6 +322,7 @@ class Endpoint:
             )
 
     def _reply(self, waiting: Waiting, reply: Reply) -> None:
+        """Send the reply to the client that asked; drop it where the client has gone."""
         self.arrivals.touch(self._control)
         # a client that has gone meanwhile is not our business
         with contextlib.suppress(zmq.ZMQError):
@@ -304,9 +330,9 @@ class Endpoint:
 
 
 def context(io_priority: int) -> "zmq.Context[zmq.Socket[bytes]]":
-    """A ZeroMQ context whose threads run at this priority of SCHED_FIFO; 0 for an ordinary one.
+    """Return a ZeroMQ context whose threads run at this priority of SCHED_FIFO; 0: at none, as ordinary threads.
 
-    A priority that is refused ends the process: see `realtime.priority_of_threads`.
+    A refused priority ends the process when the first socket is made: see `realtime.priority_of_threads`.
     """
     made = zmq.Context()
     if io_priority:

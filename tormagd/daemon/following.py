@@ -26,10 +26,17 @@ NOT_FOLLOWED: Final = HOLDING | {Limit.TAKEOVER}
 
 
 class Following:
-    """Takes ticks at an even spacing; remembers the forces asked for in the last MOST_DELAY_S, and a sum for each."""
+    """Measures how well the force is followed: RMS error, and the delay that explains most of it.
+
+    Takes ticks `period_s` apart. Keeps the forces asked for in the last MOST_DELAY_S, and a sum of squared errors for
+    each delay.
+    """
 
     def __init__(self, period_s: float, tolerance_N: float) -> None:
-        """`tolerance_N` is the scene's: so near, the first force of a setpoint has arrived."""
+        """Begin without figures. `tolerance_N` is the scene's RMS tolerance.
+
+        Errors count only after the measured force has first come this near to what was asked.
+        """
         self._period_s, self._tolerance_N = period_s, tolerance_N
         self._kept = math.exp(-period_s / FORGETS_S)
         count = round(MOST_DELAY_S / period_s) + 1
@@ -39,7 +46,11 @@ class Following:
         self._rate_mm_s = self._turned_mm = 0.0
 
     def look(self, tick: TickRecord) -> None:
-        """One more moment."""
+        """Take one tick, and add its error for each delay where it counts.
+
+        It counts ENABLED, with a sliding handle, a measured force, and none of the limits NOT_FOLLOWED. What was added
+        before fades by a factor e in FORGETS_S.
+        """
         asked_N, measured_N, kept = tick.setpoint_cf, tick.measured_cf, self._kept
         self._weight *= kept
         self._squares = [kept * known for known in self._squares]
@@ -61,7 +72,10 @@ class Following:
             ]
 
     def _slides(self, rate_mm_s: float | None, place_mm: float | None) -> bool:
-        """Whether the handle does so in one way for SLID_MM; so does one that is not measured."""
+        """Tell whether the handle has slid SLID_MM since it last turned or was slower than about SLIDES_MM_S.
+
+        True for a handle that is not measured. Remembers where it turned.
+        """
         if rate_mm_s is None or place_mm is None:
             return True
         if rate_mm_s * self._rate_mm_s < SLIDES_MM_S**2:
@@ -70,7 +84,10 @@ class Following:
         return abs(place_mm - self._turned_mm) >= SLID_MM
 
     def report(self) -> FollowingReport | None:
-        """The figures of the last seconds in which it was followed; None until there were enough."""
+        """Return the RMS error, N, the RMS error without the best delay, N, and that delay, ms.
+
+        None where fewer ticks count than fill LEAST_S: at first, and some seconds after the last one that counted.
+        """
         if self._weight * self._period_s < LEAST_S:
             return None
         least = min(self._squares)

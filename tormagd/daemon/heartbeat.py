@@ -15,7 +15,10 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Heartbeat:
-    """A periodic CLOCK_MONOTONIC timer. Missed beats are merged by the kernel and counted here."""
+    """A periodic timer of the kernel on CLOCK_MONOTONIC (timerfd), which the event loop watches.
+
+    Raises OSError where the kernel gives none.
+    """
 
     def __init__(self, period_ns: int) -> None:
         self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
@@ -33,7 +36,10 @@ class Heartbeat:
         return self._fd
 
     def beats(self) -> int:
-        """Beats since the last call: 0 if none is due, more than 1 if some were merged."""
+        """Return the number of beats due since the last call: 0 if none is, more than 1 if some were missed.
+
+        Sets `due_ns` to when the newest was due. Never waits.
+        """
         try:
             expirations: int = struct.unpack("=Q", os.read(self._fd, 8))[0]
         except BlockingIOError:
@@ -42,5 +48,5 @@ class Heartbeat:
         return expirations
 
     def close(self) -> None:
-        """Gives the timer back."""
+        """Close the timer's descriptor."""
         os.close(self._fd)

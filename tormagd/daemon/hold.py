@@ -7,8 +7,11 @@ from typing import NamedTuple
 
 
 class Hold(NamedTuple):
-    """The source that holds the brake; "" before the first. `number` grows with every change of the publisher behind
-    it, so that the force goes from one to the other along a ramp. With `is_given`, an operator has chosen it."""
+    """Which source holds the brake; "" before the first.
+
+    `number` grows with every change of the publisher, also of the process behind one source. The force then goes from
+    one to the other along a ramp. `is_given` says that an operator has chosen the source.
+    """
 
     source: str = ""
     number: int = 0
@@ -16,7 +19,11 @@ class Hold(NamedTuple):
 
 
 def is_passed(hold: Hold, source: str, priority: tuple[str, ...], *, is_stale: bool) -> bool:
-    """Whether a message of another source makes it the holder. `is_stale`: the holder's newest setpoint is too old."""
+    """Tell whether a message of `source`, which does not hold the brake, makes it the holder.
+
+    It does where the holder's newest setpoint is too old (`is_stale`). It also does where `source` comes before the
+    holder in `priority`, unless an operator has chosen the holder. Sources that are not listed come last.
+    """
     # an operator's choice goes before the configured order, and what is not listed comes after all that is
     ranks = {name: place for place, name in enumerate(priority)}
     goes_before = ranks.get(source, len(ranks)) < ranks.get(hold.source, len(ranks))

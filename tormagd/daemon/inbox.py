@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 
 class _Source:
-    """What is known of one publisher."""
+    """One publisher: its newest setpoint, sequence, clock, unit of stamps, manner of sending, and counts."""
 
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
         self.setpoint, self.heard_s = setpoint, now_s
@@ -61,7 +61,10 @@ class _Source:
         self.refresh(now_s)
 
     def refresh(self, now_s: float) -> bool:
-        """Makes the figures anew; True if there is something wrong with the clock that was not named before."""
+        """Update the reported figures: delays, the clock's line, and what is wrong with clock or stamps.
+
+        Returns True if something is wrong that was right at the last call.
+        """
         self.delays.refresh()
         self.fit = self.clock.line.fit()
         self.cause, self.remedy = _of_clock(self.clock, self.fit, now_s, self.setpoint.stamp_ns)
@@ -74,6 +77,10 @@ class _Source:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, needs: Needs) -> None:
+        """Make `setpoint` the source's newest, and add its delay to the statistics.
+
+        `delay_s` is its age on arrival by the corrected clock; below 0 counts as 0.
+        """
         clock = self.clock
         if clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
@@ -86,9 +93,9 @@ class _Source:
 
 
 class SetpointInbox:
-    """Chooses among what the publishers sent: the newest valid setpoint of the source that holds the brake.
+    """Chooses the setpoint to plan for: the newest valid one of the source that holds the brake.
 
-    No sockets, no clock. `priority` names sources, the one that goes before all others first.
+    No sockets, no clock. `priority` lists sources, the foremost first.
     """
 
     def __init__(self, priority: tuple[str, ...] = ()) -> None:
@@ -112,7 +119,11 @@ class SetpointInbox:
         self._turn = 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
-        """Takes one message; True if it became the newest setpoint. `now_s` is the control clock."""
+        """Decode and judge one message; return True if it became the newest setpoint.
+
+        A message that is refused is counted, and `last_refusal` says why; nothing is raised. `now_s` is the control
+        clock, `realtime_ns` CLOCK_REALTIME of the same moment.
+        """
         try:
             setpoint = decode(data, Setpoint)
             if not self.has_way:
@@ -123,7 +134,11 @@ class SetpointInbox:
             return False
 
     def give(self, name: str, now_s: float) -> None:
-        """Gives the brake to a source on purpose. Raises RefusedError where it has sent nothing that is still valid."""
+        """Make the source `name` the holder of the brake, as an operator's choice.
+
+        Its newest setpoint becomes the one to plan for, unless it is the holder already. Raises RefusedError for a
+        source that is not known, or whose newest setpoint is no longer valid.
+        """
         source = self._sources.get(name)
         if source is None:
             known = ", ".join(sorted(self._sources)) or "none"
@@ -139,36 +154,46 @@ class SetpointInbox:
         self.newest = self._timed(source, now_s)
 
     def newest_is(self) -> tuple[str, int]:
-        """Source and number of `newest`, which there has to be."""
+        """Return source and `seq` of the newest setpoint. Call only while `newest` is not None."""
         return self.hold.source, self._sources[self.hold.source].setpoint.seq
 
     def passed_over(self) -> tuple[str, int] | None:
-        """The same of what was refused last, because another source holds the brake; None where nothing was."""
+        """Return source and newest `seq` of the source last refused because another one holds the brake.
+
+        None where none was refused, and where it has got the brake since or is forgotten.
+        """
         other = self._sources.get(self._other)
         return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
 
     def begin_scene(self, scene: Scene) -> None:
-        """Judges by what this scene needs, and forgets the newest setpoint: it was meant for another one."""
+        """Judge by the needs of `scene` from now on, and forget the newest setpoint.
+
+        In a scene whose element is a pad, setpoints with `withdraw_cf` or `contact` are refused.
+        """
         self.newest, self.has_way, self._needs = None, scene.element == "torque", needs_of(scene)
 
     def withdraw(self, reason: str) -> None:
-        """Forgets the newest setpoint: nothing can be planned for it. It counts as refused, too."""
+        """Forget the newest setpoint and count it as refused for `reason`; without one do nothing."""
         if self.newest is not None:
             self.newest = None
             self._refuse(reason)
 
     def _refuse(self, reason: str) -> None:
+        """Count a refused message, and keep the beginning of `reason`."""
         self.refused += 1
         self.last_refusal = reason[:LONGEST_REFUSAL]
 
     def tell(self, now_s: float) -> None:
-        """Says in the log who holds the brake now, whose clock is wrong: a line in NEWS_S at most."""
+        """Log one waiting line, of a new holder or of a wrong clock; at most one in NEWS_S."""
         if self._news and now_s - self._told_s >= NEWS_S:
             self._told_s = now_s
             log.warning("%s", self._news.popleft())
 
     def told(self, now_s: float) -> dict[Limit, Explanation]:
-        """What is known now of the limits that are about sources."""
+        """Return explanations of the limits about sources, as things are now, in force or not.
+
+        Empty while no source holds the brake.
+        """
         holder = self._sources.get(self.hold.source)
         if holder is None:
             return {}
@@ -176,7 +201,7 @@ class SetpointInbox:
         return why | holder.manner.found
 
     def refresh(self, now_s: float) -> None:
-        """Makes the figures of one source anew, for `report`: of each in turn."""
+        """Update the reported figures of one source, each in turn, and queue a log line if its clock is newly wrong."""
         if self._sources:
             self._turn += 1
             source = tuple(self._sources.values())[self._turn % len(self._sources)]
@@ -184,7 +209,7 @@ class SetpointInbox:
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
     def report(self, now_s: float) -> SetpointReport:
-        """Counters, the last refusal, and each source with its newest sequence number; the newest ones in full."""
+        """Return counts, the last refusal, and each source's `seq`; in full for the holder and the newest others."""
         newest = sorted(self._sources, key=lambda name: (name != self.hold.source, -self._sources[name].heard_s))
         return SetpointReport(
             accepted=self.accepted,
@@ -198,6 +223,12 @@ class SetpointInbox:
         )
 
     def _judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> bool:
+        """Judge a decoded setpoint; return True if it became the newest.
+
+        A stray of its sequence is dropped and counted. A setpoint of a source that may not take the brake is refused
+        and counted. Raises MessageError for one source too many, for stamps that do not count ns, and for a stamp too
+        far ahead.
+        """
         source, order = self._sources.get(setpoint.source), Order.NEWER
         if source is None:
             self._make_room(setpoint.source, now_s)
@@ -236,6 +267,7 @@ class SetpointInbox:
         return True
 
     def _pass(self, name: str, why: str, *, is_given: bool = False) -> None:
+        """Make the source `name` the holder, and queue a log line that says `why`, unless it is the first."""
         if self.hold.source:
             self._news.append(f"source {name!r} holds the brake instead of {self.hold.source!r}: {why}")
         # of the first ever, there is nobody to take over from
@@ -244,7 +276,10 @@ class SetpointInbox:
             self._other_s = -SILENT_S
 
     def _timed(self, source: _Source, now_s: float) -> TimedSetpoint:
-        """The source's newest setpoint, on the control clock, which no setting of the time moves."""
+        """Return the source's newest setpoint, stamped on the control clock, for the planner.
+
+        Its limits say whether another source sends too, and what is wrong with how its own setpoints come.
+        """
         setpoint = source.setpoint
         wall = setpoint.contact
         is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
@@ -264,6 +299,11 @@ class SetpointInbox:
         )
 
     def _make_room(self, name: str, now_s: float) -> None:
+        """Forget a source where SOURCES are kept, so that `name` can be added. Raises MessageError where none may go.
+
+        One that was silent for SILENT_S may go; for a `name` in `priority`, else one that is not listed. The holder
+        stays.
+        """
         if len(self._sources) < SOURCES:
             return
         others = [source for other, source in self._sources.items() if other != self.hold.source]
@@ -276,6 +316,7 @@ class SetpointInbox:
         del self._sources[oldest.setpoint.source]
 
     def _why_stale(self, holder: _Source, now_s: float) -> Explanation:
+        """Explain a stale setpoint: the holder has fallen silent, or its messages come late."""
         name, silent_ms = self.hold.source, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
@@ -292,6 +333,7 @@ class SetpointInbox:
         )
 
     def _why_other(self, holder: _Source, now_s: float) -> Explanation:
+        """Explain competing setpoints: two publishers of one name, or another source beside the holder."""
         if holder.sequence.is_doubled(now_s):
             return Explanation(
                 f"two publishers call themselves {self.hold.source!r}, or one repeats itself: one of them is followed",
@@ -303,6 +345,7 @@ class SetpointInbox:
         )
 
     def _source_report(self, name: str, now_s: float) -> SourceReport:
+        """Return the report on one known source, with the figures of its last `refresh`."""
         source = self._sources[name]
         clock, sequence = source.clock, source.sequence
         state = "holds" if name == self.hold.source else "refused"
@@ -326,13 +369,17 @@ class SetpointInbox:
 
 
 def _refuse_way(setpoint: Setpoint) -> None:
+    """Raise MessageError for a setpoint with `withdraw_cf` or `contact`: the element is a pad."""
     for name in ("withdraw_cf", "contact"):
         if getattr(setpoint, name) is not None:
             raise MessageError(f"{name}: allowed is servo_cf alone, as the scene's element is a pad")
 
 
 def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
-    """Raises MessageError where the source's stamps count in something else, or may."""
+    """Raise MessageError where the source's stamps do not count ns, or where this is not known yet.
+
+    Notes the stamp for this judgement, and that the source was heard at `now_s`.
+    """
     unit = source.unit
     unit.hear(now_s, setpoint.stamp_ns, realtime_ns)
     source.heard_s = now_s
@@ -346,7 +393,10 @@ def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: 
 
 
 def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: int) -> tuple[str, str]:
-    """What is wrong with a publisher's clock, and what to do; empty where nothing is."""
+    """Return what is wrong with a publisher's clock, and the remedy; two empty texts where nothing is.
+
+    `fit` is the clock's line, None without one. `stamp_ns` is its newest stamp.
+    """
     if not clock.is_settled:
         return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"
     causes = []

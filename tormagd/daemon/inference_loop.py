@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class InferenceLoop:
-    """Plans for the newest setpoint. `on_failure` hears of a plan that failed."""
+    """The inference loop: plans for the inbox's newest setpoint, and calls `on_failure` for a plan that failed."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class InferenceLoop:
         clock_ns: Callable[[], int] = time.monotonic_ns,
         beside: SearchProcess | None = None,
     ) -> None:
-        """`beside` is the search for the field where it is not part of the plans."""
+        """`beside` is the search that runs in a process of its own; None where plans search by themselves."""
         self.planner, self._inbox, self._clock_ns, self._journal = planner, inbox, clock_ns, journal
         self._on_failure, self._failure = on_failure, ""
         self.beside: Final = beside
@@ -43,18 +43,21 @@ class InferenceLoop:
         self._due_ns = 0
 
     def teach(self, learned: Learned) -> None:
-        """Plans from now on for a device of which this is known."""
+        """Replace what is known of the device by `learned`, and note it in the journal."""
         self._journal.taught(learned)
         self.planner.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """The operator says that the device has changed, or that its sensor is wrong."""
+        """Take the operator's word that the device has changed, or that its sensor is wrong; note it in the journal."""
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
-        """Plans if a setpoint has come (`is_asked`) or a plan is due. `measured` is what the last step measured,
-        `is_followed` whether it followed the plan."""
+        """Make a plan if a setpoint has come (`is_asked`) or if one is due; else do nothing.
+
+        `measured` is the last step's measurement, None while the device is silent. `is_followed` says whether that step
+        followed the plan. A plan that fails ends as `_begin_afresh` says; nothing is raised.
+        """
         period_ns = self.timing.period_ns
         # by when beats are due, not by when they begin: lateness takes nothing from the rate
         if not is_asked and beat.due_ns < self._due_ns:
@@ -67,7 +70,10 @@ class InferenceLoop:
         self._due_ns = period_ns + (self._due_ns if is_regular else beat.due_ns)
 
     def foresee(self, _beat: Beat) -> bool:
-        """Makes the forecast for the next plans; False where none was due."""
+        """Make the forecast for the next plans, if one is due; return False where none is.
+
+        A forecast that fails ends as a plan does, and returns True.
+        """
         try:
             is_made = self.planner.foresee()
         except PLAN_ERRORS as error:
@@ -78,6 +84,7 @@ class InferenceLoop:
         return is_made
 
     def _make_plan(self, now_s: float, measured: Measured | None, is_followed: bool) -> None:
+        """Take the search's newest answer, plan at `now_s`, and ask the search the next question."""
         setpoint, beside = self._inbox.newest, self.beside
         answer = None if beside is None else beside.answer()
         if answer is not None:
@@ -92,7 +99,10 @@ class InferenceLoop:
             beside.ask(self.planner.question)
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
-        """Goes on without what could not be planned for."""
+        """Reset the planner after a plan or forecast that failed, withdraw the newest setpoint, and call `on_failure`.
+
+        `error` is logged, unless its message is that of the last one.
+        """
         if str(error) != self._failure:  # the first failure is news, the same one again is not
             self._failure = str(error)
             log.error("no gap could be planned for %s", self._inbox.newest, exc_info=error)

@@ -14,24 +14,33 @@ PEERS = 16
 
 
 class Listeners:
-    """Counts the subscriptions to each topic by its name."""
+    """Counts who subscribes to each of TOPICS by its name.
+
+    A peer that subscribes to everything is not counted: a topic is published for it only while another asks for it.
+    """
 
     def __init__(self) -> None:
         self._asked: dict[bytes, Counter[Peer | None]] = {topic: Counter() for topic in TOPICS}
         self._gone = dict.fromkeys(TOPICS, 0)
 
     def has(self, topic: bytes) -> bool:
-        """Whether somebody listens to it."""
+        """Tell whether a peer subscribes to `topic`."""
         return bool(self._asked[topic])
 
     def hear(self, word: bytes, peer: Peer | None) -> None:
-        """Takes what XPUB tells: 1 or 0, and what is subscribed to, or not any more. `peer` is None where libzmq says
-        it of one that has gone."""
+        """Count what a subscriber says to an XPUB socket: byte 1 to subscribe or 0 to end, then the topic's name.
+
+        `peer` is None where libzmq ends the subscription of a peer that has gone. Other topics are passed over.
+        """
         for topic in TOPICS:
             if word[1:] == topic:
                 self._count(topic, self._asked[topic], peer, is_subscription=word[0] == 1)
 
     def _count(self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
+        """Count one subscription to `topic`, or its end. Peers beyond PEERS are counted together.
+
+        It is not known whose subscription libzmq ends. So a topic has no listener once as many are gone as are counted.
+        """
         if peer not in asked and (len(asked) >= PEERS or not is_subscription):
             peer = None if peer is None else Peer(OTHERS)
         if is_subscription:

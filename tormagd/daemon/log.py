@@ -8,7 +8,8 @@ from tormagd_client.printable import printable
 
 
 def log_to_stderr() -> None:
-    """From here on whatever is logged is one line there, with its time on a terminal: the journal has its own."""
+    """Send the log of this process to stderr, a line a record; with the time only on a terminal, as a journal has its
+    own."""
     handler = logging.StreamHandler(sys.stderr)
     time_first = "%(asctime)s " if sys.stderr is not None and sys.stderr.isatty() else ""
     handler.setFormatter(LogFormatter(f"{time_first}%(levelname)s %(name)s: %(message)s"))
@@ -16,12 +17,12 @@ def log_to_stderr() -> None:
 
 
 class LogFormatter(logging.Formatter):
-    """One line for each record, whatever stands in it; a traceback keeps its lines."""
+    """Formats each record as one line, with unprintable characters escaped; a traceback keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """The record's line."""
+        """Return the record's line, unprintable characters escaped."""
         return printable(super().formatMessage(record))
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line and the traceback."""
+        """Return the record's line and its traceback, if any, unprintable characters escaped."""
         return escaped(super().format(record))

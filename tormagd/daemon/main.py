@@ -18,7 +18,7 @@ SIGHUP reads keys and configuration again."""
 
 
 def parser() -> Parser:
-    """What `tormagd` understands; its man page is made from it, too."""
+    """Return the parser of `tormagd`'s command line; its man page is made from it, too."""
     made = Parser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
     made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
     made.add_argument("--scene", metavar="NAME", help="this scene, or scene file, in place of the configuration's")
@@ -28,7 +28,11 @@ def parser() -> Parser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the daemon; returns the exit code: 0 ended on request, 1 could not run, 2 configuration refused."""
+    """Run `tormagd` with `arguments`, None: those of the process; return the exit code.
+
+    0: ended on request; 1: could not run; 2: command line or configuration refused. Errors go to stderr, as does the
+    log.
+    """
     write_in_any_encoding()
     try:
         options = parser().parse_args(arguments)

@@ -21,24 +21,29 @@ log = logging.getLogger(__name__)
 
 
 def state_folder(configured: str, name: str) -> Path | None:
-    """The folder that is configured, or else the one of that name in which the service may keep things; None where
-    there is neither."""
+    """Return the folder `configured`, or else `name` in the service's $STATE_DIRECTORY; None without either.
+
+    The folder need not exist.
+    """
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(configured) if configured else Path(state, name) if state else None
 
 
 class ProfileFolder:
-    """The files of one scene's insert and model, one for each device."""
+    """The profile files of one scene's insert and model: one file for each device, by its serial number."""
 
     def __init__(self, folder: Path, insert: str, model: str, bounds: DeviceBounds) -> None:
         self.folder, self.insert, self.model, self._bounds = folder, insert, model, bounds
 
     def path(self, serial_number: int) -> Path:
-        """Where the profile of that device is."""
+        """Return the path of a device's profile."""
         return self.folder / f"{serial_number:08x}-{self.insert}.json"
 
     def read(self, serial_number: int) -> Profile | None:
-        """The profile of that device; None where there is none. Raises ProfileError saying why it cannot be used."""
+        """Read the profile of the device with this serial number, and return it; None where there is no file.
+
+        Raises ProfileError for a file that cannot be read or does not fit device, insert, model or bounds.
+        """
         path = self.path(serial_number)
         try:
             data = read_bounded(path, MAX_BYTES)
@@ -53,7 +58,10 @@ class ProfileFolder:
             raise ProfileError(f"{path}: {error}") from error
 
     def write(self, profile: Profile) -> None:
-        """Keeps it: the old one or the new one is there, whatever happens. Raises ProfileError."""
+        """Write `profile` to its device's file, by way of another file: the old one stays until the new one is whole.
+
+        Makes the folder where it is missing. Raises ProfileError where nothing could be written.
+        """
         path = self.path(profile.serial_number)
         try:
             self.folder.mkdir(mode=0o750, parents=True, exist_ok=True)
@@ -66,10 +74,9 @@ class ProfileFolder:
 
 
 class Profiles:
-    """Takes care that what a device shows of itself is known the next time, and of no other device.
+    """Keeps what each device has shown of itself, and teaches it when the device is connected again.
 
-    `believe` is what learns, `teach` puts something else in the place of what it has learned. Without a folder nothing
-    is kept.
+    `believe` holds what is learned, `teach` replaces it. A `folder` of None keeps nothing.
     """
 
     def __init__(self, folder: ProfileFolder | None, believe: Believe, teach: Callable[[Learned], None]) -> None:
@@ -85,7 +92,11 @@ class Profiles:
         self._refusal = "" if folder is not None else "no folder is named for profiles"
 
     def look(self, serial_number: int | None, is_driven: bool) -> None:
-        """Once a telemetry period: which device there is, and whether it is driven."""
+        """Note the connected device's serial number, None where it is not known, and whether it is driven.
+
+        A new device's profile begins to be read; what was learned of another device is dropped first. Once a device is
+        no longer driven, its profile is kept. A profile that the device contradicts counts as unused, and is logged.
+        """
         if serial_number is not None and serial_number != self._serial_number:
             if self._serial_number is not None:
                 self._teach(NOTHING_LEARNED)  # that was another device
@@ -104,9 +115,11 @@ class Profiles:
         self._was_driven = is_driven
 
     def keep(self) -> None:
-        """Keeps what has been learned, where anything has been and nothing is disputed.
+        """Begin to write what was learned as the device's profile, in another thread.
 
-        A profile that nothing was added to stays as it is: it does not get younger by being used."""
+        Does nothing without a folder or device, where nothing is new since the profile was read or written, and while
+        the sensor is disputed.
+        """
         learned, is_disputed = self._believe.learned(), self._believe.sensor.is_disputed
         is_news = learned.device is not UNSEEN and learned != self._on_disk
         if self._folder is None or self._serial_number is None or not is_news or is_disputed:
@@ -124,16 +137,16 @@ class Profiles:
         self._writing.add_done_callback(self._note)
 
     def close(self) -> None:
-        """Takes nothing any more that is still being read."""
+        """Drop a profile that is still being read."""
         self._serial_number = None
 
     async def finished(self) -> None:
-        """Waits until what is being kept is on the disk."""
+        """Wait until the profile that is being written is on the disk, or has failed."""
         if self._writing is not None:
             await asyncio.wait([self._writing])
 
     def report(self) -> ProfileReport:
-        """Whether the device's profile is used, how old it is, and why not."""
+        """Return whether a profile is used, its age, s (None without one), its folder, and why none is used."""
         return ProfileReport(
             is_used=self._is_used,
             age_s=None if self._saved_ns is None else round(max(0.0, (time.time_ns() - self._saved_ns) * 1e-9), 1),
@@ -142,6 +155,11 @@ class Profiles:
         )
 
     def _take(self, reading: "asyncio.Future[Profile | None]") -> None:
+        """Teach the profile that was read, and note its digest.
+
+        It is dropped where it was refused, where another device is connected by now, or where this one has shown
+        itself. Without a file nothing happens.
+        """
         try:
             profile = reading.result()
         except ProfileError as error:
@@ -160,6 +178,7 @@ class Profiles:
         log.info("the device's profile of %.1f hours ago is used: scale %.3f", hours, profile.scale)
 
     def _note(self, writing: "asyncio.Future[None]") -> None:
+        """Note whether a profile was written; after a failure the next `keep` writes again."""
         try:
             writing.result()
         except ProfileError as error:

@@ -22,8 +22,11 @@ _BINS: Final = _EXACT + 32 * _DOUBLINGS
 
 @final
 class Histogram:
-    """Durations in microseconds, counted in bins. Adding costs a fraction of a microsecond, whatever has been added;
-    percentiles cost a hundred times that, and are those of the last `refresh`."""
+    """Counts durations, us, in bins, over one to two horizons (HORIZON_NS).
+
+    Adding costs a fraction of a microsecond, however many there are. Percentiles cost a hundred times that; `report`
+    has those of the last `refresh`.
+    """
 
     def __init__(self) -> None:
         self._now = [0] * _BINS
@@ -35,7 +38,7 @@ class Histogram:
         self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
-        """Counts one duration; a negative one (a clock's grain) counts as 0. Forgets those of two horizons ago."""
+        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0."""
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s
             self._before, self._now = self._now, [0] * _BINS
@@ -45,7 +48,7 @@ class Histogram:
             self._most_now = value_us
 
     def refresh(self) -> None:
-        """Makes `report` anew."""
+        """Compute `report` anew from what is counted."""
         most = round(max(self._most_now, self._most_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []
@@ -58,6 +61,7 @@ class Histogram:
 
 
 def _bin(value_us: float) -> int:
+    """Return the bin of a duration, us; what is longer than the last bin falls into that."""
     whole = int(value_us) if value_us > 0.0 else 0
     if whole < _EXACT:
         return whole
@@ -66,6 +70,7 @@ def _bin(value_us: float) -> int:
 
 
 def _upper_edge(index: int) -> int:
+    """Return the upper edge, us, of a bin."""
     if index < _EXACT:
         return index + 1
     shift, part = divmod(index - _EXACT, 32)
@@ -73,7 +78,7 @@ def _upper_edge(index: int) -> int:
 
 
 class _Mark(NamedTuple):
-    """The counters at a turn of the horizon."""
+    """The counts of a rate group at the beginning of a horizon."""
 
     time_ns: int
     runs: int
@@ -83,7 +88,7 @@ class _Mark(NamedTuple):
 
 @final
 class RateGroup:
-    """Timing of one periodic activity."""
+    """The timing of one periodic activity: counts, lateness and execution time of its runs."""
 
     def __init__(self, name: str, period_ns: int) -> None:
         self.name = name
@@ -104,7 +109,11 @@ class RateGroup:
         self._newest_ns = 0
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
-        """One run that was due, began and ended at these times, and stands for `merged` missed ones too."""
+        """Count one run that was due, began and ended at these times, and stands for `merged` missed ones, too.
+
+        It is an overrun if it ended more than WARNING_PERIODS after it, or the first missed one, was due. Beyond
+        ERROR_PERIODS it is also a stall.
+        """
         if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
             self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
         self.lateness_us = (start_ns - due_ns) * 1e-3
@@ -122,7 +131,11 @@ class RateGroup:
                 self.stalls += 1
 
     def report(self) -> RateReport:
-        """Counts since the start; rate, grade and percentiles over the horizon, the percentiles as last refreshed."""
+        """Return counts since the start, and rate, grade and percentiles over one to two horizons.
+
+        Percentiles are those of the last `refresh` of the histograms. The worst lateness is since the start, and 0 Hz
+        stands for fewer than two runs.
+        """
         since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"
         if self._newest_ns > since.time_ns:

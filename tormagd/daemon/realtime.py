@@ -19,10 +19,10 @@ log = logging.getLogger(__name__)
 
 
 def prepare(settings: RealTime) -> list[str]:
-    """Applies the settings to this thread and process; returns what was refused, in plain words.
+    """Ask the kernel for these settings, for this thread and process; return and log what it refused, a line each.
 
-    FIFO is set on this thread only and reset on fork, so that child processes and threads stay ordinary. Without it the
-    thread has short slices, and so have those that it begins.
+    FIFO is set on this thread only and reset on fork, so that child processes and threads stay ordinary. Without FIFO
+    this thread, and those that it begins, get short slices.
     """
     refused = []
     if settings.cpus:
@@ -50,9 +50,10 @@ def prepare(settings: RealTime) -> list[str]:
 
 
 def priority_of_threads() -> int:
-    """The FIFO priority that threads begun by this one may take: one below its own; 0 where it or they may have none.
+    """Return the FIFO priority that threads begun by this one may take: one below its own; 0 for none.
 
-    ZeroMQ's threads ask for it: a setpoint passes through one, and would wait there for whatever else the machine runs.
+    0 where this thread has no FIFO priority, or where the kernel refuses it; a refusal is logged. ZeroMQ's threads use
+    it: a setpoint passes through one, and would wait there for whatever else the machine runs.
     """
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0
@@ -68,6 +69,6 @@ def priority_of_threads() -> int:
 
 
 def freeze_garbage() -> None:
-    """Takes what lives now out of the collector's reach: a full collection takes tens of milliseconds."""
+    """Collect garbage, then exempt all living objects from collection: a full one takes tens of milliseconds."""
     gc.collect()
     gc.freeze()

@@ -12,7 +12,10 @@ LIVE = frozenset({"sources.priority", "realtime.watchdog_ms"})
 
 
 class Reread(NamedTuple):
-    """The configuration now in force, the keys that were taken over, and those that wait for a restart."""
+    """The configuration in force after a reload, the keys taken over, and the keys that wait for a restart.
+
+    Keys are paths, `a.b`.
+    """
 
     config: Config
     taken: tuple[str, ...]
@@ -20,7 +23,10 @@ class Reread(NamedTuple):
 
 
 def reread(running: Config, read: Config) -> Reread:
-    """The `running` configuration with what can change taken from the one that was `read`. Keys are paths, `a.b`."""
+    """Take what may change while control runs (LIVE) from `read` into `running`; return the result.
+
+    Neither configuration is changed. Every differing key is listed, as a path `a.b`.
+    """
     differing = tuple(_differing(msgspec.to_builtins(running), msgspec.to_builtins(read), ""))
     config = msgspec.structs.replace(
         running,
@@ -32,6 +38,7 @@ def reread(running: Config, read: Config) -> Reread:
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:
+    """Yield the paths of the keys whose values differ between two nested tables, sorted within each table."""
     for name in sorted(before.keys() | after.keys()):
         old, new = before.get(name), after.get(name)
         if isinstance(old, dict) and isinstance(new, dict):

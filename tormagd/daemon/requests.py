@@ -14,7 +14,10 @@ WAITING = 1_024
 
 
 class Waiting(NamedTuple):
-    """A request as it came, and who sent it. `opens` is how often the gap had been told to open by then."""
+    """A request as it came, still encoded, and the peer that sent it.
+
+    `envelope` leads back to the client. `opens` is how often the gap had been told to open before.
+    """
 
     envelope: list[bytes]
     data: bytes
@@ -23,7 +26,7 @@ class Waiting(NamedTuple):
 
 
 class Requests:
-    """The waiting requests. No sockets, no clock."""
+    """The requests that wait for an answer; clients take turns. No sockets, no clock."""
 
     def __init__(self) -> None:
         self._waiting: dict[bytes, deque[Waiting]] = {}
@@ -33,7 +36,7 @@ class Requests:
         "How often the gap has been told to open."
 
     def put(self, waiting: Waiting) -> bool:
-        """Lets a request wait for its client's turn; False where too many wait."""
+        """Add a request behind its client's others; return False, with nothing added, where too many wait."""
         client = waiting.envelope[0]
         if self.count >= WAITING or len(self._waiting.get(client, ())) >= WAITING_PER_CLIENT:
             return False
@@ -42,7 +45,7 @@ class Requests:
         return True
 
     def next(self) -> Waiting | None:
-        """The one whose turn it is: one of each client, then the next of each."""
+        """Remove and return the next request; None where none waits. Each client with requests has one turn a round."""
         for client, of_client in self._waiting.items():
             taken = of_client.popleft()
             del self._waiting[client]
@@ -54,5 +57,8 @@ class Requests:
 
 
 def may_go_first(data: bytes) -> bool:
-    """Whether this may be one of FIRST: a msgpack string holds its characters as they are, however it is packed."""
+    """Tell whether an encoded request may be a `stop` or `disable`: whether either word is anywhere in its bytes.
+
+    msgpack keeps a text's bytes as they are, so no such command is missed.
+    """
     return any(sign in data for sign in _SIGNS)

@@ -15,8 +15,11 @@ log = logging.getLogger(__name__)
 
 
 class SceneChange:
-    """The changes, one after the other. `build` makes a scene's core and raises ConfigError; `require` raises
-    RefusedError where the device is in use; `take` goes on with the core."""
+    """Changes the running scene, one change at a time.
+
+    `build` makes the core of a scene and raises ConfigError. `require` raises RefusedError where the device is in use.
+    `take` puts the core in the place of the running one.
+    """
 
     def __init__(
         self, build: Callable[[str], Awaitable[Core]], require: Callable[[], None], take: Callable[[str, Core], None]
@@ -27,7 +30,10 @@ class SceneChange:
         self._changing: asyncio.Task[None] | None = None
 
     def begin(self, scene: object) -> None:
-        """Begin to change to `scene`, a name or a path. Raises RefusedError."""
+        """Begin to change to `scene`, a name or a path, in a task of its own; `newest` says how it ends.
+
+        Raises RefusedError for what is no such text, while another change goes on, and where the device is in use.
+        """
         if not isinstance(scene, str) or not 0 < len(scene) <= LONGEST_NAME:
             raise RefusedError(
                 "bad_scene", f"args.scene is no text of 1..{LONGEST_NAME} characters", "tormagctl scene list"
@@ -41,6 +47,10 @@ class SceneChange:
         self._changing.add_done_callback(self._finish)
 
     async def _change(self, scene: str) -> None:
+        """Build the core and put it in place, if the device is still not in use; note and log how it ended.
+
+        A refusal leaves the running scene as it is.
+        """
         error = None
         try:
             core = await self._build(scene)
@@ -57,5 +67,6 @@ class SceneChange:
         self.newest = SceneReport(scene=scene, is_over=True, error=error)
 
     def _finish(self, changing: "asyncio.Task[None]") -> None:
+        """Allow the next change. Raises the exception of this one, if it ended unexpectedly."""
         self._changing = None
         changing.result()

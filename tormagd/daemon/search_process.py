@@ -25,7 +25,11 @@ log = logging.getLogger(__name__)
 
 
 class SearchProcess:
-    """The daemon's end. Raises ConfigError where the search does not start."""
+    """The daemon's end of the process that searches for the field of `core`.
+
+    Waits for the process to be ready, STARTS_S at most. Raises ConfigError where it is not by then, OSError where it
+    does not start.
+    """
 
     def __init__(self, core: Core) -> None:
         self.timing = RateGroup("search", 1_000_000_000 // core.config.rates.inference_hz)
@@ -38,7 +42,10 @@ class SearchProcess:
             raise ConfigError(f"solver.name = {core.solver.solver!r}: its process did not start within {STARTS_S:g} s")
 
     def answer(self) -> Answer | None:
-        """What it found, if it has since the last time. Never waits."""
+        """Return the answer that has come since the last call; None where none has. Never waits.
+
+        A search that found no field is logged, and gives None, too.
+        """
         data = None if self._is_idle else self._beside.receive()
         if data is None:
             return None
@@ -51,8 +58,10 @@ class SearchProcess:
         return None
 
     def ask(self, question: Question | None) -> None:
-        """Asks, unless a question is open or the next is not due yet. Plans fail as soon as the last answer is too old:
-        that the search has ended is said once."""
+        """Send `question` to the search, unless it is None, another is open, or the next is not due yet. Never waits.
+
+        A search process that has ended is logged once; plans fail once the last answer is too old.
+        """
         if self._beside.is_gone and not self._is_told:
             self._is_told = True
             log.error("the search beside the plans has ended; restart the daemon")
@@ -66,14 +75,18 @@ class SearchProcess:
         self._is_idle = not self._beside.send(pickle.dumps(question))
 
     def close(self) -> None:
-        """Ends the process."""
+        """Close the socket, kill the process and wait for its end."""
         self._beside.close()
         self._beside.process.kill()
         self._beside.process.wait()
 
 
 def main() -> None:
-    """Answers until the daemon is gone."""
+    """Answer questions that come in over a socket until its other end is closed.
+
+    The socket's descriptor is the first argument. The first packet holds what the core is built from. An answer is a
+    pickled Answer, or the ValueError of a search that found no field.
+    """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service's whole group gets it; the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:
         config, scene, models = pickle.loads(asked.recv(MOST_PACKET))

@@ -16,7 +16,7 @@ STRAYS_S = 1.0
 
 
 class Order(Enum):
-    """What a message is to those before it."""
+    """How a message stands to those taken before it."""
 
     NEWER = "newer"
     RESTARTED = "restarted"
@@ -29,7 +29,7 @@ class Order(Enum):
 
 @final
 class Sequence:
-    """The run of `seq` that is followed, in its `session`; None where the publisher has none."""
+    """Follows a publisher's count `seq` through restarts. `session` is None where the publisher states none."""
 
     def __init__(self, session: int | None, seq: int) -> None:
         self.session, self.seq = session, seq
@@ -43,7 +43,12 @@ class Sequence:
         self._strays, self._strays_since_s = 0, 0.0
 
     def order(self, now_s: float, session: int | None, seq: int, *, is_over: bool) -> Order:
-        """Takes one message, unless it is a stray. `is_over`: what was taken last is not valid any more."""
+        """Judge one message by its numbers, and follow it unless it is a stray.
+
+        A `seq` above the newest is NEWER, unless it leaps; a `session` above all before is RESTARTED. RUN messages in a
+        row that fit neither are a run of their own: REPLACED. After `is_over`, when the newest message taken is no
+        longer valid, the first that is no repetition is enough. Counts lost messages, restarts and strays.
+        """
         if session == self.session and seq > self.seq:
             step = seq - self.seq
             known = self._step
@@ -69,10 +74,11 @@ class Sequence:
         return Order.STRAY
 
     def is_doubled(self, now_s: float) -> bool:
-        """Whether two publishers seem to send under this name at once."""
+        """Tell whether two publishers seem to use this name at once: RUN strays or more within STRAYS_S."""
         return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
 
     def _begin(self, session: int | None, seq: int, order: Order) -> Order:
+        """Follow a new run from this message, count a restart, and return `order`."""
         self.session, self.seq, self._step = session, seq, 0
         self._in_row = self._strays = 0
         self.restarts += 1

@@ -15,7 +15,7 @@ _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
 
 
 class Service:
-    """The service as systemd knows it. No socket, no clock: `notify` sends what this says."""
+    """What systemd is to be told of the daemon: ready, status, alive. No socket, no clock: `notify` sends it."""
 
     def __init__(self) -> None:
         self.is_ready = False
@@ -27,11 +27,11 @@ class Service:
     def is_alive(
         self, now_s: float, limit_s: float, planned_s: float | None, link: LinkState, received_s: float | None
     ) -> bool:
-        """Whether plans and what the device says are fresh. `planned_s` and `received_s`: when the newest of
-        each came; `limit_s`: how old they may be.
+        """Tell whether plans and device states are fresh, so that systemd's watchdog may be fed.
 
-        A device that was identified and says nothing any more while its port is open counts as silent, however often
-        it is asked again; one that answers, if only that its firmware does not fit, does not.
+        `planned_s` and `received_s` are the times of the newest plan and state, None before the first; `limit_s` is how
+        old they may be. A device that was identified and has fallen silent while its port is open counts as not fresh.
+        A port that is not open, a device not yet identified, or one whose firmware was refused does not.
         """
         if planned_s is None or now_s - planned_s > limit_s:
             return False
@@ -42,7 +42,10 @@ class Service:
         return now_s - self._heard_s < limit_s
 
     def news(self, now_s: float, is_alive: bool, link: LinkState, status: str) -> list[str]:
-        """The messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives."""
+        """Return the messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives.
+
+        Before READY, a daemon that lives also asks for EXTENSION_S more to start, once in REPEAT_S.
+        """
         messages = []
         if not self.is_ready and link is LinkState.RUNNING:
             self.is_ready = True
@@ -61,7 +64,10 @@ class Service:
 def status_line(
     link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
 ) -> str:
-    """One line for `systemctl status`: how the device stands, or why there is none and what to do about it."""
+    """Return one line for `systemctl status`: state, faults or scene, and the next command.
+
+    While the link does not run, it says why (`cause`) and what to do (`remedy`) instead.
+    """
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:
         # what is wrong may come from the device or the kernel: it must not become lines of its own
@@ -73,10 +79,10 @@ def status_line(
 
 
 def notify(message: str) -> bool:
-    """Sends `message`, lines of `NAME=value`, to the service manager, as sd_notify(3) does; False where there is none,
-    or it does not listen.
+    """Send `message`, lines of `NAME=value`, to the service manager, as sd_notify(3) does. Never waits.
 
-    A NOTIFY_SOCKET that begins with `@` is an abstract socket. Never blocks.
+    Returns False where there is no service manager ($NOTIFY_SOCKET is not set), or where it does not take the message.
+    A name that begins with `@` is an abstract socket.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
