@@ -46,41 +46,44 @@ Bounds = tuple[float, float]
 
 @final
 class Governor:
-    """The stage that turns the setpoints of one publisher after another into forces to render."""
+    """The stage that turns setpoints, of one publisher after another, into the forces to render."""
 
     time_s: float
-    "Of the newest plan."
+    "Time of the newest plan."
     asked_N: float
-    "What it asked of the device,"
+    "Force that the newest plan asked of the device."
     above_N: float
-    "and by how much that was above the least that the device then seemed to make."
+    "By how much `asked_N` was above the least force of the device, as it was known then."
     stamp_s: float
-    "Of the setpoint that the force follows; -inf where it follows none."
+    "Stamp of the setpoint that the force follows; -inf where it follows none."
     slope_N_s: float
-    "Of the setpoints, filtered."
+    "Slope of the setpoints, filtered."
     last_N: float
     "The newest setpoint's force, within what the scene allows."
     holder: int
-    "Whose setpoints it followed last."
+    "Number of the publisher whose setpoint was followed last; 0 for the first one, and before it."
     is_passing: bool
-    "The force is on its way to those of its holder, along the ramp."
+    "Whether the force is on the ramp to the forces of its holder."
     sent_N: float | None
-    "Where the carriages were sent, as a force; None where it is not known what comes."
+    "Force of the gap that the carriages were sent to; None where nothing is known ahead."
     expected_N: float | None
-    "The force by now along the path of a preview or to a wall, behind the carriages' lag."
+    "Force that the lagging gap should give by now on its path; None where it follows no path."
     law_N: float | None
-    "What was asked for at `law_mm` by a wall, or on the way from one; None where neither is."
+    "Force asked for at the place `law_mm` by a wall, or on the ramp from one; None without either."
     law_mm: float
     blend_N: float
-    "What is left of the difference to another wall, or to none."
+    "What is left of the ramp from one wall to another, or to none; 0 off the ramp."
     was_pushing: bool
-    "The handle, at the last plan."
+    "Whether the handle pushed at the last plan."
 
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
     ) -> None:
-        """Begin with the gap open. `force` is the scene's, `gap_speed_mm_s` the gap's greatest, `terms` what is in
-        use."""
+        """Begin at `now_s` with the gap open and no publisher.
+
+        `force` is the scene's, `gap_speed_mm_s` the gap's top speed. Of `terms`, only whether the forecast is in use
+        counts.
+        """
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._path: Final = Path(portrait, gap_speed_mm_s)
@@ -92,7 +95,7 @@ class Governor:
         self.begin(now_s)
 
     def begin(self, now_s: float) -> None:
-        """Begin at `now_s` with the gap open and no publisher."""
+        """Forget all setpoints, and begin at `now_s` with the gap open and no publisher."""
         self.time_s, self.asked_N, self.above_N = now_s, self._portrait.min_N, 0.0
         self.holder, self.is_passing = 0, False
         self._forget()
@@ -106,13 +109,16 @@ class Governor:
         travel: Travel = AT_REST,
         held_N: float | None = None,
     ) -> Ask:
-        """Return what is asked of `device` at `now_s`.
+        """Return the force to render now and those ahead, N, with the limits that hold them back.
 
-        `setpoint` is None without a publisher. `travel` is the handle's. `lag_s` is the carriages' lag: what is known
-        ahead is looked at this much further on. `held_N` is the force of a gap that follows no plan; None where it
-        does. A setpoint that jumps is followed at once, within the scene's and the device's bounds. At the scene's
-        release rate go: decay to F_min without a valid setpoint; the way to a publisher's forces, from another one's or
-        from a force that followed none; and what one wall asks for beside the next.
+        `setpoint` is None without a publisher. `device` is what is known of the device's strength, `travel` the
+        handle's motion. What is known ahead is looked at `lag_s` later, the carriages' lag. `held_N` is the force of a
+        gap that follows no plan; None where it follows plans.
+
+        A setpoint that jumps is followed at once, within the scene's and the device's bounds. Three things go at the
+        scene's release rate. Without a valid setpoint, the force decays to the device's least. A new publisher's
+        forces, and the first after none was followed, are reached along a ramp. So is another wall, or none, in the
+        place of a wall.
 
         Raises DomainError for a number that is not finite or beyond LARGEST, and for a preview without `preview_dt_s` >
         0.
@@ -168,11 +174,15 @@ class Governor:
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def foresee(self) -> bool:
-        """Make a forecast for the next plans, and return whether one was due: for the time between plans."""
+        """Make a forecast for the next plans, if one is due, and return whether it was. Call between plans."""
         return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def _hear(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
-        """Takes the setpoint's slope, and whose it is."""
+        """Update the setpoints' slope, newest force, stamp and holder.
+
+        A new holder begins a ramp, without slope or forecast. There is no slope after a pause above MAX_STEP_S, against
+        a wall, or without the term forecast. It is held to what the gap's speed gives at `force_N`.
+        """
         spacing_s = setpoint.stamp_s - self.stamp_s
         if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
             self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
@@ -186,7 +196,11 @@ class Governor:
         self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
 
     def _blended(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, dt_s: float) -> float:
-        """The force on the way from what another law asked for to `allowed_N`. Updates `blend_N`."""
+        """Return `allowed_N`, or a force on the ramp to it where another wall, or none, has replaced a wall.
+
+        The ramp goes at the release rate, besides what the handle's motion changes. A new holder and a handle that
+        withdraws have none. Updates `blend_N`, `law_N`, `law_mm` and `was_pushing`.
+        """
         wall, place_mm = setpoint.wall, travel.place_mm
         before_N = self.law_N
         if before_N is None and wall is not None and self.stamp_s != -math.inf and self.was_pushing:
@@ -213,7 +227,10 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """The forces at PATH_S of a handle that pushes against a wall. Updates `sent_N` and `expected_N`."""
+        """Return the forces (7) at PATH_S on the best path for a handle that pushes against `wall` at its present rate.
+
+        The gap closes early by at most EARLY_N over the force at each moment. Updates `sent_N` and `expected_N`.
+        """
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
         begins_s = lag_s + SPEEDING_UP_S
         wanted_N = [
@@ -225,7 +242,10 @@ class Governor:
         return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _foreseen(self, stamp_s: float, allowed_N: float, age_s: float) -> float:
-        """How far the forecast is trusted after this setpoint."""
+        """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1.
+
+        0 without the term forecast, and for a setpoint older than MAX_STEP_S.
+        """
         if not self._has_forecast:
             return 0.0
         self.forecast.update(stamp_s, allowed_N)
@@ -242,7 +262,11 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """The forces at PATH_S on the best path for a preview, which begins `soon_s` after the setpoint's stamp."""
+        """Return the forces (7) at PATH_S on the best path for a preview; now is `soon_s` after its stamp.
+
+        The forecast goes on from the end of a preview that is shorter than TIMES_S, and is forgotten for a longer one.
+        Updates `sent_N` and `expected_N`.
+        """
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
             self.slope_N_s = setpoint.preview_slope_N_s
@@ -263,8 +287,11 @@ class Governor:
         lag_s: float,
         most_N: list[float] | None = None,
     ) -> list[float]:
-        """The forces at PATH_S on the best path for `wanted_N`, none over `most_N`. Updates `sent_N` and
-        `expected_N`."""
+        """Return the forces (7) at PATH_S, within `bounds`, on the gap's best path for `wanted_N` at TIMES_S.
+
+        `most_N` are upper bounds at PATH_S; None: none. `force_N` is where the path begins during a ramp. Updates
+        `sent_N` and `expected_N`.
+        """
         from_N, sent_N = self._left_from(force_N)
         path_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, wanted_N, device, lag_s, most_N)
         # the path sets out sooner by as much as the carriages come later
@@ -284,7 +311,11 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """The forces at PATH_S along the slope of the setpoints, and so far as `foresight` goes as forecast."""
+        """Return the forces (7) at PATH_S along the setpoints' slope, or the forecast, weighted by `foresight`, 0..1.
+
+        Now is `soon_s` after the newest stamp. Where the gap gets there soon, the path is the best one for these
+        forces. Updates `sent_N` and `expected_N`.
+        """
         begins_s = soon_s + foresight * lag_s
         times_s = _FORECAST_S if foresight > 0.0 else PATH_S
         slope_N_s = self.slope_N_s
@@ -302,7 +333,10 @@ class Governor:
         return path_N[: len(PATH_S)]
 
     def _left_from(self, force_N: float) -> tuple[float, float]:
-        """The force at the last plan, and the one that the carriages were sent to then."""
+        """Return the force at the last plan, and the force that the carriages were sent to then.
+
+        During a ramp both are `force_N`: the ramp leads to what is asked.
+        """
         # what the ramp leads to is what is asked, not what the gap can make of it
         from_N = force_N if self.is_passing else self.asked_N
         return from_N, from_N if self.is_passing or self.sent_N is None else self.sent_N
@@ -310,8 +344,10 @@ class Governor:
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
     ) -> tuple[float, tuple[Limit, ...]]:
-        """Of what the scene allows, what the device gives: never over the scene's greatest, unless the open gap itself
-        makes more. Its limits are those of `asked_N`, too."""
+        """Return `allowed_N` held to what the device gives (F_MIN, F_MAX), with the limits in force.
+
+        `asked_N` adds RANGE where the scene does not allow it, and STANDBY where the scene waits at a greater force.
+        """
         limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._allowed[1] else (Limit.RANGE,)
         if asked_N < self._allowed[0] and self._least_N < self._allowed[0]:
             limits = (*limits, Limit.STANDBY)
@@ -322,6 +358,11 @@ class Governor:
         return allowed_N, limits
 
     def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
+        """Return a force that falls to `lowest_N` at the release rate, for no valid setpoint, and forget the last one.
+
+        The force above `lowest_N` never grows, even where a device is found to be weaker. The next setpoint is reached
+        along a ramp.
+        """
         # a device that is found to make less than was believed is not asked for more above its least than it was
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
         self.asked_N, self.above_N, self.is_passing = lowest_N + above_N, above_N, True
@@ -329,7 +370,7 @@ class Governor:
         return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, limits)
 
     def _forget(self) -> None:
-        """No setpoint is followed."""
+        """Forget the setpoint that was followed: its slope, wall, path and forecast."""
         self.stamp_s, self.slope_N_s, self.last_N = -math.inf, 0.0, 0.0
         self.sent_N, self.expected_N = None, None
         self.law_N, self.law_mm, self.blend_N, self.was_pushing = None, 0.0, 0.0, True
@@ -337,6 +378,10 @@ class Governor:
 
 
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
+    """Raise DomainError where a number of `setpoint` or its age is not finite or beyond LARGEST.
+
+    Also raise it for a preview whose `preview_dt_s` is not above 0.
+    """
     if not (
         -_LARGEST <= age_s <= _LARGEST
         and -_LARGEST <= setpoint.force_N <= _LARGEST
@@ -362,10 +407,10 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
 
 
 def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:
-    """Return the forces at TIMES_S from `begins_s` >= 0 after the stamp, as far as the preview goes, MIN_TIMES at
-    least.
+    """Return the forces of a preview, N, held to `bounds`, at the times TIMES_S from `begins_s` >= 0 after its stamp.
 
-    Past its end, a short preview goes on along its mean slope, mixed with a trusted forecast.
+    There are MIN_TIMES or more, as far as the preview goes. Past its end, forces go on along its mean slope for a
+    moment, mixed with a trusted forecast. Raises DomainError for a force beyond LARGEST.
     """
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
