@@ -18,35 +18,38 @@ from tormagd_client.printable import in_short
 MOST_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
 LONGEST_LINE = 8_192
-"Of a key with more parts than that the parser takes the square: a minute."
+"Characters in a line: the parser's time grows as the square of a key's parts, to a minute."
 MOST_GUESSES = 16
-"Lines that may give a key, of those that have its name in them: a file may be full of them."
+"Lines with a key's name that are tried for the one that gives it: a file may be full of them."
 MOST_LINES = 8
-"Of one value, to be told where it stands."
+"Lines of one value whose key's line is found."
 
 T = TypeVar("T")
 _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
 "The key, or the table, that a refusal of ours begins with."
 _PLACE = re.compile(r"`\$([^`]*)`")
-"The place that one of msgspec's ends with."
+"The place that a refusal of msgspec ends with."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
 GONE = {"neutral_margin_N": "; delete it: `enable` goes to any setpoint along a ramp now"}
 "Keys of earlier versions, and what to do about them."
 _NOTHING = object()
-"No value of a table: TOML's and JSON's may be None."
+"Stands for no value: a value of a table may be None."
 
 
 class TomlError(ValueError):
-    """A text that is refused: not TOML (with its line), nested too deeply, or with a number that nothing can be."""
+    """A text that is refused: not TOML (with its line), nested too deeply, too long a line, or an impossible number."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables in a file. Raises as `toml_text` and `toml_tables` do."""
+    """Read a TOML file and return its tables. Raises as `toml_text` and `toml_tables` do."""
     return toml_tables(toml_text(path))
 
 
 def toml_text(path: Path) -> str:
-    """What is in a file. Raises OSError, whose `strerror` says why it is not read, and TomlError."""
+    """Read a text file of at most MOST_BYTES, in UTF-8, and return its text.
+
+    Raises OSError, whose `strerror` says why it cannot be read, and TomlError for bytes that are not UTF-8.
+    """
     try:
         return read_bounded(path, MOST_BYTES).decode("utf-8-sig")  # editors on Windows put a mark before the first line
     except UnicodeDecodeError as error:
@@ -54,7 +57,10 @@ def toml_text(path: Path) -> str:
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """The tables in `text`, all numbers finite and of 64 bits. Raises TomlError."""
+    """Parse `text` as TOML and return its tables. Raises TomlError, also for what TOML allows.
+
+    Refused are lines beyond LONGEST_LINE, deep nesting, numbers that are not finite, and integers beyond 64 bits.
+    """
     import tomllib  # not above: who reads no file, as most commands of tormagctl, need not wait for it
 
     for number, line in enumerate(text.splitlines(), start=1):
@@ -77,12 +83,15 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def convert(path: Path, kind: type[T]) -> T:
-    """The file's tables as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
+    """Read a TOML file as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
     return convert_as(path, lambda _tables: kind)
 
 
 def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
-    """The file's tables as the kind that they say they are. Raises as `convert` does."""
+    """Read a TOML file as the kind that `kind_of` returns for its tables. Raises as `convert` does.
+
+    `kind_of` may raise ConfigError.
+    """
     try:
         text = toml_text(path)
         try:
@@ -97,13 +106,20 @@ def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
 
 
 def placed(path: Path | None, message: str) -> str:
-    """A refusal of what a file, which has been read, says: with its name and the line, where it names a key there."""
+    """Return `message`, a refusal of what the file at `path` says, with the file's name before it and the line after.
+
+    Only where it names a key that is in the file; otherwise, and where `path` is None, `message` itself. Reads the file
+    again, and raises as `toml_text` does.
+    """
     where = "" if path is None else _line(toml_text(path), message)
     return f"{path}: {message}{where}" if where else message
 
 
 def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
-    """The tables as a `kind`, whose root is at `where`. Raises ConfigError naming key, value and what is allowed."""
+    """Convert tables to a `kind`. Raises ConfigError naming key, value and what is allowed.
+
+    `where` is the path of these tables in the whole, as `$.a.b`, for the message.
+    """
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
@@ -115,13 +131,16 @@ def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
 
 
 def table_in(kind: Any) -> type[msgspec.Struct] | None:
-    """The table that a field of this type holds, optional or not; None where it is a plain value."""
+    """Return the struct, optional or not, that a field of type `kind` holds; None where it holds a plain value."""
     structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
     return next(structs, None)
 
 
 def _known_key(kind: Any, message: str) -> str:
-    """The known key that is nearest to an unknown one of msgspec's message."""
+    """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key of old.
+
+    Empty where no key is unknown, or where none of `kind` is near.
+    """
     if (unknown := _UNKNOWN.search(message)) is None or unknown[1] in GONE:
         return GONE[unknown[1]] if unknown else ""
     table = table_in(kind)
@@ -132,14 +151,17 @@ def _known_key(kind: Any, message: str) -> str:
 
 
 def _line(text: str, message: str) -> str:
-    """` (line N)` of the key that the message is about, or of the table it is missing in; nothing without either."""
+    """Return ` (line N)` of the key in a refusal, or of the nearest table above it that `text` gives; else nothing."""
     key = _key_in(message)
     lines = (line_of(text, key[:size]) for size in range(len(key), 0, -1))
     return next((f" (line {line})" for line in lines if line is not None), "")
 
 
 def _key_in(message: str) -> list[str]:
-    """The key that a refusal names: ours begin with it, msgspec's end with its place, and may name an unknown one."""
+    """Return the key that a refusal names, as its parts; empty where it names none.
+
+    Our own begin with it. Those of msgspec end with a place, and may name an unknown key in it.
+    """
     if ours := _OURS.match(message):
         return ours[1].split(".")
     place, unknown = _PLACE.search(message), _UNKNOWN.search(message)
@@ -148,9 +170,10 @@ def _key_in(message: str) -> list[str]:
 
 
 def _value_at(tables: dict[str, Any], message: str) -> str:
-    """` (it is VALUE)` for the `$.a.b` path msgspec puts at the end of its message; msgspec leaves the value out.
+    """Return ` (it is VALUE)` for the path `$.a.b` at the end of a message of msgspec, which leaves the value out.
 
-    An element of an array, `$.a[...]`, is not told from its neighbours, so the value is the array.
+    Empty without such a path, and for a table. An element of an array, `$.a[...]`, has no index there: the value is
+    then the array.
     """
     if "`$." not in message:
         return ""
@@ -159,17 +182,17 @@ def _value_at(tables: dict[str, Any], message: str) -> str:
 
 
 def _at(table: Any, key: Sequence[str]) -> Any:
-    """What `key`, a path through tables, leads to; _NOTHING where it leads nowhere."""
+    """Return what the path `key` leads to in nested tables; _NOTHING where it leads nowhere."""
     for name in key:
         table = table.get(name, _NOTHING) if isinstance(table, dict) else _NOTHING
     return table
 
 
 def line_of(text: str, key: Sequence[str]) -> int | None:
-    """The line of `text`, which is TOML, that gives `key`, a path through its tables; None where none of them does.
+    """Return the number of the line of `text`, which is TOML, that gives `key`, a path through its tables.
 
-    The parser keeps no lines. So it is asked after each that has the key's name in it: the first to make the key known
-    gives it. None, too, where that name stands in many lines before.
+    None where no line does, or where none of the first MOST_GUESSES lines that contain its name does. The parser keeps
+    no lines. So the text up to each of those lines is parsed, until the key is known.
     """
     lines = text.splitlines()
     guesses = (number for number, line in enumerate(lines, start=1) if key and key[-1] in line)
@@ -177,6 +200,7 @@ def line_of(text: str, key: Sequence[str]) -> int | None:
 
 
 def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
+    """Tell whether `key` is known after this line, or after up to MOST_LINES more that its value may go on in."""
     import tomllib
 
     for end in range(number, min(number + MOST_LINES, len(lines)) + 1):  # a value may go on in the lines below
@@ -188,6 +212,7 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
 
 
 def _require_numbers(value: Any, key: str) -> None:
+    """Raise TomlError for a number in `value`, however deep, that is not finite or not of 64 bits."""
     if isinstance(value, float) and not math.isfinite(value):
         raise TomlError(f"{key} = {value}: allowed is a finite number")
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
