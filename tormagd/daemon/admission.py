@@ -26,9 +26,9 @@ from tormagd_client.keys import fingerprint
 
 CONNECTIONS = 200
 CONNECTIONS_PER_PEER = 160
-"Of one endpoint, and of one address or process among them. More are cut off as soon as they are accepted."
+"Connections allowed to one endpoint, and to one address or process. More are cut off as soon as they are accepted."
 PEERS = 32
-"Refused peers that are told apart."
+"Refused peers that are counted apart."
 RECONNECT_S = 0.5
 "A peer that was cut off comes back within this time (libzmq's default is 0.1 s)."
 GUARDED = {
@@ -58,10 +58,10 @@ MAY: dict[str, frozenset[str]] = {
     "recording": frozenset({"observe", "operate"}),
     "control": frozenset({"observe", "operate"}),
 }
-"Which roles an endpoint is for. On `control` an observer may ask for the status only."
+"Roles that may use each endpoint. On `control` an observer may only ask for status and description."
 
 PLAIN = "no CURVE handshake"
-"It speaks without CURVE, leaves when it is asked for it, or says nothing: which of these is seen first varies."
+"The peer speaks no CURVE, leaves when asked for it, or says nothing: which of these is seen first varies."
 REASONS: dict[int, str] = {
     zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH: PLAIN,
     zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC: "another server's key",
@@ -82,11 +82,11 @@ class _Connections:
         self.turned_away: deque[str] = deque(maxlen=CONNECTIONS)
         "Addresses whose keys were refused, and whose connections are not closed yet."
         self.untold = 0
-        "So many of these libzmq has not turned away yet: whoever leaves in the handshake may be one of them."
+        "Peers of refused keys that libzmq has not rejected yet. One that leaves in the handshake may be one of them."
         self.taken_for_one: deque[str] = deque(maxlen=CONNECTIONS)
-        "Addresses of those that did, and that were taken for one of them."
+        "Addresses of peers that left in the handshake and were counted as one of these."
         self.failed: str | None = None
-        "Why the handshake failed of the connection that is closed next: libzmq closes it at once."
+        "Why the handshake failed of the connection that is closed next, as libzmq does at once; None: it did not fail."
         self.cut: set[int] = set()
 
     def told(self) -> str | None:
@@ -139,9 +139,9 @@ class Admission:
         self.allowed: Allowed = keys.allowed if keys else {}
         self.refusals = Tally(PEERS, "refused %d peers, the newest at %s", self.name)
         self.left: deque[tuple[str, float]] = deque(maxlen=64)
-        "Publishers that left after a handshake that went well, by their address, and when."
+        "Addresses of publishers that left after a complete handshake, and when."
         self.oversize = 0
-        "How often one of them came back at once: it had been cut off."
+        "How often such a publisher came back at once: it had been cut off for a message that was too long."
         self._endpoints: dict[str, _Connections] = {}
         # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
         self._zap = context.socket(zmq.ROUTER)

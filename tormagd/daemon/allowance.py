@@ -3,7 +3,7 @@
 from tormagd.daemon.tally import Peer
 
 PEERS = 256
-"Peers that are kept apart; beyond, the one that has been silent longest is forgotten."
+"Peers that have a bucket; beyond, the one heard longest ago is forgotten."
 
 
 class Allowance:
@@ -12,7 +12,7 @@ class Allowance:
     def __init__(self, per_s: float, burst: float) -> None:
         self._per_s, self._burst = per_s, burst
         self._buckets: dict[Peer, tuple[float, float]] = {}
-        "When each was last filled, and what was left then."
+        "When each peer's bucket was last filled, and the messages left in it then."
 
     def grants(self, peer: Peer, now_s: float) -> bool:
         """Tell whether one more message of `peer` may be read at `now_s`, and count it if so.

@@ -16,11 +16,11 @@ from tormagd.safety.operating_state import (
 )
 
 PATIENCE_S = 2.0
-"So long a device that neither homes nor opens may take until the next command is taken."
+"How long a device that neither homes nor opens may refuse the next command."
 MOVES_S = 15.0
-"Longer than any homing or opening takes that is not a fault."
+"Longest homing or opening: any longer is a fault."
 WAITS = frozenset({"busy", "device_latched", "not_homed", "not_fresh"})
-"Refusals that go away by themselves once the command before has been carried out."
+"Codes of refusals that end by themselves once the command before has been carried out."
 
 
 class Arming:
@@ -35,7 +35,7 @@ class Arming:
         self.given: tuple[str, ...] = ()
         self.is_over = False
         self.refusal: RefusedError | None = None
-        "Why it ended before the force follows."
+        "Why the arming ended before ENABLED; None while it goes on, and in ENABLED."
         self._faults = faults
         self._given_s = self._moved_s = now_s
 

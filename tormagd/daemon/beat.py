@@ -13,7 +13,7 @@ from typing import NamedTuple
 from tormagd.daemon.rate_group import Histogram
 
 KERNEL = "kernel"
-"To blame where nothing of ours ran: the thread was not given the processor, or was stopped."
+"The part to blame where nothing of ours ran: the thread was not given the processor, or was stopped."
 NEWS_NS = 10_000_000_000
 "At most one log line about late beats in this time."
 COUNTED = 7
@@ -67,10 +67,10 @@ class Phases:
         self._ran: list[tuple[str, int, int]] = []
         self._last_ran: list[tuple[str, int, int]] = []
         self.spent: dict[str, Histogram] = {}
-        "What each took."
+        "How long each phase and slice took, by name."
         self._errors: dict[str, str] = {}
         self.blamed: Counter[str] = Counter()
-        "How many late beats each is to blame for."
+        "How many late beats each part is to blame for."
         self._late, self._worst = 0, Delay(0, "", 0)
         self._tell_ns = clock_ns()
 

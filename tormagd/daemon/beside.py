@@ -33,7 +33,7 @@ class Beside:
         with its:
             self.process = start_beside(module, its)
         self.is_gone = False
-        "Whether it was found to have ended, or this end was closed."
+        "Whether the process was found to have ended, or this end is closed."
 
     def send(self, data: bytes) -> bool:
         """Send one packet, and return whether the socket took it.

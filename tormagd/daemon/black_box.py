@@ -33,11 +33,11 @@ from tormagd_client.messages import BlackBoxReport, TickRecord
 PART_TICKS = 20
 "Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
 SNAPSHOT_S = 1.0
-"A replay may begin so often."
+"Time between snapshots: a replay may begin at each."
 AFTER_FAULT_S = 2.0
-"So much of what follows a fault is in its black box: the gap opens."
+"How long a black box goes on after its fault: the gap opens."
 BUFFER_BYTES = 4_000_000
-"What the kernel is asked to keep for a process that is held up; it may grant less, which is a third of a second."
+"Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
 LEAVING_S = 2.0
 MOST_ASKED = 8
 

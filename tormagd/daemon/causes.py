@@ -21,7 +21,7 @@ class Causes:
     def __init__(self, device: Device) -> None:
         self._device = device
         self.stall: StallReport | None = None
-        "The newest stall of the control loop."
+        "The newest stall of the control loop; None before the first."
         self._told: dict[str, str] = {}
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:

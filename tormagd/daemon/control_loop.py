@@ -25,7 +25,7 @@ class ControlLoop:
         self.output: Duty | None = None
         self.used: Plan | None = None
         self.measurement: Measurement | None = None
-        "What the last step was given, as `used`; None before the first."
+        "Measurement that the last step was given, as `used` is its plan; None without a device."
         self.timing = RateGroup("control", period_ns)
         self.arming: Arming | None = None
         "What the newest `arm` has done; None before the first."

@@ -48,13 +48,13 @@ SUBSCRIPTIONS = 16
 """What waits of one subscriber's subscriptions: libzmq works off all that there are in the thread that publishes. A
 thousand, as of all else, would make a tick late (`tools/endure.py siege`)."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
-"What one subscriber may say. Who says more is cut off, and comes back as anybody."
+"What one subscriber may say. One that says more is cut off, and may connect again."
 TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket in one beat at most, and for how long."
 ANSWERS_NS = 300_000
 "For how long requests are answered in one beat."
 PEERS = 16
-"Peers whose messages were not read, as many as are told apart."
+"Peers whose messages were not read that are counted apart."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."

@@ -14,11 +14,11 @@ from tormagd.safety.operating_state import OperatingState
 from tormagd_client.messages import MAX_DISPLACEMENT_MM, FollowingReport, TickRecord
 
 MOST_DELAY_S: Final = 0.4
-"What a delay may be that is taken out: the budget of the whole way."
+"Greatest delay that is taken out: the budget of the whole way."
 FORGETS_S: Final = 5.0
-"So long ago what is remembered counts a third."
+"After this time an error counts a third (1/e)."
 LEAST_S: Final = 1.0
-"Of fewer moments than in this time no figure is told: some seconds after the last none is."
+"No figure is told of fewer ticks than fill this time: some seconds after the last one that counted there is none."
 SLIDES_MM_S: Final = 1.0
 SLID_MM: Final = MAX_DISPLACEMENT_MM
 "A slower handle sticks, and one that has turned feels all of the brake's force only so much further."
@@ -84,7 +84,7 @@ class Following:
         return abs(place_mm - self._turned_mm) >= SLID_MM
 
     def report(self) -> FollowingReport | None:
-        """Return the RMS error, N, the RMS error without the best delay, N, and that delay, ms.
+        """Return the RMS error, N, the RMS error with the best delay taken out, N, and that delay, ms.
 
         None where fewer ticks count than fill LEAST_S: at first, and some seconds after the last one that counted.
         """

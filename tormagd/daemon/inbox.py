@@ -26,7 +26,7 @@ from tormagd.scenes.scene import Scene
 from tormagd_client.messages import MessageError, Setpoint, SetpointReport, SourceReport, decode
 
 SOURCES = 16
-"Publishers that are kept apart; another one is refused until an old one has been silent."
+"Publishers that are kept apart; one more is refused until an old one has been silent."
 SILENT_S = 1.0
 "A source that was silent this long makes room for another; one that was refused is named for so long."
 LONGEST_REFUSAL = 200
@@ -38,7 +38,7 @@ MOST_DRIFT_PPM = 100.0
 NEVER_SET_NS = 946_684_800 * 10**9
 "The year 2000, in which nobody publishes: a clock that begins in 1970 has not been set."
 SURE_WINDOWS = 20
-"Of fewer half seconds the scatter around the line says little of how sure its slope is."
+"Half seconds that a clock's line needs before its scatter says how sure its slope is."
 NEWS, NEWS_S = 4, 1.0
 "Lines for the log that wait, and how long each waits after the one before."
 STEP_NAMED_S = 60.0
@@ -63,7 +63,7 @@ class _Source:
     def refresh(self, now_s: float) -> bool:
         """Update the reported figures: delays, the clock's line, and what is wrong with clock or stamps.
 
-        Returns True if something is wrong that was right at the last call.
+        Returns True if something is newly wrong, once the clock's offset is known.
         """
         self.delays.refresh()
         self.fit = self.clock.line.fit()
@@ -100,7 +100,7 @@ class SetpointInbox:
 
     def __init__(self, priority: tuple[str, ...] = ()) -> None:
         self.has_way = True
-        "What is controlled has a handle that goes either way, and is no pad."
+        "Whether the scene's element is a brake, whose handle goes either way, and no pad."
         self.accepted = 0
         self.refused = 0
         self.dropped = 0
@@ -301,8 +301,8 @@ class SetpointInbox:
     def _make_room(self, name: str, now_s: float) -> None:
         """Forget a source where SOURCES are kept, so that `name` can be added. Raises MessageError where none may go.
 
-        One that was silent for SILENT_S may go; for a `name` in `priority`, else one that is not listed. The holder
-        stays.
+        The source that was silent for longest goes, if for over SILENT_S. Otherwise one that is not in `priority` goes
+        for one that is. The holder stays.
         """
         if len(self._sources) < SOURCES:
             return

@@ -16,7 +16,7 @@ from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.search_process import SearchProcess
 
 PLAN_ERRORS = (ValueError, ArithmeticError, RuntimeError)
-"A DomainError; what NumPy raises."
+"Errors by which a plan fails: DomainError, and those of NumPy."
 
 log = logging.getLogger(__name__)
 

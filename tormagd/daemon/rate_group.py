@@ -9,11 +9,11 @@ from msgspec.structs import asdict
 from tormagd_client.messages import ExecReport, LatenessReport, RateReport
 
 WARNING_PERIODS: Final = 1.0
-"A run that is done later than this after it was due has overrun: the next one was due already."
+"A run that ends later than this after it was due has overrun: the next one was due already."
 ERROR_PERIODS: Final = 10.0
 "This late it is a stall; at 1 kHz a fifth of the time after which the firmware opens the gap."
 HORIZON_NS: Final = 5_000_000_000
-"Percentiles cover the time since one to two of these ago."
+"Percentiles cover the last one to two of these."
 SHARES: Final = (0.5, 0.99, 0.999)
 _EXACT: Final = 64  # bins of one microsecond each; beyond, 32 bins for each doubling: 3% resolution
 _DOUBLINGS: Final = 20
@@ -98,7 +98,7 @@ class RateGroup:
         self.overruns = 0
         self.stalls = 0
         self.delay_ns = 0
-        "From when the newest run, or the first one it stands for, was due until it was done."
+        "Time from when the newest run, or the first one it stands for, was due until it ended."
         self.lateness_us = 0.0
         self.exec_us = 0.0
         self.lateness = Histogram()

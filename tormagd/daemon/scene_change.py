@@ -26,7 +26,7 @@ class SceneChange:
     ) -> None:
         self._build, self._require, self._take = build, require, take
         self.newest: SceneReport | None = None
-        "None before the first."
+        "Report on the newest change; None before the first."
         self._changing: asyncio.Task[None] | None = None
 
     def begin(self, scene: object) -> None:

@@ -34,11 +34,11 @@ class Sequence:
     def __init__(self, session: int | None, seq: int) -> None:
         self.session, self.seq = session, seq
         self.lost = 0
-        "Messages that are missing in the count, where the publisher counts by ones."
+        "Messages missing in `seq`, counted where the publisher counts by ones."
         self.restarts = 0
         self._latest_session = session
         self._step = 0
-        "The least step of `seq`; 0 while it has made none. A publisher may count in nanoseconds."
+        "Least step of `seq`; 0 before the first step. A publisher may count in nanoseconds."
         self._stray_session, self._stray_seq, self._in_row = session, seq, 0
         self._strays, self._strays_since_s = 0, 0.0
 

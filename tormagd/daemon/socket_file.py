@@ -9,11 +9,11 @@ from pathlib import Path
 
 
 class SocketFile:
-    """A listening socket with its path. Raises OSError saying what is in the way.
+    """A listening socket bound to `path`, which one process has at a time. Raises OSError saying what is in the way.
 
-    libzmq itself takes a path away from whoever listens there, or whatever lies there, without a word; so the socket is
-    made here and handed over (ZMQ_USE_FD). A lock on `PATH.lock` keeps others out until the process ends, however it
-    ends; what a killed one leaves behind is replaced.
+    Makes missing folders, and replaces the socket that a killed process left. Anything else at `path` is refused and
+    left alone. A lock on `PATH.lock` keeps other processes out until this one ends. libzmq by itself would take the
+    path from whoever listens there; so it is handed this socket (ZMQ_USE_FD).
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,7 +31,7 @@ class SocketFile:
         self._identity = _identity(path)
 
     def close(self) -> None:
-        """Takes path and lock away, unless somebody has put others in their place."""
+        """Close the socket, and remove its path and its lock, unless others have been put in their place."""
         self.listener.close()
         if self._identity is not None and _identity(self._path) == self._identity:
             with contextlib.suppress(OSError):
@@ -39,6 +39,7 @@ class SocketFile:
         self._unlock()
 
     def _unlock(self) -> None:
+        """Remove the lock's file, if it is still ours, and let the lock go."""
         held = os.fstat(self._lock)
         # while it is held: whoever opened it before finds that its name has gone, and tries again
         if _identity(self._lock_path) == (held.st_dev, held.st_ino):
@@ -48,14 +49,18 @@ class SocketFile:
 
 
 def ipc_path(address: str) -> Path | None:
-    """The path in an address; None where it has none: `ipc://@name` is a name without a file."""
+    """Return the path in an `ipc://` address; None for other addresses, and for `ipc://@name`, which has no file."""
     if not address.startswith("ipc://") or address.startswith("ipc://@"):
         return None
     return Path(address.removeprefix("ipc://"))
 
 
 def _locked(path: Path) -> int:
-    """A descriptor that holds the lock, with our process number in the file."""
+    """Lock the file `path`, write our process number into it, and return its descriptor, which holds the lock.
+
+    Makes the file where it is missing. Raises OSError where it cannot be opened, is not a lock's, or is locked by
+    another process.
+    """
     while True:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o660)
@@ -75,6 +80,7 @@ def _locked(path: Path) -> int:
 
 
 def _lock(path: Path, descriptor: int) -> None:
+    """Lock an open file without waiting. Raises OSError where it holds anything but a number, or is locked."""
     content = os.pread(descriptor, 32, 0).decode(errors="replace").strip()
     if content and not content.isdecimal():
         raise OSError(f"{path} is not a lock of this program; it is left alone: name another path")
@@ -87,6 +93,10 @@ def _lock(path: Path, descriptor: int) -> None:
 
 
 def _listening(path: Path) -> socket.socket:
+    """Return a socket that listens at `path`, in place of one that was left there. Call with the lock held.
+
+    Raises OSError where something else is at `path`, or where it cannot be bound.
+    """
     if _identity(path) is not None and not stat.S_ISSOCK(path.lstat().st_mode):
         raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
@@ -101,7 +111,7 @@ def _listening(path: Path) -> socket.socket:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Which file is there; None where none is."""
+    """Return device and inode of what is at `path`, links not followed; None where nothing is, or none can be read."""
     try:
         found = path.lstat()
     except OSError:

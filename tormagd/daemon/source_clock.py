@@ -33,11 +33,14 @@ JITTER_SHARE = 1.0 / 16.0
 
 @final
 class SourceClock:
-    """The clock of one publisher, fed with each of its messages, in the order in which they were sent."""
+    """Estimates one publisher's clock offset and the delay of its messages, from stamps and arrivals.
+
+    Give it each message in the order of sending. No clock of its own.
+    """
 
     def __init__(self) -> None:
         self.offset_s = 0.0
-        "By how much the clock is behind ours, as far as it can be told."
+        "How far the clock is behind ours, s, as far as it can be told."
         self.way_s = 0.0
         "The constant part of the way, as far as it can be told."
         self.jitter_s = 0.0
@@ -45,9 +48,9 @@ class SourceClock:
         self.steps = 0
         "How often the clock was seen to be set."
         self.stepped_s = 0.0
-        "By how much it was set last; forward is positive."
+        "By how much the clock was set last, forward positive."
         self.stepped_at_s = -math.inf
-        "When that was seen."
+        "When the clock was last seen to be set; -inf before."
         self._lateness_s = self._leaked_s = 0.0
         self._heard_s: float | None = None
         self._settles_s: float | None = None
@@ -56,19 +59,19 @@ class SourceClock:
 
     @property
     def is_settled(self) -> bool:
-        """Whether it is known how far the clock is off."""
+        """Whether the clock's offset is known; not for SETTLED_S after a first lateness that no way takes."""
         return self._settles_s is None
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the clock is so far off that it should be set."""
+        """Whether the clock's offset is known and beyond AHEAD_S, so that the clock should be set."""
         return self.is_settled and not -AHEAD_S <= self.offset_s <= AHEAD_S
 
     def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
-        """One message came at `now_s` and was that late by its stamp: its delay, s.
+        """Take the message that came at `now_s`, and return its delay, s. `lateness_s` is our time less its stamp.
 
-        Not negative, unless the clock is ahead and not settled. With `is_continued` False the publisher may be another
-        process than before, on another machine.
+        The delay is not negative, unless the clock is ahead and not settled: it is then `lateness_s`. With
+        `is_continued` False the publisher may be another process, on another machine.
         """
         if self._heard_s is None:
             self._begin(now_s, lateness_s)
@@ -83,7 +86,11 @@ class SourceClock:
         return max(lateness_s - self.offset_s, 0.0)
 
     def _begin(self, now_s: float, lateness_s: float) -> None:
-        """Nothing is known: a lateness that no way takes is the clock's, if it stays."""
+        """Begin with nothing known but this lateness.
+
+        What a way can take counts as the way at once. More counts as the clock's offset once it has stayed for
+        SETTLED_S.
+        """
         self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
         self._settles_s = now_s + SETTLED_S
         self.line = DeviceClock()
@@ -91,11 +98,17 @@ class SourceClock:
             self._settle()
 
     def _settle(self) -> None:
+        """Count the offset as known; one that a way can take becomes the constant part of the way."""
         self._settles_s = None
         if 0.0 < self.offset_s <= MOST_WAY_S:
             self.offset_s, self.way_s = 0.0, self.offset_s
 
     def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
+        """Update offset, way and jitter from a message that came `gap_s` after the last.
+
+        A stamp that runs back shows that the clock was set. Otherwise the offset rises by what drift allows. After
+        FORGOTTEN_S of silence, or from another process, a lateness that does not fit begins the clock anew.
+        """
         rise_s = lateness_s - self._lateness_s
         if not is_continued or gap_s > FORGOTTEN_S:
             above_s = lateness_s - self.offset_s - self.way_s
@@ -116,8 +129,11 @@ class SourceClock:
             self._fall(now_s, fall_s)
 
     def _fall(self, now_s: float, fall_s: float) -> None:
-        """The least lateness so far: first it takes back what was granted to drift, then the way is shorter than was
-        thought, and what no way explains is the clock."""
+        """Lower offset and way by `fall_s`: the message was less late than both of them together.
+
+        First goes what was granted to drift, then the way. What is left is the clock's: above STEP_S, a settled clock
+        was set forward.
+        """
         granted_s = min(fall_s, self._leaked_s)
         self.offset_s -= granted_s
         self._leaked_s -= granted_s
@@ -129,6 +145,7 @@ class SourceClock:
             self._set(now_s, ahead_s)
 
     def _set(self, now_s: float, by_s: float) -> None:
+        """Count that the clock was set by `by_s`, forward positive, and begin its line anew."""
         self.steps += 1
         self.stepped_s, self.stepped_at_s = by_s, now_s
         self.line = DeviceClock()

@@ -12,7 +12,7 @@ from tormagd.safety.codes import Explanation, Limit
 from tormagd.scenes.scene import Scene
 
 WINDOW_S, LEAST_MESSAGES = 1.0, 4
-"What is judged together: so much time, and so many messages."
+"Least time and least messages that are judged together."
 MOST_LOST = 0.05
 SPREAD_S = 0.02
 "By more than this from message to message a delay shows in the force: what the slope carries over is 50 ms."
@@ -30,7 +30,10 @@ class Needs(NamedTuple):
 
 
 def needs_of(scene: Scene) -> Needs:
-    """What is stated there; otherwise as many setpoints as the slope carries over."""
+    """Return what a scene needs of its publisher: setpoints a second, and their greatest delay, s.
+
+    Where the scene states none, setpoints may be as far apart as the slope carries over, and late by MOST_LATE_S.
+    """
     stated = UNSET if scene.signal is None else scene.signal.setpoint_hz
     delay_ms = scene.budget.delay_ms
     return Needs(
@@ -40,17 +43,21 @@ def needs_of(scene: Scene) -> Needs:
 
 
 class SourceManner:
-    """Of one publisher, fed with each of its messages."""
+    """Judges once a second how the setpoints of one publisher come. Give it each message."""
 
     def __init__(self) -> None:
         self.found: dict[Limit, Explanation] = {}
-        "What was wrong in the newest window."
+        "What was wrong in the newest full window."
         self._began_s: float | None = None
         self._lost = self._messages = 0
         self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
 
     def hear(self, now_s: float, late_s: float, lost: int, preview_s: float, needs: Needs) -> None:
-        """Take one message, `late_s` after its stamp by the corrected clock; `lost` were missing so far."""
+        """Take a message, `late_s` after its stamp by the corrected clock; set `found` anew when a window is full.
+
+        `lost` counts all messages missing so far. `preview_s` is the length of its preview, 0 without one. The first
+        message only begins the window.
+        """
         if self._began_s is None:
             self._begin(now_s, lost)
             return
@@ -67,6 +74,8 @@ class SourceManner:
         self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
 
     def _judged(self, past_s: float, lost: int, preview_s: float, needs: Needs) -> dict[Limit, Explanation]:
+        """Return what is wrong in a window of `past_s` in which `lost` messages were missing; empty where nothing
+        is."""
         sent = self._messages + lost
         found = {}
         if lost > MOST_LOST * sent:

@@ -9,28 +9,32 @@ FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
 FAR_NS = 86_400 * 10**9
 "Stamps of such another unit are years away; nearer ones are of a clock."
 LOOKED_AT, LEAST_S = 8, 0.005
-"So many messages, and so much time, show how fast stamps run."
+"Messages, and time, that it takes to see how fast stamps run."
 SLOW = 0.03
-"Of our clock's rate: no clock runs so slow."
+"Share of our clock's rate: no clock runs so slow."
 
 
 class StampUnit:
-    """Of one publisher, fed with each of its messages."""
+    """Finds out whether the stamps of one publisher count ns. Give it each message."""
 
     def __init__(self) -> None:
         self.is_known = False
         self.wrong = ""
-        "The unit, where it is not ns."
+        "The unit of the stamps, a key of FACTORS; empty where it is ns or not known."
         self._from: tuple[float, int] | None = None
         self._messages = 0
 
     @property
     def remedy(self) -> str:
-        """What the publisher has to do where its unit is wrong."""
+        """What the publisher has to do about its unit; empty where no other unit than ns was found."""
         return f"send ns since 1970 (CLOCK_REALTIME): {FACTORS[self.wrong]} times as much" if self.wrong else ""
 
     def hear(self, now_s: float, stamp_ns: int, realtime_ns: int) -> None:
-        """Take one message, which came at `now_s`, at `realtime_ns` of our clock."""
+        """Take a message that came at `now_s`; `realtime_ns` is our CLOCK_REALTIME then.
+
+        A stamp within FAR_NS of it counts ns. Stamps further off are judged by how fast they run, after LOOKED_AT
+        messages and LEAST_S. `is_known` and `wrong` then say what was found.
+        """
         if abs(realtime_ns - stamp_ns) < FAR_NS:
             self.is_known, self.wrong, self._from = True, "", None
             return

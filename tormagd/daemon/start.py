@@ -25,7 +25,11 @@ from tormagd_client.printable import printable
 
 
 def start(options: argparse.Namespace) -> int:
-    """Returns the exit code: 0 ended on request, 1 could not run. Raises ConfigError for what is refused."""
+    """Build the core and run the daemon as the command line and its configuration say; return the exit code.
+
+    0: ended on request; 1: could not run, with the reason on stderr. `--check` prints what would run, as JSON, and runs
+    nothing. Raises ConfigError where configuration, scene, keys or backend are refused.
+    """
     try:
         config = _configured(options)
         keys = KeyRing(config.endpoints) if any(map(config.endpoints.is_guarded, ENDPOINTS)) else None
@@ -44,7 +48,11 @@ def start(options: argparse.Namespace) -> int:
 
 
 def _configured(options: argparse.Namespace) -> Config:
-    """What the file says, and the command line beside it. Raises ConfigError."""
+    """Return the file's configuration with the command line's scene, and the scene's rates where `rates.of_scene` is
+    set.
+
+    Raises ConfigError.
+    """
     config = load_config(options.config)
     if options.scene is not None:
         config = msgspec.structs.replace(config, scene=options.scene)
@@ -58,6 +66,10 @@ async def _run(
     keys: KeyRing | None,
     options: argparse.Namespace,
 ) -> None:
+    """Start the processes of black box and search, make this thread a real-time one, and run the daemon to its end.
+
+    Raises ConfigError where the search does not start, OSError where an endpoint cannot be bound.
+    """
     # before this thread is a real-time one: the process that is started keeps off its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     known = {} if folder is None else header(config, core)
@@ -69,6 +81,7 @@ async def _run(
 
 
 def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
+    """Return what `--check` prints, as JSON: configuration, scene, what follows from both, installed backends."""
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
         "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),

@@ -14,15 +14,18 @@ log = logging.getLogger(__name__)
 
 
 class Peer(NamedTuple):
-    """Who is counted: a host, or the process at a local socket, as libzmq names it; and the key it showed, if any."""
+    """A peer: its host, or the process at a local socket, as libzmq names it; and its key, empty without one."""
 
     address: str
     key: str = ""
 
 
 class Tally:
-    """Counts by endpoint, peer and reason. At most `most` are told apart; whoever was counted longest ago joins the
-    others. `line` is for the log, with how many and the newest; `name` is a key's for people."""
+    """Counts refusals by endpoint, peer and reason. `line` is the log's format, for a count and the newest entry.
+
+    At most `most` entries are told apart; the one counted longest ago joins the OTHERS of its endpoint. `name` returns
+    a key as people know it.
+    """
 
     def __init__(self, most: int, line: str, name: Callable[[str], str]) -> None:
         self.most, self._line, self._name = most, line, name
@@ -31,7 +34,7 @@ class Tally:
         self._counts: dict[tuple[str, Peer, str], int] = {}
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
-        """Counts one more."""
+        """Count one more refusal of `peer` at `endpoint` for `reason`."""
         self.total += 1
         self._add((endpoint, peer, reason), 1)
         if len(self._counts) > self.most:
@@ -39,14 +42,14 @@ class Tally:
             self._add((first[0], Peer(OTHERS), first[2].split(":")[0]), self._counts.pop(first))
 
     def report(self) -> tuple[PeerReport, ...]:
-        """Who they are, the newest last."""
+        """Return the entries, the one counted last at the end; keys and addresses as people know them."""
         return tuple(
             PeerReport(endpoint, shown(peer.address), peer.key and self._name(peer.key), reason, count)
             for (endpoint, peer, reason), count in self._counts.items()
         )
 
     def tell(self, now_s: float) -> None:
-        """Says in the log how many there were: some times a second."""
+        """Log the number of refusals since the last line, and the newest one; at most one line in NEWS_S."""
         if self.total > self._told and now_s >= self._tell_s:
             it = self.report()[-1]
             newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
@@ -58,7 +61,7 @@ class Tally:
 
 
 def shown(address: str) -> str:
-    """A peer's address for people: the host, or the process."""
+    """Return a peer's address for people: the host, `process N of user N`, or that it had gone."""
     if address.startswith("localhost:"):
         _, user, _, process = address.split(":")
         return f"process {process} of user {user}"

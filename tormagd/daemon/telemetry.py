@@ -20,7 +20,11 @@ def tick_record(
     exec_us: float,
     number: int = 0,
 ) -> TickRecord:
-    """The record of one tick. By position, as by name it would take ten times as long: in the order of its fields."""
+    """Return the record of one control tick, number `number`, along `plan`. Call right after the step.
+
+    `measurement` is None without a device: its fields are None, too. Fields are given by position: by name it takes ten
+    times as long.
+    """
     measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
     is_placed = measured is not None and measured.is_homed
     link = None if measurement is None else measurement.link
@@ -100,7 +104,7 @@ def _names(bits: Switches | DeviceFault) -> tuple[str, ...]:
 
 
 def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...]:
-    """What holds the force back now; nothing does while the device is not driven."""
+    """Return the limits that hold the force back, the plan's before the step's; none while the device is not driven."""
     return tuple(dict.fromkeys((*plan.limits, *output.limits))) if safety.is_driven else ()
 
 
@@ -115,7 +119,11 @@ def snapshot(
     verdict: Verdict | None = None,
     mark: Mark | None = None,
 ) -> Telemetry:
-    """The telemetry of the newest tick. `handle` is its place and rate, positive pushing on."""
+    """Return the telemetry message `sequence` of the newest `tick`.
+
+    `age_s` is the setpoint's, None without one. `handle` is the handle's place, mm, and rate, mm/s, positive pushing
+    on; None without a device. `mark` is the newest, None before the first.
+    """
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
     return Telemetry(

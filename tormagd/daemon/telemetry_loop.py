@@ -51,7 +51,7 @@ from tormagd_client.messages import (
 MOST_TICKS = 100
 "Ticks in one recording message at most."
 REQUESTS = 16
-"Answered in a telemetry period at most: whoever asks on and on must not keep a `stop` waiting."
+"Requests answered in a telemetry period at most: a client that asks on and on must not keep a `stop` waiting."
 TELL_S = 0.1
 "How often systemd, log and black box are seen to."
 REFRESHED = 2
@@ -63,9 +63,10 @@ log = logging.getLogger(__name__)
 
 
 class TelemetryLoop:
-    """Tells everybody else what the control and inference loops do: a phase of every beat, and three slices.
+    """The telemetry loop: publishes what the control and inference loops do, and answers requests.
 
-    `not_granted` is what the kernel refused at the start, `config_file` where `config` is from.
+    One phase of every beat and three slices. `not_granted` is what the kernel refused at the start. `config_file` names
+    the file of `config`, None for the defaults.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class TelemetryLoop:
         config_file: str | None,
     ) -> None:
         self.config = config
-        "Another one may take its place, of which only what a loop looks at each time may differ."
+        "Replaced by a reload, which changes only keys that are looked at each time they are used."
         self._core, self._not_granted, self._config_file = core, tuple(not_granted), config_file
         self._control, self._inference, self._profiles = control, inference, profiles
         self._connection, self._endpoint = connection, endpoint
@@ -100,7 +101,7 @@ class TelemetryLoop:
         self._following = Following(1.0 / config.rates.telemetry_hz, core.scene.force.tolerance_rms_N)
         self.topics = Topics(config, core, control, inference, endpoint)
         self.scene_change: SceneChange | None = None
-        "Where the scene may be changed."
+        "What changes the scene; None until the daemon sets it."
         self._service = Service()
         self._status: msgspec.Raw | None = None
         self._mark: Mark | None = None
@@ -111,12 +112,15 @@ class TelemetryLoop:
         self._reported_s, self._reported_state = -math.inf, connection.state
 
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
-        """Tells of another core from now on."""
+        """Publish and report on `core` from now on, with its configuration and profiles; reports are made anew."""
         self.config, self._core, self.topics.core, self._profiles = config, core, core, profiles
         self._status, self._reported_s = None, -math.inf
 
     def record(self, _beat: Beat) -> None:
-        """Keeps the control tick that just ran, with the plan that it used."""
+        """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing.
+
+        MOST_TICKS records are published at once where telemetry is slow.
+        """
         control = self._control
         if control.output is None or control.used is None:
             return
@@ -138,7 +142,11 @@ class TelemetryLoop:
         self._box.ticked(record, control.stepper, self._inference.planner)
 
     def publish(self, beat: Beat) -> bool:
-        """The snapshot of a telemetry period, and its ticks; False where none is due."""
+        """Publish the snapshot and the ticks of a telemetry period; return False where none is due.
+
+        The snapshot is made only where a peer listens or a request waits; the requests that wait now are then answered
+        by `serve`. Profiles look at the connected device.
+        """
         if self._left > 0 or not self._ticks:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
@@ -161,12 +169,16 @@ class TelemetryLoop:
         return True
 
     def _publish_ticks(self) -> None:
+        """Publish the kept ticks if a peer listens to the recording, and drop them in any case."""
         if self._endpoint.admission.connections()["recording"]:
             self._endpoint.publish_ticks(self._ticks)
         self._ticks = []
 
     def tell(self, _beat: Beat) -> bool:
-        """Every TELL_S: log, service and black box. False where it has been done."""
+        """Every TELL_S, feed log, systemd and black box, and go on arming; return False where it is not time.
+
+        Also computes the percentiles of REFRESHED histograms and of one source anew.
+        """
         now_s = time.monotonic()
         if now_s - self._told_s < TELL_S:
             return False
@@ -183,13 +195,16 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answers a few of the requests that waited at the last snapshot; False where there are none."""
+        """Answer requests that waited at the last snapshot, for a limited time; return False where none did."""
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
 
     def keep(self, reason: str, after_s: float) -> Path:
-        """Has a black box written, with what comes `after_s` later; where it will be. Raises RefusedError."""
+        """Ask for a black box that also holds the next `after_s`, and return the path it will have.
+
+        `reason` becomes part of its name. Raises RefusedError where none is kept.
+        """
         link = self._connection.report()
         details = {
             "firmware": link.firmware or "",
@@ -199,19 +214,19 @@ class TelemetryLoop:
         return self._box.write(reason, after_s, details)
 
     def conditions(self) -> Conditions:
-        """What a command is decided on now."""
+        """Return the conditions, as they are now, on which a command is taken or refused."""
         control, doubted = self._control, self._inference.planner.believe.sensor.is_doubted
         return conditions(
             time.monotonic(), self.config, self._connection, control.stepper, control.output, sensor_doubted=doubted
         )
 
     def is_busy(self) -> bool:
-        """Whether the device homes or opens, or is about to."""
+        """Tell whether the device homes or opens, or has been asked to."""
         connection = self._connection
         return is_busy(connection.measurement, connection.pending, self._control.stepper, self._control.output)
 
     def is_open(self) -> bool | None:
-        """Whether the gap is open; None without a device."""
+        """Tell whether the gap is open; None without a device."""
         measurement = self._connection.measurement
         return None if measurement is None else is_open(measurement, self._is_homed())
 
@@ -219,6 +234,7 @@ class TelemetryLoop:
         return is_homed(self._connection.measurement, self._control.stepper.measured)
 
     def _snapshot(self, now_s: float) -> Telemetry:
+        """Return the telemetry message of the newest tick."""
         stamp = self._endpoint.inbox.newest
         age_s = None if stamp is None else now_s - stamp.stamp_s
         planner, stepper = self._inference.planner, self._control.stepper
@@ -228,7 +244,8 @@ class TelemetryLoop:
         return snapshot(self._ticks[-1], *known, *told, self._mark)
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
-        """Says to systemd how it stands, and feeds its watchdog while plans and device states are fresh."""
+        """Tell systemd what is new: readiness, status, and that the daemon lives while plans and device states are
+        fresh."""
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
         is_alive = service.is_alive(
@@ -253,13 +270,20 @@ class TelemetryLoop:
             notify(message)
 
     def _in_turn(self) -> Iterator[Histogram]:
-        """All histograms, again and again: making all percentiles anew at once would take too long for one beat."""
+        """Yield all histograms, again and again.
+
+        A beat computes the percentiles of a few: all of them would take too long.
+        """
         while True:
             for group in self._groups:
                 yield from (group.lateness, group.exec)
             yield from (self._way.to_duty, *self._phases.spent.values())
 
     def _answer(self, request: Request) -> Any:
+        """Return the result of a request. Raises RefusedError.
+
+        A `status` is packed once for all who ask in a telemetry period. All but `status` and `describe` is carried out.
+        """
         if request.command == "status":
             # built once for everybody who asks in this period
             if self._status is None:
@@ -268,6 +292,10 @@ class TelemetryLoop:
         return self._describe() if request.command == "describe" else self.command(request)
 
     def _describe(self) -> Any:
+        """Return what does not change from tick to tick, as plain data.
+
+        Configuration, scene, model, profile and firmware, and the device's force and force rate over the gap.
+        """
         link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
         scaled_mm_s = device.scale * self._core.gap_speed_mm_s
         description = Description(
@@ -288,7 +316,10 @@ class TelemetryLoop:
         return msgspec.to_builtins(description)
 
     def command(self, request: Request) -> dict[str, Any]:
-        """Carries out what is no question. Raises RefusedError."""
+        """Carry out a request that is no question, and return its result as plain data.
+
+        Raises RefusedError where the state or its arguments do not allow it. The next `status` is made anew.
+        """
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
             return self._give(request.args.get("source"))
@@ -311,7 +342,10 @@ class TelemetryLoop:
         }
 
     def _put(self, text: object) -> dict[str, Any]:
-        """Puts an event into telemetry, and so into what is recorded."""
+        """Put a mark with this text into telemetry, and so into recordings; return it as plain data.
+
+        Raises RefusedError for what is not 1..MAX_MARK_CHARACTERS printable characters.
+        """
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
             raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")
@@ -320,6 +354,10 @@ class TelemetryLoop:
         return msgspec.to_builtins(self._mark)  # type: ignore[no-any-return]
 
     def _confirm(self, what: object) -> dict[str, Any]:
+        """Take the operator's word on what is wrong, "device" or "sensor", and log it.
+
+        Raises RefusedError for any other word, and where the readings agree with the device.
+        """
         try:
             wrong = msgspec.convert(what, Disputed)
         except msgspec.ValidationError as error:
@@ -335,6 +373,7 @@ class TelemetryLoop:
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
+        """Give the brake to the source of this name, and return it with the one before. Raises RefusedError."""
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
         inbox = self._endpoint.inbox
@@ -344,6 +383,7 @@ class TelemetryLoop:
         return {"source": source, "instead_of": before}
 
     def _build_status(self, newest: Telemetry) -> Status:
+        """Return the answer to `status`: the newest snapshot, states as they are now, reports, causes and remedies."""
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device
@@ -396,6 +436,7 @@ class TelemetryLoop:
         )
 
     def _arm_report(self) -> ArmReport | None:
+        """Return the report on the newest arming; None before the first."""
         arming = self._control.arming
         if arming is None:
             return None
@@ -404,8 +445,10 @@ class TelemetryLoop:
         return ArmReport(given=arming.given, is_over=arming.is_over, error=ended)
 
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:
-        """The reports that take most of a status' time: made anew every TELL_S, after a command, and when the link
-        changes."""
+        """Return the reports that take most of a status' time, by the names of its fields.
+
+        They are made anew every TELL_S, after a command, and when the state of the link changes.
+        """
         if now_s - self._reported_s >= TELL_S or self._connection.state is not self._reported_state:
             self._reported_s, self._reported_state = now_s, self._connection.state
             link = self._connection.report()

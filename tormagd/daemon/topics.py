@@ -17,14 +17,14 @@ NS = 1_000_000_000
 
 
 class Topics:
-    """A phase of every beat, which says what is new to whoever listens; and what a snapshot says of the same."""
+    """Publishes the topics `motion` and `verdict` as a phase of every beat, and makes both for snapshots, too."""
 
     def __init__(
         self, config: Config, core: Core, control: ControlLoop, inference: InferenceLoop, endpoint: Endpoint
     ) -> None:
         self._control, self._inference, self._endpoint = control, inference, endpoint
         self.core = core
-        "Of the scene that runs."
+        "Core of the running scene."
         self._push_sign = float(config.handle.push_sign)
         self._period_ns = NS // min(config.rates.motion_hz, config.rates.control_hz)
         self._due_ns, self._sensed_s = 0, 0.0
@@ -32,22 +32,29 @@ class Topics:
         self._passed_over: tuple[str, int] | None = None
 
     def publish(self, beat: Beat) -> bool:
-        """Says what is new; False where nothing is, or nobody listens."""
+        """Publish a new verdict and a new motion of the handle; return False where nothing was published.
+
+        Topics that nobody subscribes to are skipped.
+        """
         listeners = self._endpoint.listeners
         is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
         return (listeners.has(MOTION_TOPIC) and self._publish_motion(beat)) or is_said
 
     def handle(self) -> tuple[float, float] | None:
-        """The handle's place and rate, positive pushing on; None without a device."""
+        """Return the handle's place, mm, and rate, mm/s, positive pushing on; None without a device."""
         measured = self._control.stepper.measured
         return None if measured is None else place_and_rate(measured, self._push_sign)
 
     def verdict(self) -> Verdict | None:
-        """Of the newest setpoint, as things are now; None without one."""
+        """Return the verdict on the newest setpoint, as things are now; None without a setpoint."""
         inbox = self._endpoint.inbox
         return None if inbox.newest is None else self._verdict(*inbox.newest_is(), self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
+        """Publish the handle's newest motion; return False where it is not due or was not sensed anew.
+
+        Due times that were missed are not made up for.
+        """
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
             return False
@@ -63,6 +70,10 @@ class Topics:
         return True
 
     def _publish_verdicts(self) -> bool:
+        """Publish the verdict on a new setpoint, and on one refused because another source holds the brake.
+
+        Each is judged once. Returns False where neither is new.
+        """
         inbox, is_said = self._endpoint.inbox, False
         # a setpoint is a new object, even where its source begins its numbers anew
         if inbox.newest is not None and inbox.newest is not self._judged:
@@ -76,6 +87,7 @@ class Topics:
         return is_said
 
     def _judge(self) -> Judged:
+        """Judge the newest setpoint by the newest plan and the measured gap."""
         planner, stepper, core = self._inference.planner, self._control.stepper, self.core
         measured, believe, force = stepper.measured, planner.believe, core.scene.force
         return judged(
@@ -89,6 +101,7 @@ class Topics:
 
     @staticmethod
     def _verdict(source: str, seq: int, found: Judged) -> Verdict:
+        """Return a judgement as the message for the setpoint `seq` of `source`."""
         return Verdict(
             v=VERSION,
             t_ns=time.time_ns(),

@@ -12,13 +12,17 @@ RENDERED, ARRIVES, CANNOT = "rendered", "arrives", "cannot"
 HOLDING = frozenset({Limit.RANGE, Limit.STANDBY, Limit.F_MIN, Limit.F_MAX})
 "Limits that keep a force from coming, as CEILING and MODEL_RANGE may; the others only make it late."
 FORGOTTEN = frozenset({Limit.STALE, Limit.OTHER_SOURCE})
-"Why a setpoint is not followed any more."
+"Limits that say why a setpoint is no longer followed."
 FIELD = "field_mT"
-"Of what a plan was held outside of, by the features' names."
+"Name of the feature that keeps a force away where a plan is held inside the model's range."
 
 
 class Judged(NamedTuple):
-    """`arrives_ms` is 0 where the force is rendered, and None where it cannot be. `why` names limits or the state."""
+    """A judgement on a setpoint: rendered, arrives or cannot.
+
+    `arrives_ms` is 0 where the force is rendered, None where it cannot be. `why` names the limits or the state that
+    keep it from coming.
+    """
 
     outcome: str
     arrives_ms: float | None
@@ -26,7 +30,8 @@ class Judged(NamedTuple):
 
 
 class Carriages(NamedTuple):
-    """How fast the gap moves, how late its motion begins, what the scene tolerates, and its ramp."""
+    """Figures of the gap's motion: its greatest speed, and its lag; and of the scene: its force tolerance and release
+    rate."""
 
     gap_speed_mm_s: float
     lag_s: float
@@ -42,7 +47,12 @@ def judged(
     device: DeviceFit,
     carriages: Carriages,
 ) -> Judged:
-    """What becomes of the setpoint that was planned for. `gap_mm` is the measured one, None without a homed device."""
+    """Judge the setpoint that `plan` was made for: rendered, arrives in some time, or cannot, and why.
+
+    `gap_mm` is the measured gap, None without a homed device. Rendered means within the scene's tolerance. Cannot: not
+    ENABLED, no valid setpoint, or a limit that keeps the force away for good. The time is that of the gap's way at its
+    speed, or of the ramp, plus the lag.
+    """
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:
         return Judged(CANNOT, None, (str(state),))
@@ -63,7 +73,7 @@ def judged(
 
 
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
-    """Whether it keeps the gap from where it should go, and not only from somewhere on the way."""
+    """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there."""
     if limit is Limit.CEILING:
         return aim_mm < plan.min_gap_mm
     if limit is Limit.MODEL_RANGE:

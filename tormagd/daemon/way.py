@@ -12,18 +12,18 @@ from tormagd.daemon.rate_group import Histogram
 from tormagd_client.messages import WayReport
 
 BUDGET_MS = 400.0
-"Over this, a delayed force makes a task slower and its contacts harder."
+"Delay above which a task becomes slower and its contacts harder."
 
 
 class Way:
-    """Takes every control tick; remembers a bounded number of figures."""
+    """Measures the delay from a setpoint's stamp to the first duty that follows it. Give it each control tick."""
 
     def __init__(self) -> None:
         self.to_duty = Histogram()
         self._stamp_s = -math.inf
 
     def ticked(self, now_s: float, used: Plan) -> None:
-        """A control tick at `now_s`, and what had been planned when it ran."""
+        """Count the delay of a setpoint in the first tick, at `now_s`, along a plan for it; `used` is that plan."""
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
@@ -31,7 +31,10 @@ class Way:
                 self.to_duty.add(now_s, (now_s - stamp_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float) -> WayReport:
-        """The way's parts; `device_us` is the link's, `lag_s` that of the carriages."""
+        """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known.
+
+        `device_us` is the link's median round trip, None without one; `lag_s` is the carriages' lag.
+        """
         to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
             total_ms = round((to_duty_us.p99 + device_us) * 1e-3 + carriages_ms, 2)
