@@ -279,8 +279,8 @@ class Config(Strict, frozen=True):
 def load_config(path: Path | None) -> Config:
     """Read the configuration file `path`; None: take the defaults. Raises ConfigError naming file, key and value.
 
-    Where the file states none of rates.control_hz, rates.inference_hz and rates.of_scene, `rates.of_scene` becomes
-    true: the daemon then runs at its scene's rates.
+    Where neither rates.control_hz, rates.inference_hz nor rates.of_scene is stated, `rates.of_scene` becomes true: the
+    daemon then runs at its scene's rates.
     """
     config = Config() if path is None else convert(path, Config)
     stated = {} if path is None else read_toml(path).get("rates", {})

@@ -57,9 +57,10 @@ def toml_text(path: Path) -> str:
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """Parse `text` as TOML and return its tables. Raises TomlError, also for what TOML allows.
+    """Parse `text` as TOML and return its tables. Raises TomlError where it is not TOML.
 
-    Refused are lines beyond LONGEST_LINE, deep nesting, numbers that are not finite, and integers beyond 64 bits.
+    Also refused are lines beyond LONGEST_LINE, too deep nesting, numbers that are not finite, and integers beyond 64
+    bits.
     """
     import tomllib  # not above: who reads no file, as most commands of tormagctl, need not wait for it
 

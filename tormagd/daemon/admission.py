@@ -254,7 +254,7 @@ class Admission:
         """
         known = self._endpoints[name]
         if self.has_role(public, MAY[name]):
-            self._came(name, address)
+            self._count_oversize(name, address)
             known.admitted[address] += 1
             return True
         known.turned_away.append(address)
@@ -291,7 +291,7 @@ class Admission:
     def _accepted(self, known: _Connections, descriptor: int) -> None:
         """Note a new connection, and end it where its address or its endpoint has too many.
 
-        On an open endpoint its peer counts as come, for `_came`.
+        On an open endpoint, a publisher that returns at once counts as cut off for a message that was too long.
         """
         address = known.addresses[descriptor] = _address(descriptor)
         if not address:
@@ -301,7 +301,7 @@ class Admission:
             known.cut.add(descriptor)
             _end(descriptor, address)
         elif not known.is_guarded:
-            self._came(known.name, address)
+            self._count_oversize(known.name, address)
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
         """Forget a closed connection, and count a refusal where its peer never got in and was not counted before.
@@ -326,7 +326,7 @@ class Admission:
             # a peer of an old version is closed without an event of its own
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
-    def _came(self, name: str, address: str) -> None:
+    def _count_oversize(self, name: str, address: str) -> None:
         """Count a message that was too long where a publisher's address returns within RECONNECT_S of leaving."""
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
         # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket

@@ -15,9 +15,9 @@ class Allowance:
         "When each peer's bucket was last filled, and the messages left in it then."
 
     def grants(self, peer: Peer, now_s: float) -> bool:
-        """Tell whether one more message of `peer` may be read at `now_s`, and count it if so.
+        """Tell whether one more message of `peer` may be read at `now_s`; if so, it is taken from the peer's bucket.
 
-        Of more than PEERS peers, the one heard longest ago is forgotten; it begins again with a full burst.
+        Of more than PEERS peers, the one heard longest ago is forgotten; it would begin again with a full bucket.
         """
         if peer not in self._buckets and len(self._buckets) >= PEERS:
             del self._buckets[min(self._buckets, key=self._buckets.__getitem__)]

@@ -74,9 +74,9 @@ class Arming:
             raise RefusedError("fault", f"a fault came while arming: {', '.join(news)}", "tormagctl status")
 
     def _attempt(self, now_s: float, command: Event, give: Callable[[str], None]) -> None:
-        """Give `command` and note it; a refusal in WAITS is passed over for PATIENCE_S.
+        """Give `command` and note it. Raises RefusedError where it is refused, or was given and has not led on.
 
-        Raises RefusedError for any other refusal, and for a command that was given and has not led on by then.
+        Refusals in WAITS are passed over for PATIENCE_S after the last command or motion.
         """
         try:
             if command in self.given:

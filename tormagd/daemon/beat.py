@@ -144,9 +144,9 @@ class Phases:
             self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
-        """Run one part, and return whether it had something to do: it did not return False, or it raised.
+        """Run one part and keep its times; return False, and keep none, where it returned False: it had nothing to do.
 
-        An exception is logged and ends here.
+        An exception is logged and counts as something done.
         """
         start_ns = self._clock_ns()
         try:

@@ -113,7 +113,7 @@ class BlackBox:
             return
         self.journal.take()
         self._packer.take()
-        self._say(Begin(str(self._folder), header))
+        self._send(Begin(str(self._folder), header))
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
@@ -128,13 +128,13 @@ class BlackBox:
         try:
             self._packer.add(self.journal.take())
         except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
-            self._lose(f"an entry that cannot be written: {error}")
+            self._stop(f"an entry that cannot be written: {error}")
             return
         self._ticks += 1
         if self._ticks % PART_TICKS:
             return
         entries = self._packer.take()
-        is_taken = self._say(Part(record.monotonic_s, record.t_ns, entries))
+        is_taken = self._send(Part(record.monotonic_s, record.t_ns, entries))
         if not is_taken:
             self._dropped += 1
             self.journal.missed()
@@ -158,7 +158,7 @@ class BlackBox:
         name = f"{stamp}.{now_ns // 1_000_000 % 1_000:03d}Z-{reason}.mcap"
         self._refusal = ""
         self._asked.append(Write(name, reason, after_s, details))
-        self._ask()
+        self._send_requests()
         return self._folder / name
 
     def look(self) -> None:
@@ -166,7 +166,7 @@ class BlackBox:
 
         A keeper that has ended ends the black box.
         """
-        self._ask()
+        self._send_requests()
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
@@ -175,7 +175,7 @@ class BlackBox:
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
-        self._see_to()
+        self._stop_if_gone()
 
     def report(self) -> BlackBoxReport:
         """Return the state of the black box: its folder, the newest file, what went wrong, parts lost."""
@@ -190,7 +190,7 @@ class BlackBox:
         """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most."""
         beside = self._beside
         if beside is not None:
-            self._say(End())
+            self._send(End())
             self._beside = None
             beside.close()
             try:
@@ -198,26 +198,26 @@ class BlackBox:
             except subprocess.TimeoutExpired:
                 log.info("the black box is still being written")
 
-    def _ask(self) -> None:
+    def _send_requests(self) -> None:
         """Send the keeper the requests that wait; those that the socket does not take wait on."""
-        while self._asked and self._say(self._asked[0]):
+        while self._asked and self._send(self._asked[0]):
             self._asked.popleft()
 
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
         self.journal.snapshot(stepper, planner, None if self._connection is None else self._connection.memory())
 
-    def _say(self, what: Said) -> bool:
+    def _send(self, what: Said) -> bool:
         """Send one message to the keeper, and return whether the socket took it. A dead keeper ends the black box."""
         is_taken = self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
-        self._see_to()
+        self._stop_if_gone()
         return is_taken
 
-    def _see_to(self) -> None:
+    def _stop_if_gone(self) -> None:
         """End the black box where the keeper has ended."""
         if self._beside is not None and self._beside.is_gone:
-            self._lose("the process that keeps it has ended")
+            self._stop("the process that keeps it has ended")
 
-    def _lose(self, reason: str) -> None:
+    def _stop(self, reason: str) -> None:
         """End the black box: close the socket, and empty and stop the journal. Control goes on.
 
         `reason` goes into the log and into `report`.

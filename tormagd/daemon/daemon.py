@@ -254,7 +254,8 @@ class Daemon:
     async def _reload(self) -> None:
         """Read keys and configuration again, and take over what may change while control runs.
 
-        Logs which keys changed and which wait for a restart. A file that is refused leaves everything as it was.
+        Logs which keys of the configuration changed, and which wait for a restart. Lists of keys that are refused stay
+        as they were; so does a configuration that is refused. Neither raises.
         """
         # in threads: reading a file is nothing that a beat should wait for
         try:

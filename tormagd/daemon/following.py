@@ -48,8 +48,9 @@ class Following:
     def look(self, tick: TickRecord) -> None:
         """Take one tick, and add its error for each delay where it counts.
 
-        It counts ENABLED, with a sliding handle, a measured force, and none of the limits NOT_FOLLOWED. What was added
-        before fades by a factor e in FORGETS_S.
+        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED, after MOST_DELAY_S of
+        setpoints. Sums fade by a factor e in FORGETS_S. Out of ENABLED or without a setpoint, arrival and setpoints are
+        forgotten.
         """
         asked_N, measured_N, kept = tick.setpoint_cf, tick.measured_cf, self._kept
         self._weight *= kept

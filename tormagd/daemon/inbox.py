@@ -150,7 +150,7 @@ class SetpointInbox:
         if name == self.hold.source:
             self.hold = self.hold._replace(is_given=True)
             return
-        self._pass(name, "an operator's choice", is_given=True)
+        self._hand_over(name, "an operator's choice", is_given=True)
         self.newest = self._timed(source, now_s)
 
     def newest_is(self) -> tuple[str, int]:
@@ -258,7 +258,7 @@ class SetpointInbox:
                 source.refused += 1
                 self.refused += 1
                 return False
-            self._pass(setpoint.source, "that is stale" if is_free else "it goes before that")
+            self._hand_over(setpoint.source, "that is stale" if is_free else "it goes before that")
         elif order is not Order.NEWER:
             self.hold = hold._replace(number=hold.number + 1)  # behind it there is another process now
         source.accepted += 1
@@ -266,7 +266,7 @@ class SetpointInbox:
         self.newest = self._timed(source, now_s)
         return True
 
-    def _pass(self, name: str, why: str, *, is_given: bool = False) -> None:
+    def _hand_over(self, name: str, why: str, *, is_given: bool = False) -> None:
         """Make the source `name` the holder, and queue a log line that says `why`, unless it is the first."""
         if self.hold.source:
             self._news.append(f"source {name!r} holds the brake instead of {self.hold.source!r}: {why}")

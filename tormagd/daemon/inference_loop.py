@@ -56,7 +56,8 @@ class InferenceLoop:
         """Make a plan if a setpoint has come (`is_asked`) or if one is due; else do nothing.
 
         `measured` is the last step's measurement, None while the device is silent. `is_followed` says whether that step
-        followed the plan. A plan that fails ends as `_begin_afresh` says; nothing is raised.
+        followed the plan. Where planning fails, nothing is raised: the newest setpoint is withdrawn, the planner is
+        reset, and `on_failure` is called.
         """
         period_ns = self.timing.period_ns
         # by when beats are due, not by when they begin: lateness takes nothing from the rate
@@ -72,7 +73,8 @@ class InferenceLoop:
     def foresee(self, _beat: Beat) -> bool:
         """Make the forecast for the next plans, if one is due; return False where none is.
 
-        A forecast that fails ends as a plan does, and returns True.
+        Where that fails, nothing is raised: the newest setpoint is withdrawn, the planner is reset, and `on_failure` is
+        called.
         """
         try:
             is_made = self.planner.foresee()

@@ -38,7 +38,10 @@ class Histogram:
         self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
-        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0."""
+        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0.
+
+        Forgets durations from two horizons ago.
+        """
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s
             self._before, self._now = self._now, [0] * _BINS

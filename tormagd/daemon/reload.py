@@ -23,9 +23,10 @@ class Reread(NamedTuple):
 
 
 def reread(running: Config, read: Config) -> Reread:
-    """Take what may change while control runs (LIVE) from `read` into `running`; return the result.
+    """Return `running` with what may change while control runs taken from `read`: the keys in LIVE.
 
-    Neither configuration is changed. Every differing key is listed, as a path `a.b`.
+    The result also lists the keys that were taken, and those that differ but wait for a restart. Neither argument is
+    changed.
     """
     differing = tuple(_differing(msgspec.to_builtins(running), msgspec.to_builtins(read), ""))
     config = msgspec.structs.replace(

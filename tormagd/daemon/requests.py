@@ -36,7 +36,10 @@ class Requests:
         "How often the gap has been told to open."
 
     def put(self, waiting: Waiting) -> bool:
-        """Add a request behind its client's others; return False, with nothing added, where too many wait."""
+        """Add a request behind its client's others.
+
+        Returns False, with nothing added, where WAITING requests wait, or WAITING_PER_CLIENT of this client.
+        """
         client = waiting.envelope[0]
         if self.count >= WAITING or len(self._waiting.get(client, ())) >= WAITING_PER_CLIENT:
             return False

@@ -84,8 +84,8 @@ class SearchProcess:
 def main() -> None:
     """Answer questions that come in over a socket until its other end is closed.
 
-    The socket's descriptor is the first argument. The first packet holds what the core is built from. An answer is a
-    pickled Answer, or the ValueError of a search that found no field.
+    The socket's descriptor is the first argument. The first packet holds what the core is built from; `ready` says that
+    it is. An answer is a pickled Answer, or the ValueError of a search that found no field. SIGTERM is ignored.
     """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service's whole group gets it; the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:

@@ -65,9 +65,10 @@ class Service:
 def status_line(
     link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
 ) -> str:
-    """Return one line for `systemctl status`: state, faults or scene, and the next command.
+    """Return one line for `systemctl status`: the operating state with its faults, or the scene.
 
-    While the link does not run, it says why (`cause`) and what to do (`remedy`) instead.
+    Then comes the next command, if one is needed. While the link does not run, its state, `cause` and `remedy` come
+    instead.
     """
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:

@@ -203,7 +203,8 @@ class TelemetryLoop:
     def keep(self, reason: str, after_s: float) -> Path:
         """Ask for a black box that also holds the next `after_s`, and return the path it will have.
 
-        `reason` becomes part of its name. Raises RefusedError where none is kept.
+        `reason` becomes part of its name. It tells firmware, serial number and, where one is used, the profile's
+        digest. Raises RefusedError where none is kept.
         """
         link = self._connection.report()
         details = {
@@ -318,7 +319,9 @@ class TelemetryLoop:
     def command(self, request: Request) -> dict[str, Any]:
         """Carry out a request that is no question, and return its result as plain data.
 
-        Raises RefusedError where the state or its arguments do not allow it. The next `status` is made anew.
+        A request takes the brake, confirms, marks, keeps a black box, arms, or changes the scene. Any other is a
+        command to the operating state. Raises RefusedError where the state or the arguments do not allow it. The next
+        `status` is made anew.
         """
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
@@ -326,7 +329,7 @@ class TelemetryLoop:
         if request.command == "confirm":
             return self._confirm(request.args.get("what"))
         if request.command == "mark":
-            return self._put(request.args.get("text"))
+            return self._add_mark(request.args.get("text"))
         if request.command == "blackbox":
             return {"file": str(self.keep("REQUEST", 0.0))}
         if request.command == "arm":
@@ -341,7 +344,7 @@ class TelemetryLoop:
             "is_connected": self._connection.measurement is not None,
         }
 
-    def _put(self, text: object) -> dict[str, Any]:
+    def _add_mark(self, text: object) -> dict[str, Any]:
         """Put a mark with this text into telemetry, and so into recordings; return it as plain data.
 
         Raises RefusedError for what is not 1..MAX_MARK_CHARACTERS printable characters.
@@ -373,7 +376,10 @@ class TelemetryLoop:
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
-        """Give the brake to the source of this name, and return it with the one before. Raises RefusedError."""
+        """Give the brake to the source of this name; return its name with that of the holder before.
+
+        Raises RefusedError for what is no text, an unknown source, and one whose newest setpoint is no longer valid.
+        """
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
         inbox = self._endpoint.inbox

@@ -73,7 +73,10 @@ def judged(
 
 
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
-    """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there."""
+    """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there.
+
+    The ceiling does where the aim is beyond it, the model's range where it bounds the field, and all in HOLDING do.
+    """
     if limit is Limit.CEILING:
         return aim_mm < plan.min_gap_mm
     if limit is Limit.MODEL_RANGE:

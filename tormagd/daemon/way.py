@@ -23,7 +23,10 @@ class Way:
         self._stamp_s = -math.inf
 
     def ticked(self, now_s: float, used: Plan) -> None:
-        """Count the delay of a setpoint in the first tick, at `now_s`, along a plan for it; `used` is that plan."""
+        """Count the delay of a setpoint at its first control tick, at `now_s`, along the plan `used` for it.
+
+        Later ticks for the same setpoint count nothing, nor do plans without one.
+        """
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s

@@ -46,7 +46,11 @@ Bounds = tuple[float, float]
 
 @final
 class Governor:
-    """The stage that turns setpoints, of one publisher after another, into the forces to render."""
+    """The stage that turns setpoints, of one publisher after another, into the forces to render.
+
+    In its methods, `dt_s` is the time since the last plan, `force_N` what is asked for now, and `bounds` what scene and
+    device allow. `lag_s` is the lag of the carriages.
+    """
 
     time_s: float
     "Time of the newest plan."
@@ -109,7 +113,7 @@ class Governor:
         travel: Travel = AT_REST,
         held_N: float | None = None,
     ) -> Ask:
-        """Return the force to render now and those ahead, N, with the limits that hold them back.
+        """Return the force to render now and those ahead, N, with the limits that hold them back. Advances all state.
 
         `setpoint` is None without a publisher. `device` is what is known of the device's strength, `travel` the
         handle's motion. What is known ahead is looked at `lag_s` later, the carriages' lag. `held_N` is the force of a
@@ -262,10 +266,10 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S on the best path for a preview; now is `soon_s` after its stamp.
+        """Return the forces (7) at PATH_S on the best path for the setpoint's preview; now is `soon_s` after its stamp.
 
-        The forecast goes on from the end of a preview that is shorter than TIMES_S, and is forgotten for a longer one.
-        Updates `sent_N` and `expected_N`.
+        With a preview shorter than TIMES_S, the forecast goes on from its end, and its mean slope becomes the
+        setpoints' slope. A longer preview makes the forecast forget. Updates `sent_N` and `expected_N`.
         """
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
@@ -335,7 +339,8 @@ class Governor:
     def _left_from(self, force_N: float) -> tuple[float, float]:
         """Return the force at the last plan, and the force that the carriages were sent to then.
 
-        During a ramp both are `force_N`: the ramp leads to what is asked.
+        Where no path was followed, both are the force at the last plan. During a ramp both are `force_N`, what the ramp
+        leads to.
         """
         # what the ramp leads to is what is asked, not what the gap can make of it
         from_N = force_N if self.is_passing else self.asked_N
