@@ -1,5 +1,8 @@
-"""TOML that anybody may have written: refused by its shape before it is parsed, by its numbers after, and by what its
-tables may say: with the key's path, the value, what is allowed and the line."""
+"""Reading TOML that anybody may have written.
+
+A text is refused by its shape before it is parsed, then by its numbers, then by what its tables may say. A refusal
+names the key's path, the value, what is allowed and the line.
+"""
 
 import math
 import re
@@ -51,7 +54,7 @@ def toml_text(path: Path) -> str:
     Raises OSError, whose `strerror` says why it cannot be read, and TomlError for bytes that are not UTF-8.
     """
     try:
-        return read_bounded(path, MOST_BYTES).decode("utf-8-sig")  # editors on Windows put a mark before the first line
+        return read_bounded(path, MOST_BYTES).decode("utf-8-sig")  # editors on Windows put a byte order mark first
     except UnicodeDecodeError as error:
         raise TomlError(f"not UTF-8 text (byte {error.start})") from error
 
@@ -62,7 +65,7 @@ def toml_tables(text: str) -> dict[str, Any]:
     Also refused are lines beyond LONGEST_LINE, too deep nesting, numbers that are not finite, and integers beyond 64
     bits.
     """
-    import tomllib  # not above: who reads no file, as most commands of tormagctl, need not wait for it
+    import tomllib  # not above: most commands of tormagctl read no file, and need not wait for it
 
     for number, line in enumerate(text.splitlines(), start=1):
         if len(line) > LONGEST_LINE:

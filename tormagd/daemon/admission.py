@@ -1,8 +1,8 @@
-"""Who is let in: the CURVE keys of the guarded endpoints, and how many connections an address may have.
+"""Admission to the sockets: the CURVE keys of guarded endpoints, and the number of connections of an address.
 
-libzmq asks here (ZAP, RFC 27) about every peer whose handshake has proved that it has the secret key of the public one
-it shows, and tells here (socket monitors) about those that came no further, which send nothing to us and get nothing
-but ZMTP's greeting. The handshakes themselves are the work of libzmq's thread; what is left is a slice of the beat.
+libzmq carries out the handshakes in its own thread. Through ZAP (RFC 27) it asks about every peer that has proved that
+it holds the secret of its key. Through socket monitors it tells of peers that got less far. Both are handled in a slice
+of the beat.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ RECONNECT_S = 0.5
 GUARDED = {
     zmq.ZAP_ENFORCE_DOMAIN: 1,
     zmq.HANDSHAKE_IVL: 2_000,
-    # a machine that has gone without a word frees its connection after half a minute
+    # the connection of a machine that has gone without a word ends after half a minute
     zmq.TCP_KEEPALIVE: 1,
     zmq.TCP_KEEPALIVE_IDLE: 10,
     zmq.TCP_KEEPALIVE_INTVL: 5,
@@ -120,7 +120,7 @@ class _Connections:
 
         An empty `address`, of a peer that was gone before it was seen, stands for the oldest refused one.
         """
-        if not address and self.turned_away:  # it had gone before it was seen
+        if not address and self.turned_away:  # the peer had gone before its address was read
             return self.turned_away.popleft()
         if address not in self.turned_away:
             return None
@@ -218,7 +218,7 @@ class Admission:
             if not all(self.has_role(key, frozenset({role})) for role in listed.roles)
         ]
         if lost:
-            # what they send is looked at again each time; what is sent to them is not. Who may stay is back in a moment
+            # each message from a peer is checked against the list; what is sent to it is not. Allowed peers reconnect
             log.warning("keys that are let in no more, or for less: %s", ", ".join(before[key].name for key in lost))
             for name in ("telemetry", "recording"):
                 if self._endpoints[name].is_guarded:
@@ -277,7 +277,7 @@ class Admission:
             if kind == zmq.EVENT_ACCEPTED:
                 self._accepted(known, value)
             elif kind == zmq.EVENT_DISCONNECTED:
-                self._admit()  # it may have been asked about before it left, and is counted once
+                self._admit()  # a question about its key may still wait: it is counted once
                 self._disconnected(known, value)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                 other = known.told()
@@ -317,13 +317,13 @@ class Admission:
             known.cut.discard(descriptor)
             failed = "too many connections"
         if was_asked:
-            return  # counted then
+            return  # counted when its key was refused
         if failed is None and (not known.is_guarded or known.admitted[address]):
             known.admitted -= Counter((address,))
             if known.name == "setpoint" and address:
                 self.left.append((address, time.monotonic()))
         else:
-            # a peer of an old version is closed without an event of its own
+            # libzmq closes a peer of an old ZMTP version without an event of its own
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
     def _count_oversize(self, name: str, address: str) -> None:

@@ -1,4 +1,4 @@
-"""What each peer may send: a bounded rate, with a burst. What is beyond is dropped unread."""
+"""Bounded rates of messages, with a burst, for each peer. Messages beyond the rate are dropped unread."""
 
 from tormagd.daemon.tally import Peer
 

@@ -1,4 +1,4 @@
-"""Arming on one word of a person: the commands that lead to a force that follows, each as soon as it can be given."""
+"""Arming by a single command: clears, homes and enables in turn, each as soon as the device allows it."""
 
 from collections.abc import Callable
 

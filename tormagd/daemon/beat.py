@@ -89,7 +89,7 @@ class Phases:
         self._last_ran, self._ran = self._ran, []
         for name, phase in self._phases:
             self._run(name, phase, beat)
-        # a quiet beat asks one slice, one that follows a busy beat all of them until one has something to do
+        # after a quiet slice one slice is asked; after a busy one all, until one has something to do
         for _ in range(len(self._slices) if self._is_busy else 1):
             self._turn = (self._turn + 1) % len(self._slices)
             self._is_busy = self._run(*self._slices[self._turn], beat)

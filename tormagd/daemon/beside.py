@@ -16,7 +16,7 @@ def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes
     """
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
-    # no signal for our group is meant for it: it ends when we have ended
+    # a session of its own: signals to our process group must not end it before us
     return subprocess.Popen(command, pass_fds=(number,), stdin=subprocess.DEVNULL, start_new_session=True)
 
 

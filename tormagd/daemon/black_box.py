@@ -1,9 +1,8 @@
-"""The black box: all that the core decides on, and all that passes between it and the device, is handed to another
-process, which keeps the newest of it.
+"""The black box: hands all inputs of the core, and all traffic with the device, to a process that keeps the newest.
 
-The control thread writes references into a journal, which become bytes behind each tick; those of 20 ticks
-go into a socket. It waits for nobody: what the socket does not take is lost and counted. Files are the other's
-business, and it outlives this process, however that ends.
+The control thread writes references into a journal, and encodes them behind each tick. The entries of 20 ticks go into
+a socket. It never waits: what the socket does not take is lost and counted. That process writes the files, and outlives
+the daemon, however the daemon ends.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""Causes: what is known of a fault when it is latched, in the figures of that very time."""
+"""Causes of faults and limits, in the figures of the moment at which they came up."""
 
 import logging
 from collections.abc import Iterable, Mapping

@@ -36,14 +36,14 @@ class ControlLoop:
 
         Keeps output, plan and measurement for telemetry, and records the tick in journal and timing.
         """
-        now_s = time.monotonic()  # of this very moment: a stall within the beat is one, too
+        now_s = time.monotonic()  # now, not when the beat began: a stall within the beat counts, too
         self.used, self.measurement = plan, self._connection.measurement
         self._journal.stepped()
         output = self.output = self.stepper.step(now_s, self.measurement, plan)
         self._connection.exchange(
             now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
-        # from the beginning of the beat: what the step waits for is part of the tick
+        # from the beginning of the beat: what ran before the step is part of the tick
         self.timing.record(beat.due_ns, beat.start_ns, time.monotonic_ns(), beat.merged)
 
     def command(self, name: str, conditions: Conditions) -> None:

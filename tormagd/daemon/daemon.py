@@ -1,4 +1,4 @@
-"""The daemon put together: one thread, one event loop, and in every period one beat of three loops."""
+"""The daemon put together: one thread, one event loop, and one beat a period that runs the three loops."""
 
 import asyncio
 import contextlib
@@ -199,7 +199,7 @@ class Daemon:
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
         if timing.delay_ns > timing.period_ns:
-            # it was late from when the first of those was due that it stands for
+            # late since the first of the missed beats was due
             self._causes.note_stall(control.stepper, self._phases.blame(beat.due_ns - beat.merged * timing.period_ns))
         else:
             self._phases.on_time()
@@ -248,7 +248,7 @@ class Daemon:
 
     def _begin_reload(self) -> None:
         self._reloading = self._loop.create_task(self._reload())
-        # an error that nobody expects is told at once
+        # an unexpected error is reported at once, not when the task is collected
         self._reloading.add_done_callback(asyncio.Task.result)
 
     async def _reload(self) -> None:
@@ -257,7 +257,7 @@ class Daemon:
         Logs which keys of the configuration changed, and which wait for a restart. Lists of keys that are refused stay
         as they were; so does a configuration that is refused. Neither raises.
         """
-        # in threads: reading a file is nothing that a beat should wait for
+        # in threads: no beat waits for a file
         try:
             if self._keys is None:
                 log.info("no list of keys to read again: there is no endpoints.curve")

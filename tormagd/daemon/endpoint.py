@@ -1,7 +1,7 @@
-"""The ZeroMQ endpoint: setpoints in, telemetry and recording out, commands answered.
+"""The ZeroMQ endpoint: takes setpoints, publishes telemetry and recording, answers commands.
 
 Everything that arrives is hostile until `messages.decode` has passed it. A refused message is counted, its reason kept,
-and control goes on. Who may connect at all is `admission`'s to say; how much each may send, `allowance`'s.
+and control goes on. `admission` decides who may connect, `allowance` how much each peer may send.
 """
 
 import contextlib
@@ -120,8 +120,8 @@ class Endpoint:
             frame = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             is_rest, self._is_in_parts = self._is_in_parts, frame.more
             if is_rest:
-                continue  # of a message that was refused by its first part
-            # both clocks at once, for each message: how they part says which clock was set, and a drain may be held up
+                continue  # the rest of a message that was refused with its first part
+            # both clocks at once, for each message: their difference shows which was set, and the loop may be held up
             now_s, realtime_ns = time.monotonic(), time.time_ns()
             peer = self._sender(frame, "setpoint")
             if not self._allowance.grants(peer, now_s):
@@ -206,7 +206,7 @@ class Endpoint:
         made = self._context.socket(kind)
         options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
         if kind == zmq.XPUB:
-            options |= {zmq.RCVHWM: SUBSCRIPTIONS, zmq.XPUB_VERBOSER: 1}  # every word, not only the first of each topic
+            options |= {zmq.RCVHWM: SUBSCRIPTIONS, zmq.XPUB_VERBOSER: 1}  # each one, not only the first of a topic
         for option, value in options.items():
             made.setsockopt(option, value)
         path = ipc_path(address)
@@ -236,7 +236,7 @@ class Endpoint:
             if not is_readable(to):
                 return
             frame = to.recv(zmq.NOBLOCK, copy=False)
-            peer: Peer | None = None  # of what libzmq says for one that has gone
+            peer: Peer | None = None  # where libzmq unsubscribes a peer that has gone
             with contextlib.suppress(zmq.ZMQError):
                 peer = self._sender(frame, name)
             if name == "telemetry":
@@ -313,7 +313,7 @@ class Endpoint:
                 f"{request.command!r} is not for the key {self.admission.name(key)}",
                 "its .key belongs in the daemon's folder of operators (operate), which SIGHUP reads again",
             )
-        # the gap has been told to open since this came: whatever it asks, it was meant for before that
+        # the gap was told to open after this request came: it was meant for the state before
         if waiting.opens < self.requests.opens and not is_observed:
             raise RefusedError(
                 "overtaken",
@@ -324,7 +324,7 @@ class Endpoint:
     def _reply(self, waiting: Waiting, reply: Reply) -> None:
         """Send the reply to the client that asked; drop it where the client has gone."""
         self.arrivals.touch(self._control)
-        # a client that has gone meanwhile is not our business
+        # the client may have gone meanwhile
         with contextlib.suppress(zmq.ZMQError):
             self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
 

@@ -1,7 +1,7 @@
-"""How well the force is followed: measured less asked, as it is, and with the delay taken out that explains most of it.
+"""How well the force is followed: the RMS of measured less asked force, with and without the delay that explains most.
 
-Counted are the moments at which the force could be followed: ENABLED, with a setpoint that a device can give, and a
-handle that slides. Neither the way to the first force counts, nor the decay after the last.
+Only ticks at which the force could be followed count: ENABLED, a setpoint that the device can give, and a handle that
+slides. The way to the first force does not count, nor does the decay after the last.
 """
 
 import math

@@ -32,7 +32,7 @@ class Heartbeat:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
 
     def fileno(self) -> int:
-        """The descriptor to watch for reading."""
+        """Return the descriptor that becomes readable at each beat."""
         return self._fd
 
     def beats(self) -> int:

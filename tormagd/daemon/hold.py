@@ -1,6 +1,6 @@
-"""Who holds the brake: one source at a time, until it is stale, gives way to one that goes before it, or is relieved.
+"""Which source holds the brake: one at a time, until it is stale, a source of higher priority sends, or it is relieved.
 
-Pure: what is decided on is handed in.
+Pure functions of their arguments.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
-"""The inbox: which of the setpoints that several publishers sent is the one to plan for.
+"""The inbox: chooses the setpoint to plan for among those of several publishers.
 
-Each message goes through judgements, a module each: is it newer than what its source sent before (`sequence`), does its
-stamp count in ns (`stamp_unit`), how old is it by a clock that may be wrong (`source_clock`), how does its source send
-(`source_manner`), and does that hold the brake (`hold`)?
+Five judgements are made of each message, a module each. Is it newer than the last of its source (`sequence`)? Do its
+stamps count ns (`stamp_unit`)? How old is it, by a clock that may be wrong (`source_clock`)? How does its source send
+(`source_manner`)? May its source hold the brake (`hold`)?
 """
 
 import logging
@@ -52,7 +52,7 @@ class _Source:
 
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
         self.setpoint, self.heard_s = setpoint, now_s
-        self.stamp_s = -math.inf  # nothing of it has been taken yet
+        self.stamp_s = -math.inf  # no setpoint of this source has been taken yet
         self.sequence = Sequence(setpoint.session, setpoint.seq)
         self.unit, self.clock, self.manner = StampUnit(), SourceClock(), SourceManner()
         self.delays = Histogram()
@@ -84,11 +84,11 @@ class _Source:
         clock = self.clock
         if clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
-            # a way of over 0.2 s is taken for the clock; which of the two it is, nobody can tell from here
+            # a way of over 0.2 s counts as the clock's offset: the two cannot be told apart from here
             hidden_s = clock.offset_s if 0.0 < clock.offset_s < MOST_LATE_S and not clock.steps else 0.0
             preview_s = len(setpoint.preview_N or ()) * (setpoint.preview_dt_ms or 0.0) * 1e-3
             self.manner.hear(now_s, hidden_s + delay_s, self.sequence.lost, preview_s, needs)
-        # the worse of arrival and corrected stamp: a stamp of the time to come is of now
+        # a stamp in the future counts as now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 
 
@@ -260,7 +260,7 @@ class SetpointInbox:
                 return False
             self._hand_over(setpoint.source, "that is stale" if is_free else "it goes before that")
         elif order is not Order.NEWER:
-            self.hold = hold._replace(number=hold.number + 1)  # behind it there is another process now
+            self.hold = hold._replace(number=hold.number + 1)  # another process sends as this source now
         source.accepted += 1
         self.accepted += 1
         self.newest = self._timed(source, now_s)
@@ -410,7 +410,7 @@ def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: 
         way, often = "forward" if clock.stepped_s > 0.0 else "back", f", the last of {clock.steps} times"
         causes.append(f"it was set {way} by {abs(clock.stepped_s):.3f} s{often if clock.steps > 1 else ''}")
     if fit is not None and fit.windows >= SURE_WINDOWS:
-        # the slope's standard deviation, ppm: that of points at even spacing around a line
+        # standard deviation of the slope, ppm, of a line through evenly spaced points
         sd_ppm = fit.residual_us * math.sqrt(12.0 / fit.windows) / (fit.windows * WINDOW_S)
         if abs(fit.drift_ppm) - 3.0 * sd_ppm > MOST_DRIFT_PPM:
             causes.append(f"it runs {abs(fit.drift_ppm):.0f} ppm {'fast' if fit.drift_ppm > 0.0 else 'slow'}")

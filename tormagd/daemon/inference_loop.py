@@ -60,7 +60,7 @@ class InferenceLoop:
         reset, and `on_failure` is called.
         """
         period_ns = self.timing.period_ns
-        # by when beats are due, not by when they begin: lateness takes nothing from the rate
+        # counted from when beats are due, not when they begin: lateness does not lower the rate
         if not is_asked and beat.due_ns < self._due_ns:
             return
         start_ns = self._clock_ns()

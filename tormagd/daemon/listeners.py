@@ -1,6 +1,6 @@
-"""Who listens to a topic of the telemetry socket: nothing is built for nobody.
+"""Who subscribes to each topic of the telemetry socket, so that nothing is built for nobody.
 
-Whoever subscribes to everything hears a topic as long as somebody else asks for it by its name.
+A peer that subscribes to everything gets a topic only while another asks for it by its name.
 """
 
 from collections import Counter

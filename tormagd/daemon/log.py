@@ -8,8 +8,10 @@ from tormagd_client.printable import printable
 
 
 def log_to_stderr() -> None:
-    """Send the log of this process to stderr, a line a record; with the time only on a terminal, as a journal has its
-    own."""
+    """Send the log of this process to stderr, a line a record.
+
+    Times are added only on a terminal: a journal has its own.
+    """
     handler = logging.StreamHandler(sys.stderr)
     time_first = "%(asctime)s " if sys.stderr is not None and sys.stderr.isatty() else ""
     handler.setFormatter(LogFormatter(f"{time_first}%(levelname)s %(name)s: %(message)s"))

@@ -43,8 +43,8 @@ def main(arguments: list[str] | None = None) -> int:
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        load_config(options.config)  # what is wrong with it is said before the rest is loaded, which takes a moment
-        # here, not above: the signal has to be seen to first
+        load_config(options.config)  # a refusal comes before the rest is loaded, which takes a moment
+        # here, not above: the signal is set first
         from tormagd.daemon.start import start
 
         return start(options)

@@ -1,5 +1,7 @@
-"""Profiles of devices: read when a device says which one it is, kept when it is no longer driven. Files are read and
-written by another thread; the control thread only looks, once a telemetry period."""
+"""Profiles of devices: read once a device has told its serial number, written when it is no longer driven.
+
+Another thread reads and writes the files; the control thread only looks, once a telemetry period.
+"""
 
 import asyncio
 import hashlib
@@ -99,7 +101,7 @@ class Profiles:
         """
         if serial_number is not None and serial_number != self._serial_number:
             if self._serial_number is not None:
-                self._teach(NOTHING_LEARNED)  # that was another device
+                self._teach(NOTHING_LEARNED)  # what was learned is of another device
             self._serial_number, self._saved_ns, self._is_used = serial_number, None, False
             self._on_disk, self.digest = None, ""
             if self._folder is not None:
@@ -166,7 +168,7 @@ class Profiles:
             self._refusal = str(error)
             log.warning("the profile is not used: %s", error)
             return
-        # another device by now, or one that has shown itself meanwhile, is not told what it is
+        # another device is connected by now, or this one has shown itself meanwhile
         if profile is None or profile.serial_number != self._serial_number or self._believe.strength.fit is not UNSEEN:
             return
         now_ns = time.time_ns()

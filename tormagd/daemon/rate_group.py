@@ -107,7 +107,7 @@ class RateGroup:
         self.lateness = Histogram()
         self.exec = Histogram()
         self._worst_us = 0.0
-        # the last two turns of the horizon: rate and grade cover what the percentiles cover
+        # the beginnings of the last two horizons: rate and grade cover the time of the percentiles
         self._marks: deque[_Mark] = deque(maxlen=2)
         self._newest_ns = 0
 

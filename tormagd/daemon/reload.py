@@ -1,4 +1,4 @@
-"""SIGHUP: the configuration is read again. What can change while control runs does; what cannot is named."""
+"""Reading the configuration again on SIGHUP: some keys change while control runs, the others are named."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple

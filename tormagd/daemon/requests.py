@@ -1,4 +1,4 @@
-"""Requests that wait to be answered: every client in its turn, and none that a `stop` or `disable` has overtaken."""
+"""Requests that wait for an answer. Clients take turns; `stop` and `disable` overtake all that wait."""
 
 from collections import deque
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Another scene while the device is disabled: its core is built beside the beats, then takes the place of the other."""
+"""Changing the scene while the device is disabled: a new core is built beside the beats, then replaces the old one."""
 
 import asyncio
 import logging
@@ -43,7 +43,7 @@ class SceneChange:
         self._require()
         self.newest = SceneReport(scene=scene, is_over=False)
         self._changing = asyncio.get_running_loop().create_task(self._change(scene))
-        # an error that nobody expects is told at once
+        # an unexpected error is reported at once, not when the task is collected
         self._changing.add_done_callback(self._finish)
 
     async def _change(self, scene: str) -> None:

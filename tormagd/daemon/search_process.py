@@ -1,8 +1,8 @@
-"""The search that takes longer than a plan has, in a process of its own: `python -m tormagd.daemon.search_process FD`.
+"""The search for the field in a process of its own, where it takes longer than a plan has.
 
-It answers one question after the other over a socket of packets. The daemon waits for none: a plan takes the newest
-answer, and asks the next question when the last was answered and a period has passed. Both ends are of one installation
-and one parent, so what passes is pickled.
+The process runs `python -m tormagd.daemon.search_process FD`, and answers one question after another over a packet
+socket. The daemon never waits: a plan takes the newest answer. It asks the next question once the last is answered and
+a period has passed. Both ends belong to one installation and one parent, so packets are pickled.
 """
 
 import logging
@@ -87,7 +87,7 @@ def main() -> None:
     The socket's descriptor is the first argument. The first packet holds what the core is built from; `ready` says that
     it is. An answer is a pickled Answer, or the ValueError of a search that found no field. SIGTERM is ignored.
     """
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service's whole group gets it; the daemon still plans then
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd signals the whole service, and the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:
         config, scene, models = pickle.loads(asked.recv(MOST_PACKET))
         aim = build_core(config, scene, models).planner().aim

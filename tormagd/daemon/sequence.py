@@ -1,7 +1,7 @@
-"""Which messages of a publisher are newer than what was taken of it, and which come from one that was started again.
+"""Which messages of a publisher are newer than the last one taken, and which come from a publisher that has restarted.
 
-No number keeps a publisher out: what does not go on from the newest message may be old, repeated, wrong, or the first
-of a new run, and a new run shows itself in a few messages. No I/O and no clock.
+No number keeps a publisher out. A message that does not follow the newest may be old, repeated, wrong, or the first of
+a new run. A new run shows itself in a few messages. No I/O and no clock.
 """
 
 from enum import Enum

@@ -1,4 +1,4 @@
-"""What systemd is told: ready once the device is identified, a line on how it stands, and that we live."""
+"""What systemd is told: that the device is identified (ready), a status line, and that the daemon lives."""
 
 import os
 import socket
@@ -72,7 +72,7 @@ def status_line(
     """
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:
-        # what is wrong may come from the device or the kernel: it must not become lines of its own
+        # a text of the device or the kernel may have several lines; the status must be one
         why = " ".join(f"{cause}; {remedy}".split())
         return f"{told}; waiting for the device ({link}): {why}"
     if faults:

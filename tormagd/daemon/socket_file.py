@@ -1,4 +1,4 @@
-"""The file of an `ipc://` socket: one process at a time has it, and nothing but a socket is ever taken away for it."""
+"""The file of an `ipc://` socket: one process at a time has it, and only a left socket is ever replaced."""
 
 import contextlib
 import fcntl
@@ -41,7 +41,7 @@ class SocketFile:
     def _unlock(self) -> None:
         """Remove the lock's file, if it is still ours, and let the lock go."""
         held = os.fstat(self._lock)
-        # while it is held: whoever opened it before finds that its name has gone, and tries again
+        # before the lock is let go: a process that has opened the file then finds it gone, and tries again
         if _identity(self._lock_path) == (held.st_dev, held.st_ino):
             with contextlib.suppress(OSError):
                 self._lock_path.unlink()
@@ -76,7 +76,7 @@ def _locked(path: Path) -> int:
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
             return descriptor
-        os.close(descriptor)  # its owner ended, and took it away, between our opening and our locking it
+        os.close(descriptor)  # its owner removed it between our opening and our locking it
 
 
 def _lock(path: Path, descriptor: int) -> None:
@@ -101,7 +101,7 @@ def _listening(path: Path) -> socket.socket:
         raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
-        path.unlink(missing_ok=True)  # nobody has the lock: it is what a killed process left behind
+        path.unlink(missing_ok=True)  # nobody else holds the lock: a killed process left the socket
         made.bind(str(path))
         made.listen(100)
     except OSError as error:

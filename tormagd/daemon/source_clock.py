@@ -1,12 +1,12 @@
-"""A publisher's clock against ours, and how long its messages are on the way, from stamps and arrivals alone.
+"""A publisher's clock offset, and the delay of its messages, from stamps and arrivals alone.
 
-One way tells a difference, not its parts: `lateness`, our time minus the stamp, is what the clock is behind plus what
-the way took. What parts them is that no message is there before it was sent, that one publisher's messages do not
-overtake each other, and that a clock drifts slowly. So the least lateness is an envelope, the sum of the clock's offset
-and of the constant part of the way; what is above it is delay, what moves it is the clock. A constant offset and a
-constant way stay one number without a round trip: what a way can take (MOST_WAY_S) counts as the way.
+The lateness of a message, our time less its stamp, is the clock's offset plus the time on the way. Three facts part
+them. No message arrives before it was sent, those of one publisher do not overtake each other, and clocks drift slowly.
+So the least lateness is an envelope: the offset plus the constant part of the way. Lateness above it is delay; what
+moves it is the clock. Without a round trip, a constant offset and a constant way cannot be told apart: up to MOST_WAY_S
+counts as the way.
 
-No I/O and no clock: times are handed in.
+No I/O and no clock: times are arguments.
 """
 
 import math
@@ -116,7 +116,7 @@ class SourceClock:
                 self._begin(now_s, lateness_s)
                 return
         elif rise_s > gap_s + STEP_S:
-            # sent later and stamped earlier: by no delay. The way is taken to be what it was a moment ago
+            # sent later but stamped earlier, which no delay explains. The way is taken to be as before
             self.offset_s += rise_s
             self._set(now_s, -rise_s)
         else:

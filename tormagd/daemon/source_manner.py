@@ -1,6 +1,6 @@
-"""How a publisher's setpoints come: too seldom or too late for the scene, bunched, or with losses. Named once a second.
+"""How a publisher's setpoints come: too seldom, too late, unevenly, or with losses. Judged once a second.
 
-No I/O and no clock: times are handed in.
+No I/O and no clock: times are arguments.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
-"""What a publisher's stamps count in. Where they are far from our clock, they are held against it by how they run.
+"""The unit of a publisher's stamps. Stamps far from our clock are judged by how fast they run.
 
-A clock that was never set runs as fast as ours. Microseconds, milliseconds or seconds in the place of ns run a thousand
-times as slow or more. No I/O and no clock: times are handed in.
+A clock that was never set runs as fast as ours. Stamps in us, ms or s run a thousand times as slow, or more. No I/O and
+no clock: times are arguments.
 """
 
 FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}

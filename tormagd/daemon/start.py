@@ -1,4 +1,4 @@
-"""Builds the core as the configuration says, and runs the daemon; or prints what it would be."""
+"""Starting the daemon: builds the core as configured and runs the daemon, or prints what would run."""
 
 import argparse
 import sys
@@ -70,7 +70,7 @@ async def _run(
 
     Raises ConfigError where the search does not start, OSError where an endpoint cannot be bound.
     """
-    # before this thread is a real-time one: the process that is started keeps off its processors
+    # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     known = {} if folder is None else header(config, core)
     box = BlackBox(folder, known, config.rates.control_hz, config.recordings.key)

@@ -1,4 +1,4 @@
-"""Peers that were refused, or whose messages were not read: how often, and who."""
+"""Counts of peers that were refused, or whose messages were not read."""
 
 import logging
 from collections.abc import Callable

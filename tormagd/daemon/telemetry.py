@@ -1,4 +1,4 @@
-"""What one control tick was: the record of all of it, and the snapshot that is published of the newest."""
+"""The record of a control tick, and the telemetry message of the newest one."""
 
 import time
 from functools import lru_cache
@@ -97,7 +97,7 @@ _MODES = {mode: mode.name for mode in DeviceMode}
 _DRIVE_MODES = {mode: mode.name for mode in DriveMode}
 
 
-# a switch and a fault of the same bits are equal
+# typed: a switch and a fault of the same bits are equal
 @lru_cache(maxsize=None, typed=True)
 def _names(bits: Switches | DeviceFault) -> tuple[str, ...]:
     return tuple(str(bit.name) for bit in type(bits) if bit in bits)
@@ -137,7 +137,7 @@ def snapshot(
         governed_cf=tick.governed_cf,
         measured_cf=tick.measured_cf,
         predicted_cf=tick.predicted_cf,
-        # of a gap that is open, or on its way there, nobody plans the field
+        # no field is planned for a gap that is open or opening
         field_mT=None if tick.governed_cf is None else tick.field_mT,
         gap_mm=left + right if known else None,
         gap_setpoint_mm=tick.reference_gap_mm,

@@ -1,4 +1,4 @@
-"""The telemetry loop: at 50 Hz publish the snapshot and the ticks, answer commands and `status`, feed the watchdog."""
+"""The telemetry loop, at 50 Hz: publishes snapshot and ticks, answers requests, feeds the watchdog."""
 
 import logging
 import math
@@ -153,14 +153,14 @@ class TelemetryLoop:
         start_ns = time.monotonic_ns()
         endpoint, connections = self._endpoint, self._endpoint.admission.connections()
         self._following.look(self._ticks[-1])
-        # with this very snapshot those are answered who wait now; who asks later waits for the next
+        # requests that wait now are answered with this snapshot; later ones wait for the next
         self._status, self._answers = None, min(endpoint.requests.count, REQUESTS)
-        # nothing is packed for nobody
+        # no snapshot is packed without a listener
         if connections["telemetry"] or self._answers:
             self._newest = self._snapshot(start_ns * 1e-9)
             endpoint.publish(self._newest)
         self._publish_ticks()
-        # before anything is learned of a new device
+        # before the next plan learns from a new device
         identity = None if self._connection.link is None else self._connection.link.identity
         self._profiles.look(
             None if identity is None else identity.serial_number, self._control.stepper.safety.is_driven
@@ -340,7 +340,7 @@ class TelemetryLoop:
             self._control.command(request.command, self.conditions())
         return {
             "operating_state": str(self._control.stepper.safety.operating_state),
-            # without a device nothing moves yet: a request to open is kept for it, and no other is taken
+            # without a device, a request to open is kept for it, and no other is taken
             "is_connected": self._connection.measurement is not None,
         }
 
@@ -393,7 +393,7 @@ class TelemetryLoop:
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device
-        # a command or the end of a homing changes these after the snapshot, and whoever waits for that asks now
+        # these may have changed since the snapshot, by a command or a homing that a client waits for
         is_homed_ = self._is_homed()
         known = msgspec.structs.asdict(newest) | {
             "operating_state": str(safety.operating_state),

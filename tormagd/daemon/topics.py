@@ -1,4 +1,4 @@
-"""Topics of the telemetry socket: the handle's motion, and what becomes of every setpoint; for whoever subscribes."""
+"""Topics of the telemetry socket, for their subscribers: the handle's motion, and the verdict on every setpoint."""
 
 import time
 

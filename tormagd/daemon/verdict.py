@@ -1,4 +1,4 @@
-"""What becomes of a setpoint: it is rendered, it arrives in some time, or it cannot, and why. Pure."""
+"""The verdict on a setpoint: rendered, arrives in some time, or cannot, and why. Pure functions."""
 
 from typing import NamedTuple
 
@@ -59,7 +59,7 @@ def judged(
     if asked_N is None:
         return Judged(CANNOT, None, tuple(str(limit) for limit in plan.limits if limit in FORGOTTEN))
     aim_mm = portrait.gap_mm_at(device.model_N(asked_N))
-    # where nothing holds it, the plan's gap differs from the portrait's by the element's memory and the handle's rate
+    # unless the gap is held, it differs from the portrait's by the element's memory and the handle's rate
     if Limit.CEILING not in plan.limits and Limit.MODEL_RANGE not in plan.limits:
         gap_mm -= plan.gap_mm - portrait.gap_mm_at(device.model_N(plan.governed_N))
     if abs(device.force_N(portrait.force_N_at(gap_mm)) - asked_N) <= carriages.tolerance_N:

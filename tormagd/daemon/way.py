@@ -1,8 +1,8 @@
-"""The way of a setpoint from the sensor there to the force here: its parts, against a budget.
+"""The delay from the sensor on the patient's side to the force at the handle, in parts, against a budget.
 
-From the stamp to the first duty that follows it, by the corrected clock of its source; from a Drive to its State, by
-the link; and how late the carriages are believed to be. What the sensor's own filters and the stamp leave out, nobody
-here can see.
+The parts: from the stamp, by the corrected clock of its source, to the first duty that follows it; from a Drive to its
+State, by the link; and the believed lag of the carriages. Delay before the stamp, as of the sensor's filters, cannot be
+seen here.
 """
 
 import math
@@ -30,7 +30,7 @@ class Way:
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
-            if stamp_s > -math.inf:  # a duty that follows no setpoint ends no way
+            if stamp_s > -math.inf:  # -inf: the plan follows no setpoint
                 self.to_duty.add(now_s, (now_s - stamp_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float) -> WayReport:

@@ -1,13 +1,13 @@
 """The force asked of the device, now and ahead, from the publisher's setpoint, with the reason for every difference.
 
 now       what the setpoint asks for at the handle's place and way, within what the scene allows and the device gives
-ahead     its wall, as the handle moves; its preview; without one its slope, and the forecast as far as that is trusted
-path      where what comes is known: the forces along the gap's path that misses least of them, but before a wall none
-          that is EARLY_N over what is felt there
-blend     from one wall to the next or to none, at the scene's release rate beside what the handle's motion makes of it
-decay     without a setpoint, or with one that is too old: to F_min at the scene's release rate
-passing   to a publisher's forces, at the same rate: from another one's, and from where the force was while it followed
-          none, as before the first, while the gap was open or held, or after a silence
+ahead     a wall's forces as the handle moves, or a preview; else the setpoints' slope, and a forecast as far as trusted
+path      where forces ahead are known: those of the gap's path that misses them least; before a wall at most EARLY_N
+          over the force there
+blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes
+decay     without a setpoint, or with one that is too old: to the device's least force at the scene's release rate
+passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none, as
+          before the first setpoint, while the gap was open or held, or after a silence
 """
 
 import math
@@ -139,7 +139,7 @@ class Governor:
         if age_s > setpoint.valid_for_s:
             return self._decay(dt_s, lowest_N, age_s, (Limit.STALE, *setpoint.limits))
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
-        # what comes is told from what is asked: the least that the device makes is learned, and so it varies
+        # slope and forecast are of what is asked: the least force of the device is learned, and varies
         asked_N = setpoint.asked_N(travel)
         allowed_N = within(asked_N, self._allowed)
         blended_N = self._blended(setpoint, travel, allowed_N, dt_s)
@@ -253,7 +253,7 @@ class Governor:
         if not self._has_forecast:
             return 0.0
         self.forecast.update(stamp_s, allowed_N)
-        # one that has fallen silent for longer than a stream may is not believed to go on as it did
+        # a publisher that has fallen silent is not believed to go on as it did
         return self.forecast.trust if age_s <= MAX_STEP_S else 0.0
 
     def _previewed(
@@ -342,7 +342,7 @@ class Governor:
         Where no path was followed, both are the force at the last plan. During a ramp both are `force_N`, what the ramp
         leads to.
         """
-        # what the ramp leads to is what is asked, not what the gap can make of it
+        # a ramp leads to what is asked, whatever the gap can make of it
         from_N = force_N if self.is_passing else self.asked_N
         return from_N, from_N if self.is_passing or self.sent_N is None else self.sent_N
 
@@ -368,7 +368,7 @@ class Governor:
         The force above `lowest_N` never grows, even where a device is found to be weaker. The next setpoint is reached
         along a ramp.
         """
-        # a device that is found to make less than was believed is not asked for more above its least than it was
+        # where a device turns out weaker, the force above its least does not grow
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
         self.asked_N, self.above_N, self.is_passing = lowest_N + above_N, above_N, True
         self._forget()
@@ -405,7 +405,7 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         return
     if not 0.0 < setpoint.preview_dt_s <= _LARGEST:
         raise DomainError("preview_dt_s", setpoint.preview_dt_s, "above 0 s")
-    # one look for NaN and infinity, wherever they stand; a force that acts is held to its bounds where it does
+    # one sum finds NaN and infinity anywhere; each force is held to its bounds where it is used
     if not -_LARGEST <= sum(setpoint.preview_N) <= _LARGEST:
         for force_N in setpoint.preview_N:
             require_number("preview_N", force_N)
