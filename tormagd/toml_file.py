@@ -141,9 +141,9 @@ def table_in(kind: Any) -> type[msgspec.Struct] | None:
 
 
 def _known_key(kind: Any, message: str) -> str:
-    """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key of old.
+    """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key in GONE.
 
-    Empty where no key is unknown, or where none of `kind` is near.
+    Empty where the message names no unknown key, or where no key of `kind` at that place is near.
     """
     if (unknown := _UNKNOWN.search(message)) is None or unknown[1] in GONE:
         return GONE[unknown[1]] if unknown else ""

@@ -57,7 +57,7 @@ class Causes:
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
-        """Return each fault with its cause, in the figures of when it was latched, and its remedy."""
+        """Return each fault with its cause, in figures of when it was latched where there are any, and its remedy."""
         return explanations(faults, FAULTS, self._told)
 
     def of_limits(
@@ -67,7 +67,7 @@ class Causes:
         of_sources: Mapping[Limit, Explanation],
         measurement: Measurement | None,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause in figures, and its remedy.
+        """Return each limit with its cause, in figures where there are any, and its remedy.
 
         `replaced` names the inputs that the model was held to its range in. `of_sources` are explanations of limits
         about publishers. `measurement` is the newest; None without a device.

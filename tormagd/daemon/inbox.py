@@ -119,10 +119,10 @@ class SetpointInbox:
         self._turn = 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
-        """Decode and judge one message; return True if it became the newest setpoint.
+        """Decode and judge one message; return True if it became the newest setpoint. Nothing is raised.
 
-        A message that is refused is counted, and `last_refusal` says why; nothing is raised. `now_s` is the control
-        clock, `realtime_ns` CLOCK_REALTIME of the same moment.
+        Old or repeated messages count in `dropped`, refused ones in `refused`. `last_refusal` says why, unless another
+        source holds the brake. `now_s` is the control clock, `realtime_ns` CLOCK_REALTIME of the same moment.
         """
         try:
             setpoint = decode(data, Setpoint)
@@ -225,9 +225,9 @@ class SetpointInbox:
     def _judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> bool:
         """Judge a decoded setpoint; return True if it became the newest.
 
-        A stray of its sequence is dropped and counted. A setpoint of a source that may not take the brake is refused
-        and counted. Raises MessageError for one source too many, for stamps that do not count ns, and for a stamp too
-        far ahead.
+        A stray of its sequence is dropped and counted. One whose source may not take the brake is refused and counted,
+        and `last_refusal` stays. Raises MessageError for one source too many, for stamps that do not count ns, and for
+        a stamp too far ahead.
         """
         source, order = self._sources.get(setpoint.source), Order.NEWER
         if source is None:

@@ -106,8 +106,9 @@ class SourceClock:
     def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
         """Update offset, way and jitter from a message that came `gap_s` after the last.
 
-        A stamp that runs back shows that the clock was set. Otherwise the offset rises by what drift allows. After
-        FORGOTTEN_S of silence, or from another process, a lateness that does not fit begins the clock anew.
+        A stamp that runs back shows that the clock was set; else the offset rises by what drift allows. After
+        FORGOTTEN_S of silence, or from another process, neither is done. A lateness that does not fit then begins the
+        clock anew.
         """
         rise_s = lateness_s - self._lateness_s
         if not is_continued or gap_s > FORGOTTEN_S:

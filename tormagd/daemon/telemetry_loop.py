@@ -119,7 +119,7 @@ class TelemetryLoop:
     def record(self, _beat: Beat) -> None:
         """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing.
 
-        MOST_TICKS records are published at once where telemetry is slow.
+        Also counts the delay of a new setpoint. Where telemetry is slow, MOST_TICKS kept records are published first.
         """
         control = self._control
         if control.output is None or control.used is None:
@@ -357,7 +357,7 @@ class TelemetryLoop:
         return msgspec.to_builtins(self._mark)  # type: ignore[no-any-return]
 
     def _confirm(self, what: object) -> dict[str, Any]:
-        """Take the operator's word on what is wrong, "device" or "sensor", and log it.
+        """Take the operator's word on what is wrong, "device" or "sensor"; log it and return it.
 
         Raises RefusedError for any other word, and where the readings agree with the device.
         """

@@ -268,8 +268,9 @@ class Governor:
     ) -> list[float]:
         """Return the forces (7) at PATH_S on the best path for the setpoint's preview; now is `soon_s` after its stamp.
 
-        With a preview shorter than TIMES_S, the forecast goes on from its end, and its mean slope becomes the
-        setpoints' slope. A longer preview makes the forecast forget. Updates `sent_N` and `expected_N`.
+        With the term forecast and a preview shorter than TIMES_S, the forecast goes on from the preview's end. The
+        preview's mean slope then becomes `slope_N_s`. Otherwise the forecast forgets. Updates `sent_N` and
+        `expected_N`.
         """
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
