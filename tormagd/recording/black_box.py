@@ -1,8 +1,9 @@
-"""The black box's file: MCAP with three channels, and all that it takes to run the core again.
+"""The black box's file: an MCAP file with three channels, which holds all that running the core again needs.
 
-`/ticks` is that of a recording, for viewers and `tormagctl plot`, and `/frames` what passed between daemon and device.
-`/core` has both with whatever else the core was given, in its order, to the bit: msgpack, a message for each part that
-the daemon handed over. The metadata `black_box` are its header. `tormagctl replay` runs it.
+`/core` holds the core's inputs and results, exact to the bit and in their order. Each of its messages is one part that
+the daemon handed over, in msgpack. `/ticks` and `/frames` are derived from it, in JSON: `/ticks` as in a recording, for
+viewers and `tormagctl plot`; `/frames` what passed between daemon and device. The metadata record `black_box` is the
+file's header. `tormagctl replay` runs such a file.
 """
 
 import json
@@ -44,8 +45,10 @@ MAX_TIME_DIFFERENCE_NS = 1_000
 
 
 class BlackBoxFile(msgspec.Struct, frozen=True):
-    """One file: its header, and the entries of all its parts in their order, as plain data; a tick's record is a list
-    whose first value is an integer, any other entry a word or a list that begins with one."""
+    """One black box as read: its header, and the entries of all parts in their order, as plain data.
+
+    A tick's entry is a list that begins with an integer. Any other entry is a word, or a list that begins with one.
+    """
 
     header: dict[str, str]
     entries: list[Any]
@@ -56,8 +59,11 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
 
 
 class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What passed: on a bus one frame, on a serial port what was read at once, or one frame that was written. The time
-    is that of the ticks' `monotonic_s`, `data` are hexadecimal; without an `identifier` it is a serial port's."""
+    """Bytes between daemon and device: one CAN frame, one read of a serial port, or one frame written to it.
+
+    `monotonic_s` is on the clock of the ticks' `monotonic_s`. `data` is hexadecimal. `identifier` is None on a serial
+    port.
+    """
 
     monotonic_s: float
     direction: str
@@ -67,7 +73,10 @@ class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def frames_in(entry: Any) -> list[Frame]:
-    """The frames of an entry, none for one of another kind. Raises ValueError, TypeError for an odd one."""
+    """Return the frames in one entry of a black box; empty for an entry of another kind.
+
+    Raises ValueError or TypeError for an entry of READ or WROTE that is malformed.
+    """
     if not isinstance(entry, list) or not entry or entry[0] not in (READ, WROTE):
         return []
     direction, time_s, raw, *_ = entry
@@ -76,7 +85,8 @@ def frames_in(entry: Any) -> list[Frame]:
 
 
 class Shown(NamedTuple):
-    """A message that people see: its topic, when, and its number among those of its topic, from 0 or 1."""
+    """A message of `/ticks` or `/frames`: topic, time in ns since 1970, number within the topic (ticks from 0, frames
+    from 1)."""
 
     topic: str
     t_ns: int
@@ -85,7 +95,7 @@ class Shown(NamedTuple):
 
 
 class Derived:
-    """What people see of a black box, made from its parts."""
+    """Derives the messages of `/ticks` and `/frames` from the parts of `/core`; `columns` name the values of a tick."""
 
     def __init__(self, columns: tuple[str, ...]) -> None:
         self._columns = columns
@@ -94,8 +104,12 @@ class Derived:
         "Of the clock of `monotonic_s` to that of `t_ns`."
 
     def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
-        """The messages of a part. Frames are timed by the offset of the first part, so that they stay in their order;
-        None where nothing says it. Raises ValueError, TypeError for odd entries."""
+        """Yield the messages derived from one part's entries, and count them in `ticks`.
+
+        `offset_ns` takes the monotonic clock to ns since 1970. The first one given times all frames, so that they stay
+        in order; while it is None, frames count from 0 of the monotonic clock. Raises ValueError or TypeError for odd
+        entries.
+        """
         if self._offset_ns is None:
             self._offset_ns = offset_ns
         for entry in entries:
@@ -110,8 +124,10 @@ class Derived:
 
 
 def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> int:
-    """Writes a new file of some parts, whole or not at all, sealed with `key`; returns how many ticks are in it. Raises
-    FileExistsError, OSError."""
+    """Write a new black box of these parts, whole or not at all, and return how many ticks are in it.
+
+    `key` seals the file; an empty one seals it without a key. Raises FileExistsError where `path` exists, and OSError.
+    """
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
     with in_place_of(path) as beside:
@@ -119,6 +135,7 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], k
 
 
 def _write(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes) -> int:
+    """Write the file in place, sealed, and return how many ticks are in it."""
     columns = tuple(json.loads(header["columns"]))
     derived = Derived(columns)
     with path.open("wb") as file:
@@ -144,12 +161,16 @@ def _write(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes
 
 
 def is_tick(entry: Any) -> bool:
-    """Whether an entry is a tick's record."""
+    """Return whether an entry of a black box is a tick's record: a list that begins with an integer."""
     return isinstance(entry, list) and bool(entry) and type(entry[0]) is int
 
 
 def read_black_box(path: Path) -> BlackBoxFile:
-    """The black box in `path`. Raises RecordingError: not readable, not MCAP, damaged, or no black box."""
+    """Read the black box in `path`; one that was cut short is returned as far as it reads, with `is_complete` False.
+
+    Messages of `/ticks` and `/frames` that differ from `/core` are named in `odd`, and raise nothing. Raises
+    RecordingError where the file is not readable, not MCAP, damaged, or no black box.
+    """
     found = _Reading(path)
     with opened(path) as file:
         is_complete = scan(file, str(path), found.take, found.message)
@@ -164,7 +185,7 @@ NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC} or no h
 
 
 class _Reading:
-    """A black box as it is read. What people see in it is compared with what replays, message by message."""
+    """A black box while it is read: each message of `/ticks` and `/frames` is compared with what `/core` gives."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -179,7 +200,7 @@ class _Reading:
         self._size = self._parts = 0
 
     def take(self, record: Record) -> None:
-        """A record that is no message. Raises ValueError."""
+        """Take a record that is no message: channels and the header. Raises ValueError where `/core` is not msgpack."""
         if record.opcode == Opcode.CHANNEL:
             channel = record.read(Channel)
             if channel.topic == CORE_TOPIC and channel.message_encoding != "msgpack":
@@ -191,7 +212,10 @@ class _Reading:
                 self.header.update(known.metadata)
 
     def message(self, sent: Sent) -> None:
-        """A message: of the core, or derived from it. Raises UNREADABLE."""
+        """Take a message of `/core`, or compare one of `/ticks` or `/frames` with it.
+
+        Raises RecordingError where no header came before, and UNREADABLE (ValueError among them) for a damaged part.
+        """
         if not self.header:
             raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read
         topic = self._topics.get(sent.channel, "")
@@ -201,6 +225,8 @@ class _Reading:
             self._compare(topic, sent)
 
     def _part(self, sent: Sent) -> None:
+        """Keep a part's entries, and derive the messages that must follow; note in `odd` a part that derives none.
+        Raises ValueError beyond a bound."""
         self._size, self._parts = self._size + len(sent.data), self._parts + 1
         if self._size > MAX_BYTES or self._parts > MAX_PARTS:
             raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
@@ -217,6 +243,8 @@ class _Reading:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
 
     def _compare(self, topic: str, sent: Sent) -> None:
+        """Note in `odd` where a message is not the next one derived; frames may differ in time by one constant
+        offset."""
         expected = self._expected[topic].popleft() if self._expected[topic] else None
         if expected is None or (sent.sequence, sent.data) != (expected.sequence, expected.data):
             is_same = False
@@ -230,7 +258,7 @@ class _Reading:
             self.odd = f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has"
 
     def end(self) -> None:
-        """The file is over: nothing may be missing."""
+        """Note in `odd` the first derived message that the whole file does not have."""
         for topic, left in self._expected.items():
             if left and not self.odd:
                 self.odd = f"message {left[0].sequence} is missing in {topic}, and {CORE_TOPIC} has it"

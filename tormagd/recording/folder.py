@@ -1,7 +1,7 @@
-"""A folder of recordings: segments named by when they begin, within a budget of size and age.
+"""A folder of recordings: segments named by when they begin, kept within a budget of size and age.
 
-Its name says all that decides whether a segment is taken away: so that is so wherever a process is killed. Nothing is
-taken away that is marked, is being written, or has another name. The oldest goes first.
+A segment's name alone says its age and its mark, so pruning decides alike in every process, also after a kill. Pruning
+takes the oldest segment first. It spares a segment that is marked, is being written, or has another form of name.
 """
 
 import contextlib
@@ -28,7 +28,8 @@ _FORM = "%Y-%m-%dT%H-%M-%S"
 
 
 class Budget(NamedTuple):
-    """How long a segment gets, and what a folder may hold: bytes, seconds, and bytes that stay free on its disk."""
+    """How large and long one segment gets, how much and how old a folder may hold, and how much stays free on its
+    disk."""
 
     segment_bytes: int
     segment_s: float
@@ -38,7 +39,7 @@ class Budget(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """One recording in a folder; `began_s` is since 1970, None where its name does not say so."""
+    """One recording in a folder; `began_s` is in seconds since 1970, None where the name does not say when."""
 
     path: Path
     began_s: float | None
@@ -47,7 +48,7 @@ class Segment(NamedTuple):
 
 
 def segment_of(path: Path) -> Segment | None:
-    """What a file's name says; None for one that is not there any more."""
+    """Describe the recording in `path` by its name and size; None where the file does not exist."""
     named = _NAME.fullmatch(path.name)
     began_s = None
     with contextlib.suppress(ValueError):
@@ -61,8 +62,10 @@ def segment_of(path: Path) -> Segment | None:
 
 
 def mark(path: Path) -> Path:
-    """Keeps this segment from being taken away; returns its new name. Raises OSError, and ValueError for a file that is
-    not named as a segment."""
+    """Rename a segment so that pruning keeps it, and return its path; one that is marked already stays as it is.
+
+    Raises ValueError where the file is not named as a segment, and OSError where it cannot be renamed.
+    """
     named = _NAME.fullmatch(path.name)
     require(named is not None, "the name", path.name, "that of a segment, as tormagctl record DIR gives it")
     if named is None or named[3]:
@@ -77,18 +80,22 @@ def mark(path: Path) -> Path:
 
 
 class RecordingFolder:
-    """Segments in `path`, by this clock (s since 1970). Methods raise OSError."""
+    """Recordings in the folder `path` within `budget`; `clock` is in seconds since 1970. Every method may raise
+    OSError."""
 
     def __init__(self, path: Path, budget: Budget, clock: Callable[[], float] = time.time) -> None:
         self.path, self.budget, self._clock = path, budget, clock
 
     def segments(self) -> list[Segment]:
-        """All recordings in it, the oldest first, and those before them whose name says no time."""
+        """List the folder's recordings by age, the oldest first; those whose name says no time come before all."""
         found = [each for path in self.path.glob("*.mcap") if (each := segment_of(path)) is not None]
         return sorted(found, key=lambda each: (each.began_s or 0.0, each.path.name))
 
     def new(self) -> Path:
-        """Makes room for a segment, and names it."""
+        """Prune until a whole segment has room, and return the path for a new one, named by the present time.
+
+        Creates no file. Raises OSError with ENOSPC where even pruning leaves no room.
+        """
         reason = self.make_room(self.budget.segment_bytes + END_BYTES)
         if reason:
             raise OSError(errno.ENOSPC, reason)
@@ -96,24 +103,29 @@ class RecordingFolder:
         return self.path / f"{now:{_FORM}}.{now.microsecond // 1_000:03d}Z.mcap"
 
     def is_due(self, size: int, lasted_s: float) -> bool:
-        """Whether a segment of this size and length is to end."""
+        """Return whether a segment of this size (bytes) and length is to end."""
         return size >= self.budget.segment_bytes or lasted_s >= self.budget.segment_s
 
     def room(self, segment: Path, needed_bytes: int) -> str:
-        """As a recorder asks while it writes: why there is no room; empty where there is."""
+        """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty where there is.
+
+        A recorder asks this while it writes. `segment`, the file being written, plays no part.
+        """
         if shutil.disk_usage(self.path).free >= self.budget.free_bytes + needed_bytes:
             return ""
         return self.make_room(needed_bytes)
 
     def make_room(self, coming_bytes: int) -> str:
-        """Takes away what is too old, and the oldest until so many bytes more are within the budget. Returns why they
-        are not; empty where they are."""
+        """Prune for `coming_bytes` more within the budget, and return why they do not fit; empty where they do."""
         self.prune(coming_bytes)
         over = self._over(self.segments(), coming_bytes)
         return f"No space left on device: {over}, and nothing unmarked is left to take away" if over else ""
 
     def prune(self, coming_bytes: int = 0) -> list[Segment]:
-        """What was taken away."""
+        """Delete segments too old, and the oldest until `coming_bytes` more fit the budget; return those deleted.
+
+        Keeps what is marked, is being written, has no time in its name, or is a link.
+        """
         left, gone = self.segments(), []
         for segment in list(left):
             is_old = segment.began_s is not None and self._clock() - segment.began_s > self.budget.most_s
@@ -123,7 +135,10 @@ class RecordingFolder:
         return gone
 
     def mark_around(self, segment: Path) -> Path:
-        """Marks a segment, and the one before it where that ended shortly before now; returns its new name."""
+        """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return the new path.
+
+        Raises ValueError where `segment` is not named as one. A failure to mark the one before is passed over.
+        """
         marked = mark(segment)
         known = self.segments()
         place = [each.path for each in known].index(marked)
@@ -134,7 +149,8 @@ class RecordingFolder:
         return marked
 
     def _over(self, left: list[Segment], coming_bytes: int) -> str:
-        """Why so many bytes more are too many; empty where they are not."""
+        """Say why `coming_bytes` beside the segments `left` break the budget or the disk's reserve; empty where they do
+        not."""
         size, free = sum(each.bytes for each in left), shutil.disk_usage(self.path).free
         if size + coming_bytes > self.budget.most_bytes:
             over = f"{size / 1e6:.1f} MB are in {self.path}, up to {coming_bytes / 1e6:.1f} come"
@@ -144,7 +160,7 @@ class RecordingFolder:
         return ""
 
     def _is_taken(self, segment: Segment) -> bool:
-        """Takes it away, unless something keeps it."""
+        """Delete a segment and return True; False where it is marked, unnamed, a link, or being written."""
         if segment.is_marked or segment.began_s is None or segment.path.is_symlink():
             return False
         with contextlib.suppress(FileNotFoundError), segment.path.open("rb") as file:

@@ -1,7 +1,7 @@
-"""How well a force was followed: only while it was to be, as it is and with the delay taken out.
+"""How well the measured force followed the asked one: RMS as recorded, and with the delay taken out.
 
-Following begins when the device is ENABLED with a fresh setpoint, and either the measured force has come near the asked
-one or the approach has had its second. It ends with either. So neither approach nor decay is in it.
+Following begins with an ENABLED device and a fresh setpoint, once the measured force is within NEAR_N of the asked one
+or APPROACH_NS have passed. It ends with the state or the setpoint. So neither approach nor decay is counted.
 """
 
 import math
@@ -21,8 +21,11 @@ DELAYS = 31
 
 
 class FollowingReport(msgspec.Struct, frozen=True):
-    """RMS of measured minus asked while following, for how long, and the same `delay_ms` later, where it is least; None
-    where nothing was followed. The sensor's noise is in both."""
+    """How a force was followed: RMS of measured minus asked, for how long, and the RMS at the delay where it is least.
+
+    `aligned_rms_N` compares the force with what was asked `delay_ms` earlier. None where nothing was followed, or too
+    little to tell a delay. Both RMS values include the sensor's noise.
+    """
 
     rms_N: float | None = None
     seconds: float = 0.0
@@ -31,7 +34,7 @@ class FollowingReport(msgspec.Struct, frozen=True):
 
 
 class Following:
-    """The sums on the way."""
+    """Sums up the error between measured and asked force, message by message, in bounded memory."""
 
     def __init__(self) -> None:
         self._count, self._sum, self._lasted_ns = 0, 0.0, 0
@@ -41,7 +44,10 @@ class Following:
         self._sums, self._counts = [0.0] * DELAYS, [0] * DELAYS
 
     def add(self, t_ns: int, asked_N: float | None, measured_N: float | None, message: Mapping[str, Any]) -> None:
-        """One moment, in their order."""
+        """Add the next message with its forces; following ends where either is None, or the setpoint does not rule.
+
+        Tries each of DELAYS delays once every STEP_NS. `message` gives `operating_state` and `limits`.
+        """
         if asked_N is None or measured_N is None or not is_asked(message):
             self._is_due = self._is_following = False
             self._asked.clear()
@@ -68,7 +74,10 @@ class Following:
                     self._counts[i] += 1
 
     def made(self) -> FollowingReport | None:
-        """What is known; None where nothing was followed."""
+        """Report the error so far; None where nothing was followed.
+
+        `aligned_rms_N` and `delay_ms` are None where messages came too far apart to tell a delay.
+        """
         if not self._count:
             return None
         rms_N = math.sqrt(self._sum / self._count)
@@ -80,6 +89,6 @@ class Following:
 
 
 def is_asked(message: Mapping[str, Any]) -> bool:
-    """Whether the force is to be the setpoint's; so it is where no state is recorded."""
+    """Return whether the setpoint rules the force: ENABLED, or no state recorded, and no limit of AWAY."""
     state = message.get("operating_state")
     return state in (None, "ENABLED") and AWAY.isdisjoint(message.get("limits") or ())

@@ -1,7 +1,7 @@
 """The process that keeps a daemon's black box: `python -m tormagd.recording.keeper DESCRIPTOR`.
 
-It holds the newest half minute in memory and writes it when it is told to; or when the daemon is gone that did not say
-it would end, whatever became of it.
+It holds the newest half minute in memory and writes it to a file when the daemon says so. It also writes it when the
+daemon is gone without having said that it ends.
 """
 
 import contextlib
@@ -36,7 +36,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Ring:
-    """The newest parts: of at most KEPT_S before the last, and MOST_BYTES."""
+    """The newest parts of a black box: none over `kept_s` older than the last, at most `most_bytes`, and always the
+    last."""
 
     def __init__(self, kept_s: float = KEPT_S, most_bytes: int = MOST_BYTES) -> None:
         self._kept_s, self._most_bytes = kept_s, most_bytes
@@ -44,7 +45,7 @@ class Ring:
         self.bytes = 0
 
     def put(self, part: Part) -> None:
-        """Takes one, and forgets those that are too old or too many."""
+        """Add a part, and drop the oldest while they are too old or too large."""
         self._parts.append(part)
         self.bytes += len(part.entries)
         parts = self._parts
@@ -52,12 +53,12 @@ class Ring:
             self.bytes -= len(parts.popleft().entries)
 
     def parts(self) -> list[Part]:
-        """What is kept, the oldest first."""
+        """List what is kept, the oldest first."""
         return list(self._parts)
 
 
 class Keeper:
-    """One daemon's."""
+    """Keeps the black box of the daemon at the other end of the socket `its`, and writes it to files."""
 
     def __init__(self, its: socket.socket) -> None:
         self._socket = its
@@ -67,7 +68,10 @@ class Keeper:
         self._writing: threading.Thread | None = None
 
     def run(self) -> None:
-        """Until the daemon ends."""
+        """Keep and write black boxes until the daemon ends, then write all that is still due.
+
+        Each file is written in a thread of its own, one at a time.
+        """
         while self._is_heard():
             if self._writing is not None and self._writing.is_alive():
                 continue  # one at a time
@@ -83,7 +87,10 @@ class Keeper:
             self._write(write, self._begun, self._ring.parts())
 
     def _is_heard(self) -> bool:
-        """Waits a little for what the daemon says; False once it has ended."""
+        """Wait for one packet from the daemon and take it; False once the daemon has ended.
+
+        Where the socket closes without End, a file named DAEMON-DIED becomes due.
+        """
         ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
         if not ready:
             return True
@@ -101,6 +108,7 @@ class Keeper:
         return not isinstance(said, End)
 
     def _take(self, said: Said) -> None:
+        """Take a part, begin anew with an empty ring, or queue a file; one over MOST_DUE is refused with an answer."""
         match said:
             case Part():
                 self._ring.put(said)
@@ -112,6 +120,8 @@ class Keeper:
                 self._answer(Written(said.name, f"{said.name}: {MOST_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
+        """Write one black box, delete files beyond MOST_FILES, and answer the daemon; a failure is logged and
+        answered."""
         from tormagd.recording.black_box import write_black_box
 
         with contextlib.suppress(OSError):
@@ -131,12 +141,14 @@ class Keeper:
         self._answer(Written(write.name, refusal))
 
     def _answer(self, answer: Written) -> None:
+        """Send an answer without waiting; a daemon that does not read is passed over."""
         with contextlib.suppress(OSError):  # there may be nobody any more
             self._socket.send(msgspec.msgpack.encode(answer), socket.MSG_DONTWAIT)
 
 
 def _key(file: str) -> bytes:
-    """The key of the seals. Without the file there is none: a black box is worth more than its seal."""
+    """Read the seals' key from `file`; empty, and a warning, where it cannot be read: a box is worth more than its
+    seal."""
     from tormagd.recording.seal import read_key
 
     try:
@@ -147,7 +159,7 @@ def _key(file: str) -> bytes:
 
 
 def main() -> None:
-    """Keeps until the daemon at the other end of the descriptor ends."""
+    """Keep the black box until the daemon ends that holds the other end of the socket descriptor in `sys.argv[1]`."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # it ends after the daemon, not with it
     with socket.socket(fileno=int(sys.argv[1])) as its:

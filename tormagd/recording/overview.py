@@ -1,8 +1,8 @@
-"""A recording at a glance: what pictures, pages and reports show of all of it, in bounded memory.
+"""A recording's overview: what pictures, pages and reports show of its whole length, in bounded memory.
 
-Time is cut into stretches of one width, which doubles when there are too many; of each stretch there is the least and
-the greatest value of each quantity. The recorder writes it at the end of its file. Of a file without one it is made
-anew, by the same steps, from the same messages.
+Time is cut into stretches of equal width. Where there are too many, their width doubles. Each stretch holds the least
+and the greatest value of each quantity. The recorder writes the overview at the end of its file. A reader of a file
+without one makes it from the messages, by the same steps.
 """
 
 import math
@@ -50,7 +50,7 @@ Words = Annotated[tuple[Word, ...], Meta(max_length=256)]
 
 
 class Glance(TypedDict, total=False):
-    """What an overview takes of a message, a control tick's or a snapshot's."""
+    """The fields that an overview reads from a control tick or a snapshot."""
 
     setpoint_cf: float | None
     governed_cf: float | None
@@ -72,8 +72,10 @@ class Glance(TypedDict, total=False):
 
 
 class Curves(msgspec.Struct, frozen=True):
-    """Stretches with a message in them, as bytes: their numbers (int64), and of each quantity the least and greatest
-    values (float32, NaN where none is known)."""
+    """Least and greatest value of each quantity in every stretch that has a message, as bytes.
+
+    `stretches` are their numbers (int64); `low` and `high`, by quantity, are float32 with NaN where no value is known.
+    """
 
     stretches: bytes
     low: dict[str, bytes]
@@ -81,7 +83,8 @@ class Curves(msgspec.Struct, frozen=True):
 
 
 class Series(msgspec.Struct, frozen=True):
-    """One quantity over time since the recording's start, in the middle of each stretch; shapes (n,) all."""
+    """One quantity over time: middle of each stretch in seconds since the start, least and greatest value; all shape
+    (n,)."""
 
     t_s: Floats
     low: Floats
@@ -89,14 +92,16 @@ class Series(msgspec.Struct, frozen=True):
 
 
 class Codes(msgspec.Struct, frozen=True):
-    """When a code was there: from, to, ns since the start; and for how long in all, which spans may overstate."""
+    """When a code was present: spans from..to in ns since the start; `held_ns` is the exact total, spans may be
+    joined."""
 
     spans_ns: list[tuple[int, int]]
     held_ns: int
 
 
 class Overview(msgspec.Struct, frozen=True, kw_only=True):
-    """All of a recording; times are ns since 1970, or since `start_ns`."""
+    """A whole recording in bounded size; times are ns since 1970 (`start_ns`, `end_ns`, marks), else ns since
+    `start_ns`."""
 
     start_ns: int
     end_ns: int
@@ -113,11 +118,12 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Return the time from the first message to the latest, s."""
         return (self.end_ns - self.start_ns) * 1e-9
 
     def series(self, name: str) -> Series | None:
-        """The quantity `name`, from the ticks or else from the snapshots; None where neither has a known value."""
+        """Return the quantity `name`, from the ticks or else from the snapshots; None where neither has a known
+        value."""
         for curves in (self.of_ticks, self.of_snapshots):
             if name in curves.low:
                 low, high = _numbers(curves.low[name]), _numbers(curves.high[name])
@@ -127,17 +133,17 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
-        """By code of this kind the stretches of time in which it was there, s since the start."""
+        """Return, by code of this kind, the spans in which the code was present, in seconds since the start."""
         known = self.codes.get(kind, {})
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
     def packed(self) -> bytes:
-        """As it stands in a file."""
+        """Encode the overview as it stands in a file: msgpack."""
         return msgspec.msgpack.encode(self)
 
 
 def unpacked(data: bytes) -> Overview:
-    """The overview that a file has. Raises ValueError for what is none."""
+    """Decode an overview that `Overview.packed` made. Raises ValueError for anything else, or beyond a bound."""
     if len(data) > MOST_BYTES:
         raise ValueError(f"an overview of {len(data)} bytes: allowed is {MOST_BYTES}")
     try:
@@ -159,7 +165,7 @@ def unpacked(data: bytes) -> Overview:
 
 
 class OverviewBuilder:
-    """An overview on its way."""
+    """Builds an overview message by message, in bounded memory."""
 
     def __init__(self) -> None:
         self._start_ns: int | None = None
@@ -172,7 +178,10 @@ class OverviewBuilder:
         self._marks: list[Mark] = []
 
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
-        """One message, in the order in which they were written."""
+        """Add one message, a control tick or a snapshot, in the order of writing; `t_ns` is since 1970.
+
+        `lateness_us` goes into the histogram. A mark counts once, and not one set before the recording began.
+        """
         if self._start_ns is None:
             self._start_ns = self._end_ns = t_ns
         since_ns = t_ns - self._start_ns
@@ -191,7 +200,10 @@ class OverviewBuilder:
             self._marks.append(mark)
 
     def made(self) -> Overview:
-        """What is known so far."""
+        """Return the overview of what was added; times are 0 where nothing was.
+
+        Ends every open span, so it belongs after the last message.
+        """
         width_ns = max(each.width_ns for each in self._stretches.values())
         for each in self._stretches.values():
             each.widen(width_ns)
@@ -212,7 +224,10 @@ class OverviewBuilder:
 
 
 def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """QUANTITIES of a message, as ticks or snapshots spell them."""
+    """Return the QUANTITIES of a tick or a snapshot in their order; None where not known.
+
+    A missing `gap_mm` is the sum of `left_mm` and `right_mm`. A missing `gap_setpoint_mm` is `reference_gap_mm`.
+    """
     get = message.get
     gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
     if gap_mm is None and left_mm is not None and right_mm is not None:
@@ -232,16 +247,18 @@ def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
 
 
 def _number(value: object) -> float | None:
+    """Return a float or an integer as it is, None for anything else, a boolean among them."""
     return value if value.__class__ is float or value.__class__ is int else None
 
 
 def codes_of(message: Mapping[str, Any], kind: str) -> tuple[str, ...]:
-    """A message's codes of this kind."""
+    """Return a message's codes of this kind, empty where it has none; odd characters become "?", 64 at most are
+    kept."""
     return _codes(message.get(kind))
 
 
 def _codes(told: object) -> tuple[str, ...]:
-    """The codes that a field tells, in characters that every picture can show."""
+    """Return the codes in a field's value, in characters that every picture can show."""
     words = (told,) if isinstance(told, str) else told if isinstance(told, tuple | list) else ()
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 
@@ -251,7 +268,7 @@ def _numbers(data: bytes) -> Floats:
 
 
 class _Stretches:
-    """The curves of one kind of message."""
+    """The least and greatest values of one kind of message, stretch by stretch."""
 
     def __init__(self) -> None:
         self.width_ns = FIRST_WIDTH_NS
@@ -260,6 +277,7 @@ class _Stretches:
         self._high = [array("f") for _ in QUANTITIES]
 
     def add(self, since_ns: int, values: Iterable[float | None]) -> None:
+        """Add values to their stretch, or to the last where time ran back; widen all where there are too many."""
         number = since_ns // self.width_ns
         # a clock that was set back does not set the curve back
         if not self._numbers or number > self._numbers[-1]:
@@ -279,7 +297,7 @@ class _Stretches:
                     high[-1] = value
 
     def widen(self, width_ns: int) -> None:
-        """To this width, which is some powers of two of the present one."""
+        """Merge stretches to this width, a power of two times the present one."""
         ratio, self.width_ns = width_ns // self.width_ns, width_ns
         if ratio == 1 or not self._numbers:
             return
@@ -301,7 +319,7 @@ class _Stretches:
 
 
 def _joined(spans: list[list[int]]) -> list[list[int]]:
-    """Fewer spans: those that lie nearest to each other are one; the last stays."""
+    """Join the spans with the smaller gaps between them, about half of all; the last span stays alone."""
     gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
     near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
     for span, gap_ns in zip(spans[1:-1], gaps, strict=True):
@@ -313,7 +331,7 @@ def _joined(spans: list[list[int]]) -> list[list[int]]:
 
 
 class _Codes:
-    """The codes of one kind of message, and when each was there."""
+    """The codes of one kind of message, and when each was present."""
 
     def __init__(self) -> None:
         self._known: dict[str, dict[str, list[list[int]]]] = {kind: {} for kind in KINDS}
@@ -323,6 +341,8 @@ class _Codes:
         self._step_ns = 0
 
     def add(self, since_ns: int, message: Mapping[str, Any]) -> None:
+        """Extend the last message's codes to this one, or, over a break, by one usual step; then begin this
+        message's."""
         passed_ns = 0 if self._last_ns is None else since_ns - self._last_ns
         if 0 < passed_ns <= BREAK_NS:
             self._step_ns = passed_ns
@@ -337,12 +357,14 @@ class _Codes:
         self._last_ns = since_ns
 
     def _extend(self, kind: str, to_ns: int, by_ns: int) -> None:
+        """Let the last message's codes of `kind` end at `to_ns`, and count `by_ns` more for each."""
         known = self._known[kind]
         for code in self._last[kind]:
             known[code][-1][1] = to_ns
             self._held[kind, code] += by_ns
 
     def _begin(self, kind: str, since_ns: int, codes: tuple[str, ...]) -> None:
+        """Continue spans that reach `since_ns`, and begin new ones. Codes over MOST_CODES count as OTHER."""
         known = self._known[kind]
         if len(known) >= MOST_CODES // len(KINDS) - 1:
             codes = tuple(code if code in known else OTHER for code in codes)
@@ -357,6 +379,7 @@ class _Codes:
         self._last[kind] = codes
 
     def made(self) -> dict[str, dict[str, Codes]]:
+        """Extend the last codes by one step, forget them, and return all spans by kind and code."""
         for kind in KINDS:
             if self._last_ns is not None:
                 self._extend(kind, self._last_ns + self._step_ns, self._step_ns)

@@ -1,4 +1,4 @@
-"""One picture of a recording: what was asked, what was rendered, and what held it back."""
+"""One picture of a recording: what was asked, what was rendered, and what held the force back."""
 
 import io
 from datetime import UTC, datetime
@@ -43,9 +43,9 @@ Spans = dict[str, list[tuple[float, float]]]
 
 
 def figure(overview: Overview, title: str, is_complete: bool = True) -> Figure:
-    """Four panels over one time axis: force, gap, duty, and lanes naming the state, limits and faults at each moment.
+    """Draw a recording as four panels over one time axis: force, gap, duty, and lanes for state, limits and faults.
 
-    Raises ValueError for a recording without messages.
+    `is_complete` False adds "recording cut short" to the title. Raises ValueError for a recording without messages.
     """
     if not overview.ticks and not overview.snapshots:
         raise ValueError("the recording has no messages: was the daemon running?")
@@ -85,14 +85,15 @@ def figure(overview: Overview, title: str, is_complete: bool = True) -> Figure:
 
 
 def picture(drawn: Figure, form: str) -> bytes:
-    """The figure as a file of this form, such as "png"."""
+    """Return the figure as the bytes of an image file of this form, such as "png"."""
     made = io.BytesIO()
     drawn.savefig(made, format=form, dpi=110)
     return made.getvalue()
 
 
 def save_plot(drawn: Figure, path: Path) -> None:
-    """Writes the figure to `path`. Raises ValueError for a suffix other than FORMATS; OSError."""
+    """Write the figure to `path`, whole or not at all. Raises ValueError for a suffix other than FORMATS, and
+    OSError."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
     data = picture(drawn, path.suffix[1:].lower())
@@ -102,7 +103,7 @@ def save_plot(drawn: Figure, path: Path) -> None:
 
 
 def followed(known: FollowingReport) -> str:
-    """How well the force was followed, in words; empty where it was not."""
+    """Say in words how well the force was followed; empty where nothing was."""
     if known.rms_N is None:
         return ""
     text = f"measured minus asked while following {known.rms_N * 1e3:.0f} mN rms"
@@ -112,6 +113,7 @@ def followed(known: FollowingReport) -> str:
 
 
 def _headline(overview: Overview, title: str, is_complete: bool) -> str:
+    """Name title, faults, a cut recording, and on a second line how well the force was followed."""
     names = ", ".join(overview.spans_s("faults"))
     told = followed(overview.following)
     parts = [
@@ -123,6 +125,7 @@ def _headline(overview: Overview, title: str, is_complete: bool) -> str:
 
 
 def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:
+    """Draw a quantity between least and greatest value, broken where messages are missing; nothing for None."""
     if data is None:
         return
     # from the least to the greatest of each stretch, and on to the next
@@ -140,6 +143,7 @@ def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, 
 
 
 def _dress(axes: Axes, label: str, quantity: str) -> None:
+    """Style a panel and give it a legend; a panel without lines says that nothing was recorded."""
     axes.set_ylabel(label)
     axes.grid(axis="both", color="#e6e6e6", linewidth=0.7)
     axes.set_axisbelow(True)
@@ -151,8 +155,7 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
 
 
 def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults: Spans) -> None:
-    """One lane for the operating state, one for every limit and fault that occurred, each with its name; limits with
-    their share of the time."""
+    """Draw one lane for the operating state and one for each limit and fault; limits with their share of the time."""
     held_s = {name: codes.held_ns * 1e-9 for name, codes in overview.codes["limits"].items()}
     shares = {name: 100.0 * held_s[name] / max(overview.duration_s, 1e-3) for name in limits}
     rows: list[tuple[str, list[tuple[str, Spans, str]]]] = [
@@ -181,7 +184,7 @@ def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults:
 
 
 def _name_spans(axes: Axes, name: str, spans: list[tuple[float, float]], row: int) -> None:
-    """The state's name inside its longest stretch; the clip keeps it from running over its neighbours' ends."""
+    """Write the state's name into its longest span."""
     start, end = max(spans, key=lambda span: span[1] - span[0])
     axes.annotate(
         name,

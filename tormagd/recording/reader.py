@@ -1,4 +1,4 @@
-"""Reading a recording: all of it at a glance, some seconds of it, or message by message."""
+"""Reading a recording: its overview, some seconds of it, or message by message."""
 
 import contextlib
 import struct
@@ -35,8 +35,10 @@ class RecordingError(ValueError):
 
 
 class Seen(NamedTuple):
-    """A control tick or a snapshot: when, ns since 1970, which it is, and its fields, as far as they are wanted. What
-    was not known is not there."""
+    """A control tick or a snapshot: its time in ns since 1970, which of the two, and the fields that were wanted.
+
+    A field without a known value is absent from `message`.
+    """
 
     t_ns: int
     is_tick: bool
@@ -45,7 +47,11 @@ class Seen(NamedTuple):
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """The file in `path`. Raises RecordingError where it is not readable."""
+    """Open the file in `path` for reading, as a context.
+
+    Raises RecordingError where it is not readable or no regular file. An OSError within the context becomes a
+    RecordingError, too.
+    """
     try:
         require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file:
@@ -56,7 +62,7 @@ def opened(path: Path) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def readable(name: str) -> Iterator[None]:
-    """Damage that is met within is a RecordingError, in which the file is called `name`."""
+    """Turn any of UNREADABLE raised within this context into a RecordingError that calls the file `name`."""
     try:
         yield
     except RecordingError:
@@ -66,9 +72,11 @@ def readable(name: str) -> Iterator[None]:
 
 
 def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Callable[[Sent], None]) -> bool:
-    """Hands each of the file's messages to `message`, any other record to `take`, which may raise UNREADABLE; False
-    where it ends in the middle of one. Raises RecordingError, in which the file is called `name`: not MCAP, or
-    damaged."""
+    """Read an MCAP file from its beginning: each message goes to `message`, any other record to `take`.
+
+    Returns whether the file ends as it should; False for one cut short. Raises RecordingError, naming the file `name`:
+    not MCAP, empty, damaged, or refused by a callback that raises UNREADABLE.
+    """
     last = -1
     with readable(name):
         for record in contents(file, message):
@@ -80,7 +88,7 @@ def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Cal
 
 
 class Place(NamedTuple):
-    """A chunk: its messages' times, ns since 1970, and where it begins in the file."""
+    """Where a chunk is: its messages' times in ns since 1970, and the byte at which it begins."""
 
     from_ns: int
     to_ns: int
@@ -88,8 +96,11 @@ class Place(NamedTuple):
 
 
 class Contents:
-    """What the records of a file tell, as they come: hands each tick and snapshot to `each`, decoded as the type
-    `wanted`, which may leave fields out. Raises UNREADABLE."""
+    """Collects what a file's records tell: metadata, chunks, and each tick or snapshot, which it hands to `each`.
+
+    Messages are decoded as the type `wanted`, which may leave fields out. `take` and `message` raise UNREADABLE for
+    damage.
+    """
 
     def __init__(self, wanted: Any, each: Callable[[Seen], None]) -> None:
         self._decoder, self._each = msgspec.json.Decoder(wanted), each
@@ -100,7 +111,8 @@ class Contents:
         "False where the recorder was killed or the disk was full: what was written before that is there."
 
     def take(self, record: Record) -> None:
-        """A record that is no message."""
+        """Take a record that is no message: a channel's topic, tormagd's metadata, or a chunk's place. Others are
+        passed over."""
         if record.opcode == Opcode.CHANNEL:
             channel = record.read(Channel)
             self._topics[channel.id] = channel.topic
@@ -113,26 +125,26 @@ class Contents:
             self.places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
 
     def message(self, sent: Sent) -> None:
-        """A message."""
+        """Decode a tick or a snapshot and hand it to `each`; a message of another topic is passed over."""
         topic = self._topics.get(sent.channel)
         if topic in TOPICS:
             self._each(Seen(sent.t_ns, topic == TICKS_TOPIC, self._decoder.decode(sent.data)))
 
     def again(self, wanted: Any, each: Callable[[Seen], None]) -> "Contents":
-        """For some of the same file's messages, which are wanted otherwise."""
+        """Return new Contents with the same topics, for reading messages of the same file as another type."""
         other = Contents(wanted, each)
         other._topics = self._topics
         return other
 
     def require(self, name: str) -> None:
-        """Raises RecordingError where the file, which is called `name`, has neither topic."""
+        """Raise RecordingError, naming the file `name`, where the file has neither telemetry nor ticks."""
         if set(self._topics.values()).isdisjoint(TOPICS):
             raise RecordingError(
                 f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
             )
 
     def described(self, name: str, kind: Any) -> Any:
-        """What the metadata say of `name`, a value of this type; None where they do not, or say something else."""
+        """Return the metadata value `name` decoded as the type `kind`; None where it is absent or of another type."""
         try:
             return msgspec.json.decode(self.metadata[name], type=kind)
         except (KeyError, msgspec.MsgspecError, RecursionError):
@@ -140,8 +152,11 @@ class Contents:
 
 
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Reads the recording in `file`, wherever that is, which errors call `name`, as Contents say. Raises
-    RecordingError: not MCAP, damaged, or not written by tormagd; and OSError."""
+    """Read the recording in an open `file`, which errors call `name`: each tick and snapshot goes to `each`.
+
+    Returns metadata, chunk places and completeness; `wanted` is the type to decode messages as. Raises RecordingError:
+    not MCAP, damaged, or not written by tormagd; and OSError.
+    """
     found = Contents(wanted, each)
     is_whole = scan(file, name, found.take, found.message)
     found.require(name)
@@ -150,16 +165,21 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
 
 
 def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Reads the recording in `path`, as Contents say. Raises RecordingError, also where it is not readable."""
+    """Read the recording in `path`: each tick and snapshot, decoded as the type `wanted`, goes to `each`.
+
+    Returns metadata, chunk places and completeness. Raises RecordingError: not readable, not MCAP, damaged, or not
+    ours.
+    """
     with opened(path) as file:
         return read_open(file, str(path), wanted, each)
 
 
 class RecordingFile:
-    """A recording on the disk, of any length: all of it at a glance, and any seconds of it.
+    """A recording on the disk, of any length: its overview, and any seconds of it.
 
-    Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd. Of a file whose recorder was
-    killed, or of an older one, the overview is made from all of its messages; without `is_scanned` it is refused.
+    Where the file has no overview (its recorder was killed, or is older), it is made from all messages; with
+    `is_scanned` False such a file is refused. Raises RecordingError: not readable, not MCAP, damaged, or not written by
+    tormagd.
     """
 
     def __init__(self, path: Path, *, is_scanned: bool = True) -> None:
@@ -180,7 +200,11 @@ class RecordingFile:
         self.is_complete = self._contents.is_complete
 
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
-        """What was recorded in this time, decoded as the type `wanted`. Raises RecordingError."""
+        """Return the ticks and snapshots from `from_ns` to `to_ns`, both included, decoded as the type `wanted`.
+
+        Times are ns since 1970. Raises RecordingError where the file is damaged, or has over MAX_SEEN messages in this
+        time.
+        """
         found: list[Seen] = []
 
         def keep(seen: Seen) -> None:
@@ -199,7 +223,7 @@ class RecordingFile:
 
 
 def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
-    """What stands at the end of a finished file; None where there is no overview."""
+    """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview."""
     at = file.seek(0, 2) - TAIL_BYTES
     file.seek(max(0, at))
     if at < 0 or not file.read().endswith(MAGIC):
@@ -230,6 +254,7 @@ def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
 
 
 def _at(file: BinaryIO, at: int, opcode: Opcode) -> Record:
+    """Read the record at byte `at`. Raises ValueError where it is cut or of another kind."""
     file.seek(at)
     record = record_at(file, at)
     if record is None or record.opcode != opcode:

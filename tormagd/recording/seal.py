@@ -1,8 +1,8 @@
-"""Seals: records in a file that hold a digest of every byte before them, so that what was changed afterwards shows.
+"""Seals: records in a file that hold a digest of every byte before them, so that a later change shows.
 
-A file says near its beginning that it is sealed, and whether with a key. Each seal is a private record: a byte that is
-1 in the last, and the BLAKE2b digest of all before it. The last stands at the end of the summary, and behind it only
-what follows from the rest. Who has the key can tell a file that was sealed anew.
+A sealed file says near its beginning that it is sealed, and whether with a key. Each seal is a private record of 33
+bytes: 1 in the last seal and 0 in others, then the BLAKE2b digest of all before. The last seal ends the summary; only
+the footer follows, which the rest of the file determines. Whoever has the key can tell a file that was sealed anew.
 """
 
 import hashlib
@@ -32,7 +32,8 @@ _BODY = struct.Struct(f"<B{DIGEST_BYTES}s")
 
 
 def read_key(file: str) -> bytes:
-    """The key in a file; empty where none is named. Raises OSError, and ValueError for one of another length."""
+    """Read the sealing key from a file; empty where `file` is empty. Raises OSError, and ValueError for a wrong
+    length."""
     if not file:
         return b""
     key = read_bounded(Path(file), MOST_KEY + 1).strip()
@@ -42,12 +43,12 @@ def read_key(file: str) -> bytes:
 
 
 def hasher(key: bytes) -> "hashlib.blake2b":
-    """A digest that has begun."""
+    """Return a new BLAKE2b hash of DIGEST_BYTES with this key; an empty key means none."""
     return hashlib.blake2b(key=key, digest_size=DIGEST_BYTES)
 
 
 class SealingFile:
-    """A file that an MCAP writer writes to, which digests what passes."""
+    """A binary file that an MCAP writer writes to, and that digests every byte for its seals."""
 
     def __init__(self, file: BinaryIO, key: bytes) -> None:
         self._file, self._hash = file, hasher(key)
@@ -56,7 +57,8 @@ class SealingFile:
         "The newest seal's, hexadecimal."
 
     def write(self, data: bytes) -> None:
-        """Writes on. Raises OSError."""
+        """Append bytes and digest them; while `finish` holds the file's end back, they are kept for it. Raises
+        OSError."""
         if self._held is None:
             self._file.write(data)
             self._hash.update(data)
@@ -64,15 +66,16 @@ class SealingFile:
             self._held += data
 
     def tell(self) -> int:
-        """How many bytes there are."""
+        """Return the number of bytes written so far."""
         return self._file.tell() + len(self._held or b"")
 
     def flush(self) -> None:
-        """Hands all on to the system. Raises OSError."""
+        """Hand all buffered bytes to the operating system. Raises OSError."""
         self._file.flush()
 
     def seal(self, *, is_last: bool = False) -> bytes:
-        """Writes a seal of all before it. Raises OSError."""
+        """Write a seal of all bytes before it, keep its digest in `digest`, and return the seal's bytes. Raises
+        OSError."""
         digest = _digest(self._hash, is_last)
         record = Record(SEAL, 0, _BODY.pack(is_last, digest)).raw()
         self.write(record)
@@ -80,7 +83,10 @@ class SealingFile:
         return record
 
     def finish(self, mcap: Writer) -> None:
-        """Ends the file that `mcap` writes here, with the last seal before its footer. Raises OSError."""
+        """Finish the file that `mcap` writes here: last seal, then a footer whose CRC covers it. Raises OSError.
+
+        The file stays open.
+        """
         mcap.flush()  # type: ignore[no-untyped-call]
         self._held = bytearray()
         mcap.finish()  # type: ignore[no-untyped-call]
@@ -94,7 +100,7 @@ class SealingFile:
 
 
 class State(StrEnum):
-    """How a file stands to its seals."""
+    """What a file's seals say of it."""
 
     WHOLE = "whole"
     UNFINISHED = "unsealed at its end"
@@ -105,7 +111,7 @@ class State(StrEnum):
 
 
 class Verdict(NamedTuple):
-    """What the seals of a file say; `why` is for a person, `last` the last seal's digest."""
+    """What a file's seals say: `why` is for a person, `follows` the previous segment's last digest, `last` its own."""
 
     state: State
     why: str
@@ -114,16 +120,20 @@ class Verdict(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing says that somebody changed it."""
+        """Return False for an altered file, or one sealed without the configured key; True for any other, also without
+        seals."""
         return self.state not in (State.ALTERED, State.NO_KEY)
 
     def text(self) -> str:
-        """In one sentence."""
+        """Return state and reason in one sentence."""
         return f"{self.state}: {self.why}"
 
 
 def verified(path: Path, key: bytes = b"") -> Verdict:
-    """What the seals of the file in `path` say. Raises OSError."""
+    """Check the seals of the file in `path` and return the verdict; damage is a verdict, too. Raises OSError.
+
+    Keyed seals need their `key`: with an empty one the state is OTHER_KEY, even where bytes were altered.
+    """
     with path.open("rb") as file:
         found = _Check(key)
         try:
@@ -137,7 +147,7 @@ def verified(path: Path, key: bytes = b"") -> Verdict:
 
 
 class _Check:
-    """One file's records as they come."""
+    """Checks one file's seals, record by record."""
 
     def __init__(self, key: bytes) -> None:
         self._key = key
@@ -151,7 +161,7 @@ class _Check:
         "The first thing that is not as it was sealed."
 
     def take(self, record: Record) -> None:
-        """The next record."""
+        """Check the next record in the file's order, and note the first thing that is not as it was sealed."""
         if record.opcode == END:
             self._is_over = True
         elif record.opcode == SEAL:
@@ -163,6 +173,8 @@ class _Check:
         self._digest(record)
 
     def _digest(self, record: Record) -> None:
+        """Add a record to the digest and the summary's CRC; before the first metadata, keep it until the hash
+        begins."""
         raw = record.raw() if record.opcode != END else b""
         if self._hash is not None:
             self._hash.update(raw)
@@ -180,6 +192,7 @@ class _Check:
             self._summary_at = record.at + len(raw)
 
     def _begin(self, record: Record) -> None:
+        """Begin the hash with all bytes so far, where this metadata record says that the file is sealed."""
         known = record.read(Metadata)
         if known.name == SEALED:
             self._by, self._follows = known.metadata.get("by", "?"), known.metadata.get("follows", "")
@@ -189,6 +202,7 @@ class _Check:
             self._hash.update(self._head)
 
     def _compare(self, record: Record) -> None:
+        """Compare a seal with the digest of the bytes before it; a mismatch is noted."""
         self._seals += 1
         if self._hash is None or len(record.body) != _BODY.size:
             self._note("a seal where none can be", record.at)
@@ -200,6 +214,7 @@ class _Check:
         self._sealed_to = record.at + HEAD.size + len(record.body)
 
     def _end(self, record: Record) -> None:
+        """Note a footer whose offsets or CRC do not fit the file."""
         footer = Footer.read(ReadDataStream(BytesIO(record.body)))
         own = zlib.crc32(record.raw()[: _FOOTER_BYTES - 4], self._crc)
         told = (footer.summary_start, footer.summary_offset_start, footer.summary_crc)
@@ -207,14 +222,15 @@ class _Check:
             self._note("its footer does not fit what it ends", record.at)
 
     def _note(self, what: str, at: int) -> None:
+        """Keep the first oddity; later ones are passed over."""
         self._odd = self._odd or f"{what} (byte {at})"
 
     def broken(self, why: str) -> Verdict:
-        """The verdict where a record cannot be read."""
+        """Return the verdict where a record cannot be read: altered, for the first oddity noted or else `why`."""
         return Verdict(State.ALTERED, self._odd or why, self._follows, self._last)
 
     def verdict(self, size: int, *, ends: bool) -> Verdict:
-        """The verdict; `ends` says whether the file's last bytes are those of one that was finished."""
+        """Return the verdict on a file of `size` bytes; `ends` says whether its last bytes are MCAP's closing magic."""
         if not self._by and not self._seals and (self._is_over or not self._head):
             return Verdict(
                 State.UNSEALED, "nothing says whether it was changed: an older tormagd, or another program, wrote it"

@@ -34,23 +34,23 @@ _ALLOWED = frozenset({*map(int, Opcode), SEAL})
 
 
 class Record(NamedTuple):
-    """One record: where it begins in the file, and its bytes without the head of nine."""
+    """One MCAP record: its kind, the byte at which it begins in the file, and its bytes without the head of nine."""
 
     opcode: int
     at: int
     body: bytes
 
     def raw(self) -> bytes:
-        """All its bytes."""
+        """Return the record's bytes with their head."""
         return HEAD.pack(self.opcode, len(self.body)) + self.body
 
     def read(self, kind: Any) -> Any:
-        """The same as a record of `mcap.records`. Raises McapError, ValueError, struct.error."""
+        """Parse the body as the type `kind` of `mcap.records`. Raises McapError, ValueError, struct.error."""
         return kind.read(ReadDataStream(BytesIO(self.body)))
 
 
 class Sent(NamedTuple):
-    """A message in a chunk."""
+    """One message: channel, sequence number, time in ns since 1970, and payload."""
 
     channel: int
     sequence: int
@@ -59,8 +59,11 @@ class Sent(NamedTuple):
 
 
 def contents(file: BinaryIO, message: Callable[[Sent], None]) -> Iterator[Record]:
-    """Reads a file: hands its messages over, and gives its other records, in their order, also of those in chunks; the
-    last is END, as of `records`. Raises ValueError, McapError, ZstdError, struct.error."""
+    """Read an MCAP file: call `message` with each message, and yield every other record in order, also those in chunks.
+
+    A chunk itself is yielded before its records. END comes last, unless the file is cut short. Raises ValueError,
+    McapError, ZstdError, struct.error where the file is damaged or beyond the bounds.
+    """
     unpacker = Unpacker()
     for record in records(file):
         if record.opcode == Opcode.CHUNK:
@@ -73,8 +76,10 @@ def contents(file: BinaryIO, message: Callable[[Sent], None]) -> Iterator[Record
 
 
 def records(file: BinaryIO) -> Iterator[Record]:
-    """Reads a file from its beginning. The last is END; one that is cut short has none. Raises ValueError: no MCAP, or
-    beyond the bounds."""
+    """Yield the records of an MCAP file from its beginning; the last is END, which a file cut short does not have.
+
+    Chunks are not unpacked. Raises ValueError where the file is no MCAP, or beyond the bounds.
+    """
     head = file.read(len(MAGIC))
     if not MAGIC.startswith(head):
         raise ValueError("it does not begin as MCAP does")
@@ -83,7 +88,10 @@ def records(file: BinaryIO) -> Iterator[Record]:
 
 
 def following(file: BinaryIO, at: int) -> Iterator[Record]:
-    """Reads the records from `at` on, where `file` stands. Raises as `records`."""
+    """Yield the records from byte `at` on, where `file` already stands; END after the closing magic.
+
+    Raises ValueError: an unknown kind, a size or a count beyond the bounds, or a wrong end.
+    """
     texts = 0
     while (record := record_at(file, at)) is not None:
         texts += record.opcode in _TEXTS
@@ -101,7 +109,10 @@ def following(file: BinaryIO, at: int) -> Iterator[Record]:
 
 
 def record_at(file: BinaryIO, at: int) -> Record | None:
-    """Reads one; None where the file ends within it. Raises ValueError as `records`."""
+    """Read the record at the file's present place, which is byte `at`; None where the file ends within it.
+
+    Raises ValueError for an unknown kind, or a length beyond the bound.
+    """
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:
         return None
@@ -116,14 +127,17 @@ def record_at(file: BinaryIO, at: int) -> Record | None:
 
 
 class Unpacker:
-    """Unpacks a file's chunks, within a bound of all of them."""
+    """Unpacks the chunks of one file, with one bound on all of them together."""
 
     def __init__(self) -> None:
         self._packed = self._unpacked = self._texts = 0
 
     def records(self, chunk: Record, message: Callable[[Sent], None]) -> Iterator[Record]:
-        """Hands the chunk's messages over, and gives its other records. Raises ValueError, McapError, ZstdError,
-        struct.error where it is damaged or beyond the bounds."""
+        """Unpack a chunk: call `message` with each message, and yield its schemas, channels and metadata.
+
+        Other kinds are passed over. Raises ValueError, McapError, ZstdError, struct.error for damage or beyond the
+        bounds.
+        """
         known: Chunk = chunk.read(Chunk)
         self._packed += len(chunk.body)
         self._unpacked += known.uncompressed_size
@@ -152,6 +166,7 @@ def _sent(data: bytes, at: int, length: int) -> Sent:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
+    """Unpack a chunk's data. Raises ValueError: too large, a compression other than zstd, a wrong size or checksum."""
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes: allowed is {MAX_CHUNK_BYTES}")

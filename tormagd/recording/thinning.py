@@ -1,4 +1,4 @@
-"""Fewer ticks where nothing happens: all of them around a fault or a mark, one of some elsewhere."""
+"""Fewer ticks where nothing happens: all of them around a fault or a mark, one of every N elsewhere."""
 
 from collections import deque
 from typing import Any
@@ -12,7 +12,7 @@ Tick = tuple[int, dict[str, Any]]
 
 
 class Thinning:
-    """Keeps one tick of `every`, and all around what happens. With 1 nothing waits, and all are kept."""
+    """Keeps one tick of `every`, and all within AROUND_S of a fault or a mark. With 1 all are kept and none waits."""
 
     def __init__(self, every: int) -> None:
         self.every = every
@@ -22,11 +22,14 @@ class Thinning:
         self._faults: Any = ()
 
     def happened(self, t_ns: int) -> None:
-        """Something that is worth all ticks around it."""
+        """Keep all ticks from AROUND_S before to AROUND_S after `t_ns`."""
         self._full_to_ns = max(self._full_to_ns, t_ns + AROUND_NS)
 
     def take(self, tick: Tick) -> list[Tick]:
-        """One more; gives those that are to be written now, in their order."""
+        """Add a tick, and return the ticks that are to be written now, in their order; others wait for AROUND_S.
+
+        A new set of faults in the tick keeps all ticks around it.
+        """
         if self.every == 1:
             return [tick]
         t_ns, message = tick
@@ -43,7 +46,7 @@ class Thinning:
         return given
 
     def rest(self, every: int) -> list[Tick]:
-        """Those that wait: one of so many."""
+        """Return one of `every` of the ticks that wait, and forget them all."""
         given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
         self._waiting.clear()
         return given

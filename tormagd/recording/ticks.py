@@ -20,7 +20,10 @@ Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 
 
 class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
-    """Rows of one value per column; the first column is `t_ns`, CLOCK_REALTIME. A value that is not known is null."""
+    """Control ticks as rows of one value per column. The first column is `t_ns`, CLOCK_REALTIME; None is not known.
+
+    Raises ValueError for another version, repeated or missing columns, a row of another length, or a time out of range.
+    """
 
     v: int
     columns: tuple[str, ...]
@@ -45,7 +48,10 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
 def listening(
     context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
 ) -> "zmq.Socket[bytes]":
-    """Hears what is published at `address`, telemetry or ticks. Raises SettingError as `connect`."""
+    """Connect a SUB socket to `address`, with the daemon's telemetry or ticks under `topic`, and return it.
+
+    `keys` None means an open endpoint. Raises SettingError where the address is not one.
+    """
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
@@ -58,7 +64,8 @@ _DECODER = msgspec.msgpack.Decoder(TickBatch)
 
 
 def decode_ticks(data: bytes) -> TickBatch:
-    """The batch in `data`. Raises MessageError for anything but a valid map of columns and rows."""
+    """Decode a batch of ticks. Raises MessageError for anything but a valid map of columns and rows, or over the size
+    bound."""
     if len(data) > MAX_BATCH_BYTES:
         raise MessageError(f"tick batch of {len(data)} bytes: allowed is {MAX_BATCH_BYTES}")
     try:

@@ -1,8 +1,8 @@
 """Writing a recording: MCAP with JSON messages and JSON schemas, compressed with zstd.
 
-Two channels: `/telemetry`, the daemon's snapshots as published, and `/ticks`, one message for every control tick. Such
-files open in Foxglove and PlotJuggler as they are. What is not known is left out of its message: viewers read plain
-schemas only, in which a number cannot be null. An overview stands at the end, and seals between (`seal.py`).
+Channel `/telemetry` has the daemon's snapshots as published, `/ticks` one message for every control tick. The files
+open in Foxglove and PlotJuggler as they are. A value that is not known is left out of its message: viewers read only
+plain schemas, in which a number cannot be null. An overview stands at the end, and seals in between (`seal.py`).
 """
 
 import contextlib
@@ -52,7 +52,7 @@ Room = Callable[[Path, int], str]
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
-    """Why a file's disk has no room for so many bytes more; empty where it has."""
+    """Say why the disk of `path` has no room for so many bytes more, and a reserve; empty where it has."""
     free, least = shutil.disk_usage(path.parent).free, LEAST_FREE_BYTES + needed_bytes
     if free >= least:
         return ""
@@ -60,15 +60,15 @@ def disk_room(path: Path, needed_bytes: int) -> str:
 
 
 class RecordingWriter:
-    """One MCAP file, open for writing until `close`, or several one after the other; also a context manager.
+    """Writes an MCAP recording, or with `rotate` several one after the other, until `close`; also a context manager.
 
-    `telemetry_count`, `tick_count`, `telemetry_lost` (missing `seq`), `ticks_lost` (missing numbers), `gaps` (steps
-    between ticks above GAP_NS, or back in time) and `longest_gap_ms` count what came. Raises FileExistsError
-    rather than overwrite a recording, and OSError where the file cannot be made or, from `telemetry`, `ticks`,
-    `describe`, `rotate` and `close`, written. Where there is no room, it is closed in order first, and says why; where
-    the disk fails without that warning, it reads up to its last whole chunk.
+    `key` seals the file, `room` makes room on its disk, and of `every` ticks one is written where nothing happens.
+    Public counters tell what came: `telemetry_lost` counts missing `seq`, `ticks_lost` missing tick numbers, and `gaps`
+    steps between ticks above GAP_NS or back in time.
 
-    `key` seals it, `room` makes room, and of `every` ticks one is written where nothing happens.
+    Raises FileExistsError rather than overwrite a recording, and OSError where the file cannot be made or written.
+    Without room the file is ended in order first. Where the disk fails without warning, the file reads up to its last
+    whole chunk.
     """
 
     def __init__(
@@ -98,6 +98,7 @@ class RecordingWriter:
         self._begin(path, "")
 
     def _begin(self, path: Path, follows: str) -> None:
+        """Open a new file, and lock it against pruning; `follows` is the digest that ends the segment before."""
         self.path = path
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks
@@ -121,32 +122,38 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """How large the file is."""
+        """Return the file's present size, bytes."""
         return self._sealing.tell()
 
     @property
     def lasted_s(self) -> float:
-        """How long the file lasts until now, by its messages."""
+        """Return the time from the file's first message to its present chunk, s; 0 before the first message."""
         return 0.0 if self.begin_ns is None or self._chunk_ns is None else (self._chunk_ns - self.begin_ns) * 1e-9
 
     def rotate(self, path: Path) -> None:
-        """Ends the file, and goes on in a new one. Raises FileExistsError, OSError."""
+        """End the file in order and go on in a new one, chained by its last seal. Ticks that wait go into the new one.
+
+        Raises FileExistsError, OSError.
+        """
         self._end()
         self._begin(path, self._sealing.digest)
 
     def give_up(self, reason: str) -> NoReturn:
-        """Ends the file in order before its end, which it says. Raises OSError."""
+        """End the file in order, with `reason` in its metadata, and raise OSError with ENOSPC and that reason."""
         self.describe({CUT: reason})
         self._end()
         raise OSError(errno.ENOSPC, reason)
 
     def describe(self, metadata: dict[str, str]) -> None:
-        """Write down what is recorded: names and values. Of a name that is described twice, the later one counts."""
+        """Write metadata, now and into every later file of `rotate`. The later value of a name counts."""
         self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Write one snapshot. A `seq` that starts over (a restarted daemon) is not a loss."""
+        """Write one snapshot, and count missing `seq`; a `seq` that starts over (a restarted daemon) is not a loss.
+
+        A new mark keeps all ticks around it. Raises OSError.
+        """
         if self._last_seq is not None and message.seq > self._last_seq + 1:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
@@ -159,8 +166,11 @@ class RecordingWriter:
         self.telemetry_count += 1
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message. Other columns than before, or values of another kind, get a channel of their
-        own under the same topic. Numbers that start over (a restarted daemon) are not a loss."""
+        """Write each row as one message, thinned, and count gaps and missing numbers; numbers may start over.
+
+        Other columns than before, or values of another type, get a channel of their own under the same topic. Raises
+        OSError.
+        """
         if not batch.rows:
             return
         if batch.columns != self._columns:
@@ -186,26 +196,24 @@ class RecordingWriter:
             self._batch_ns = self._last_tick_ns - before_ns
 
     def note_silence(self, silence_ns: int) -> bool:
-        """Count the time in which no batch came, until the recording ended, as a gap; True where it is one.
-
-        Batches come some time apart: twice that is none yet.
-        """
+        """Count `silence_ns` without a batch as a gap, and return True; False up to two batch intervals plus GAP_NS."""
         if silence_ns <= 2 * self._batch_ns + GAP_NS:
             return False
         self._note_gap(silence_ns)
         return True
 
     def close(self) -> None:
-        """Write what waits, overview and index, and close the file. Without it the file still reads, up to its last
-        whole chunk.
+        """Write waiting ticks, overview, index and last seal, and close the file; nothing on a closed one.
 
-        Raises OSError where one of them could not be written.
+        Without this call the file reads up to its last whole chunk. Raises OSError where something could not be
+        written.
         """
         if not self._file.closed:
             self._write(self._thinning.rest(self._thinning.every))
             self._end()
 
     def _end(self) -> None:
+        """Write overview, index and last seal, and close the file, whatever fails."""
         with self._file:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", self._overview.made().packed())
@@ -232,7 +240,7 @@ class RecordingWriter:
             self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
 
     def _channel_of(self, message: dict[str, Value]) -> int:
-        """The tick channel whose schema `message` obeys."""
+        """Return the tick channel whose schema `message` obeys, and register one where there is none."""
         kinds = self._kinds
         if not self._tick_channel or any(kinds.get(name) != _KINDS[type(value)] for name, value in message.items()):
             kinds |= {name: _KINDS[type(value)] for name, value in message.items()}
@@ -243,6 +251,8 @@ class RecordingWriter:
         return self._tick_channel
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
+        """Write a message. At a new chunk, first flush, seal the chunk before, and end the file where there is no
+        room."""
         if self._chunk_ns is None or abs(t_ns - self._chunk_ns) > CHUNK_NS:
             self.begin_ns = self.begin_ns or t_ns
             self._mcap.flush()  # type: ignore[no-untyped-call]
@@ -254,24 +264,29 @@ class RecordingWriter:
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 
     def _require_room(self) -> None:
+        """End the file and raise OSError where `room` names a reason."""
         reason = self._room(self.path, self.size // INDEX_SHARE)
         if reason:
             self.give_up(reason)
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
-    """A channel of JSON messages that obey this schema, in the file that `mcap` writes."""
+    """Register `schema` and a channel of JSON messages in the file that `mcap` writes; return the channel's id."""
     schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=msgspec.json.encode(schema))
     return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
-    """The JSON schema of a type of message, without `$ref`, `anyOf` and tuples: viewers read only the plain forms."""
+    """Return the JSON schema of a message type without `$ref`, `anyOf` and tuples, which viewers do not read.
+
+    A value that may be null has the schema of its other type; a tuple is an array of its first type.
+    """
     (schema,), definitions = msgspec.json.schema_components([message], ref_template="{name}")
     return {"title": f"tormagd.{message.__name__}", **_plain(schema, definitions)}
 
 
 def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Return a schema without references and alternatives: the first option that is not null, a tuple's first type."""
     if "$ref" in schema:
         return _plain(definitions[schema["$ref"]], definitions)
     if "anyOf" in schema:
@@ -288,7 +303,7 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
 
 
 def tick_schema(kinds: dict[str, str]) -> dict[str, Any]:
-    """The JSON schema of a tick with columns of these types; lists are of words."""
+    """Return the JSON schema of a tick message with columns of these JSON types, by name; an array holds strings."""
     properties = {
         name: {"type": "array", "items": {"type": "string"}} if kind == "array" else {"type": kind}
         for name, kind in kinds.items()
@@ -297,7 +312,10 @@ def tick_schema(kinds: dict[str, str]) -> dict[str, Any]:
 
 
 def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Value]:
-    """A tick as a message: what is not known is left out."""
+    """Return a tick's row as a message: by column, without values that are None, NaN or infinite.
+
+    Raises ValueError where row and columns differ in length.
+    """
     # as _known, without a call for each of some sixty values, a thousand times a second
     return {
         name: value
@@ -307,7 +325,7 @@ def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Valu
 
 
 def _tick_kinds() -> dict[str, str]:
-    """The types of the columns that this version's daemon publishes."""
+    """Return the JSON types of the columns that this version's daemon publishes; integers count as numbers."""
     (schema,), definitions = msgspec.json.schema_components([TickRecord], ref_template="{name}")
     items = definitions[schema["$ref"]]["prefixItems"]
     kinds = {
@@ -322,7 +340,7 @@ TICK_KINDS = _tick_kinds()
 
 
 def _known(value: Any) -> Any:
-    """`value` without what is not known in it, or None; a list in which something is not, is not."""
+    """Return `value` without its unknown parts; None for NaN, infinity, or a list with one of them or None in it."""
     if isinstance(value, dict):
         return {name: known for name, inner in value.items() if (known := _known(inner)) is not None}
     if isinstance(value, list | tuple):
