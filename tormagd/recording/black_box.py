@@ -38,9 +38,9 @@ CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"
 MAX_PARTS = 100_000
 MAX_BYTES = 50_000_000
-"Of all parts of a file that is read: what is kept is less."
+"Bound on all parts of one file together; a keeper holds less."
 MAX_ENTRIES = 1_000_000
-"Half a minute at 4 kHz has fewer."
+"Bound on the entries of one file: half a minute at 4 kHz has fewer."
 MAX_TIME_DIFFERENCE_NS = 1_000
 
 
@@ -53,9 +53,9 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
     header: dict[str, str]
     entries: list[Any]
     is_complete: bool = True
-    "False for one that ends in the middle: what came before is there."
+    "False for a file that was cut short: entries up to the cut are there."
     odd: str = ""
-    "The first message that people see and that is not what the core was given and gave; empty where each is."
+    "The first message of `/ticks` or `/frames` that `/core` does not give; empty where there is none."
 
 
 class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -67,7 +67,7 @@ class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
 
     monotonic_s: float
     direction: str
-    "read or wrote."
+    "By the daemon: read or wrote."
     data: str
     identifier: int | None = None
 
@@ -101,7 +101,7 @@ class Derived:
         self._columns = columns
         self.ticks = self._frames = 0
         self._offset_ns: int | None = None
-        "Of the clock of `monotonic_s` to that of `t_ns`."
+        "From the monotonic clock to ns since 1970; None while unknown."
 
     def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
         """Yield the messages derived from one part's entries, and count them in `ticks`.
@@ -196,7 +196,7 @@ class _Reading:
         self._derived: Derived | None = None
         self._expected: dict[str, deque[Shown]] = {TICKS_TOPIC: deque(), FRAMES_TOPIC: deque()}
         self._late_ns: int | None = None
-        "By how much the frames' times are later than the clock of the ticks."
+        "Frame times less those derived without an offset, by the first frame; None before."
         self._size = self._parts = 0
 
     def take(self, record: Record) -> None:

@@ -18,11 +18,11 @@ from typing import NamedTuple
 from tormagd_client.printable import require
 
 END_BYTES = 500_000
-"A segment ends with its last chunk, its overview and its index: so much more than its size when it is due."
+"What a segment may grow by once it is due: last chunk, overview and index."
 MARKED = ".marked"
-"Behind the time in a name; black boxes, which their keeper takes away, have another form."
+"Follows the time in a marked segment's name. Black boxes have another form: their keeper deletes them."
 BEFORE_MARK_S = 60.0
-"The segment before is marked, too, where the one with the mark is younger."
+"A segment younger than this is marked together with the one before."
 _NAME = re.compile(rf"(\d{{4}}-\d\d-\d\dT\d\d-\d\d-\d\d)(\.\d{{3}}Z)?({re.escape(MARKED)})?\.mcap")
 _FORM = "%Y-%m-%dT%H-%M-%S"
 

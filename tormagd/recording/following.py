@@ -12,11 +12,11 @@ from typing import Any
 import msgspec
 
 AWAY = frozenset({"NO_SETPOINT", "STALE", "TAKEOVER"})
-"Limits under which the force is not to be that of the setpoint."
+"Limits under which the setpoint does not rule the force."
 NEAR_N = 0.15
 APPROACH_NS = 1_000_000_000
 STEP_NS = 10_000_000
-"Of the delays that are tried, and between the moments at which they are."
+"Step between the delays tried, and between the times at which they are."
 DELAYS = 31
 
 

@@ -25,12 +25,12 @@ MOST_BYTES = 48_000_000
 """The ring holds no more than either. Half a minute at 1 kHz with 500 setpoints a second is 18 MB; at rates or with
 previews for which this is too little, it reaches less far back."""
 MOST_FILES = 20
-"The oldest goes when there are more."
+"The oldest file is deleted when there are more."
 MOST_PACKET = 4_000_000
 MOST_DUE = 8
-"Files that wait to be written."
+"How many files may wait to be written; more are refused."
 LOOK_S = 0.05
-"How often it is looked whether one is due."
+"Period of looking whether a file is due."
 DIED = "DAEMON-DIED"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -29,12 +29,12 @@ QUANTITIES = (
 KINDS = ("operating_state", "limits", "faults")
 "Fields that hold codes."
 BREAK_S = 0.1
-"Messages further apart than this do not belong together: nothing is known between them."
+"Between messages further apart than this, nothing is known."
 BREAK_NS = round(BREAK_S * 1e9)
 FIRST_WIDTH_NS = 1_000_000
 MOST_STRETCHES = 1_500
 MOST_SPANS = 1_000
-"Of one code: where there are more, those nearest to each other are drawn as one."
+"Bound on the spans of one code: beyond it, those nearest to each other become one."
 MOST_CODES, MOST_MARKS = 200, 1_000
 MOST_BYTES = 2_000_000
 CODE = re.compile(r"[A-Za-z0-9_.:?-]{1,64}")

@@ -19,9 +19,9 @@ from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
 MAX_INDEX = 1_000_000
-"Chunks, some days of them."
+"Bound on the chunks of one file: some days of them."
 MAX_SEEN = 400_000
-"Messages of some seconds: at 4 kHz more than a minute."
+"Bound on the messages read at once: at 4 kHz more than a minute."
 TAIL_BYTES = HEAD.size + 20 + len(MAGIC)
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
@@ -108,7 +108,7 @@ class Contents:
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
         self.is_complete = True
-        "False where the recorder was killed or the disk was full: what was written before that is there."
+        "False where the recorder was killed or the disk was full: messages up to then are there."
 
     def take(self, record: Record) -> None:
         """Take a record that is no message: a channel's topic, tormagd's metadata, or a chunk's place. Others are

@@ -23,7 +23,7 @@ from tormagd.bounded_file import read_bounded
 from tormagd.recording.stream import END, HEAD, MAGIC, MAX_CHUNK_BYTES, SEAL, Record, records
 
 SEALED = "tormagd.seal"
-"The metadata record that says so; `by` is PLAIN or KEYED, `follows` the last digest of the segment before."
+"The metadata record of a sealed file; `by` is PLAIN or KEYED, `follows` the last digest of the segment before."
 PLAIN, KEYED = "blake2b", "keyed blake2b"
 LEAST_KEY, MOST_KEY = 16, 64
 DIGEST_BYTES = 32
@@ -54,7 +54,7 @@ class SealingFile:
         self._file, self._hash = file, hasher(key)
         self._held: bytearray | None = None
         self.digest = ""
-        "The newest seal's, hexadecimal."
+        "Digest of the newest seal, hexadecimal; empty before the first."
 
     def write(self, data: bytes) -> None:
         """Append bytes and digest them; while `finish` holds the file's end back, they are kept for it. Raises

@@ -13,19 +13,19 @@ from zstandard import ZstdDecompressor
 
 MAGIC = b"\x89MCAP0\r\n"
 SEAL = 0xE5
-"Our own kind of record, which other readers pass over."
+"Opcode of a seal: a private record, which other readers pass over."
 END = 0
-"No record: the file ends here as it should."
+"Stands for the closing magic: the file ends as it should."
 MAX_RECORD_BYTES = 8_000_000
-"A black box's largest message is half of it."
+"Bound on one record; a black box's largest message has half of this."
 MAX_CHUNK_BYTES = 16_000_000
-"Of one chunk, unpacked."
+"Bound on one chunk, unpacked."
 MAX_TEXT_BYTES = 1_000_000
-"Of a schema, a channel or a metadata record."
+"Bound on a schema, a channel or a metadata record."
 MAX_TEXTS = 1_000
-"Of these together, in one file."
+"Bound on the number of schemas, channels and metadata records in one file."
 MAX_RATIO, FREE_BYTES = 100, 16_000_000
-"A file unpacks to no more than so many times its size, and this."
+"A file unpacks to at most MAX_RATIO times its size, plus FREE_BYTES."
 MAX_WINDOW_BYTES = 1 << 24
 HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")

@@ -4,7 +4,7 @@ from collections import deque
 from typing import Any
 
 AROUND_S = 10.0
-"All ticks are kept so long before and after."
+"All ticks are kept this long before and after a fault or a mark."
 AROUND_NS = round(AROUND_S * 1e9)
 
 Tick = tuple[int, dict[str, Any]]

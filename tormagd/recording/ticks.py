@@ -14,7 +14,7 @@ MAX_BATCH_BYTES = 4_000_000  # 20 ms at 4 kHz with 100 columns is under 1 MB
 MAX_COLUMNS = 256
 MAX_TIME_NS = 2**63
 QUEUE = 10_000
-"Batches that may wait while whoever listens is slow: over three minutes."
+"Batches that may wait for a slow listener: over three minutes."
 
 Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 

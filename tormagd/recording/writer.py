@@ -26,29 +26,29 @@ from tormagd.recording.ticks import TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry, TickRecord
 
 ABOUT = "tormagd"
-"The metadata records that say what is recorded."
+"Name of the metadata records that say what is recorded."
 CUT = "cut_by"
-"Among them: why a recording ends before its end."
+"Key in the metadata: why the recording ended early."
 THINNED = "thinned"
-"Among them: which ticks are there, where not all are."
+"Key in the metadata: which ticks are there, where not all are."
 OVERVIEW = "overview"
-"The attachment with all of it at a glance."
+"Name of the attachment that holds the overview."
 TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC = "/ticks"
 NUMBER_COLUMN = "tick"
-"The control tick's number: one that is missing is a tick that was lost."
+"Column of the control tick's number; a missing number is a lost tick."
 CHUNK_BYTES = 1024 * 1024
 CHUNK_NS = 500_000_000
-"So much is written at once, and lost where the recorder is killed."
+"Time that one chunk spans, lost where the recorder is killed."
 LEAST_FREE_BYTES = 16_000_000
 "A recording ends before the disk is full: the last chunk needs room, and the index, which grows with the file."
 INDEX_SHARE = 64
-"At most such a part of the file is its index."
+"The index is at most 1/INDEX_SHARE of the file."
 GAP_NS = 10_000_000
 "A step between two ticks that counts as a gap. Under one lost batch (20 ms), above a few merged ticks."
 
 Room = Callable[[Path, int], str]
-"Makes room on the disk, for so many bytes beside a file; says why there is none."
+"Makes room for bytes on a file's disk; returns why there is none, empty where there is."
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
@@ -88,7 +88,7 @@ class RecordingWriter:
         self._last_tick_ns: int | None = None
         self._batch_ns = 0
         self.mark: Mark | None = None
-        "The newest that a snapshot told."
+        "The newest mark in a snapshot; None before the first."
         self.telemetry_count = 0
         self.telemetry_lost = 0
         self.tick_count = 0
@@ -114,7 +114,7 @@ class RecordingWriter:
         self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
         self._columns: tuple[str, ...] = ()
         self._kinds: dict[str, str] = {}
-        "What is known of the columns' types; of one that has been null until now, nothing."
+        "JSON types of the columns, by name; a column that has always been null is absent."
         self._tick_channel = 0
         self._chunk_ns: int | None = None
         self.begin_ns: int | None = None
