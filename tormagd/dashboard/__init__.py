@@ -1,1 +1,1 @@
-"""The page of `tormagctl dashboard`: what the daemon does, live, or what a recording holds, at any moment of it."""
+"""The page of `tormagctl dashboard`: what the daemon does, live, or any moment of a recording."""

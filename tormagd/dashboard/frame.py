@@ -1,4 +1,4 @@
-"""What the page shows of one moment, live or recorded: the seconds before it, and what holds the force back."""
+"""What the page shows at one moment, live or recorded: the last seconds, and what holds the force back."""
 
 from bisect import bisect_right
 from collections import Counter
@@ -11,11 +11,11 @@ from tormagd_client.messages import BeliefReport
 
 SHOWN_S = 20.0
 DRIVEN = ("ENABLED", "PAUSED")
-"In other states the gap opens or is open, and the planned field stands nowhere."
+"States in which the planned field is made; in others the gap opens or is open."
 
 
 class Held(msgspec.Struct, frozen=True):
-    """A limit: in which share of the seconds shown it was there, and whether it is there at their end."""
+    """A limit: its share of the seconds shown, 0..1, and whether it holds at their end."""
 
     code: str
     share: float
@@ -23,10 +23,10 @@ class Held(msgspec.Struct, frozen=True):
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True):
-    """Curves of the same length, the oldest first, `t_s` since 1970; what is not known is null.
+    """One update of the page: curves of equal length, the oldest first; `t_s` is since 1970, None is not known.
 
-    Live ones hold what is new, and the codes and `late_counts` (control ticks by lateness, between LATE_US) of all the
-    seconds shown. `belief` is that of their end.
+    A live frame's curves hold only what is new. Limits, faults and `late_counts` (control ticks by lateness, between
+    LATE_US) are always those of all seconds shown; state and `belief` those at their end.
     """
 
     t_s: Sequence[float]
@@ -44,6 +44,6 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def late_counts(lateness_us: Iterable[float]) -> list[int]:
-    """How many of these are in each bar of the histogram."""
+    """Count these latenesses, us, by bar of the histogram that LATE_US bounds."""
     counts = Counter(bisect_right(LATE_US, late_us) for late_us in lateness_us)
     return [counts[bar] for bar in range(len(LATE_US) + 1)]

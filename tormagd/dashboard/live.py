@@ -18,16 +18,16 @@ from tormagd_client.printable import printable
 FRAME_S = 0.1
 STATUS_S = 1.0
 PORTRAIT_S = 10.0
-"Between two looks at what the device can render: it shows itself slowly."
+"Period of asking what the device can render, which changes slowly."
 SILENT_S = 0.5
 KEPT = 1_000
-"Snapshots: those of `frame.SHOWN_S`."
+"Snapshots kept: those of `frame.SHOWN_S`."
 WAITING = 50
 "Events that may wait for one browser; then it misses the oldest."
 
 
 class Live:
-    """Listens to the daemon of `client`, and tells every browser the same bytes. `run` it beside them."""
+    """Listens to one daemon and sends every browser the same events; `run` has to run beside the browsers."""
 
     about: ClassVar[dict[str, Any]] = {"kind": "live"}
     "What the page begins with."
@@ -44,7 +44,7 @@ class Live:
         self._learn(status)
 
     async def run(self) -> None:
-        """Never ends by itself; a daemon that goes is waited for."""
+        """Listen and publish without end; a daemon that is gone is waited for."""
         async with asyncio.TaskGroup() as tasks:
             for each in (
                 self._listen(),
@@ -56,7 +56,10 @@ class Live:
 
     @contextlib.contextmanager
     def browser(self) -> Iterator[asyncio.Queue[bytes]]:
-        """One more that looks: what it is to be sent, beginning with the seconds that were."""
+        """Add a browser for this context and give the queue of its events.
+
+        The first events are the seconds kept so far, the status, and what the device can render.
+        """
         events: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
         if self._kept:
             events.put_nowait(event("frame", self._frame(self._kept)))
@@ -69,6 +72,7 @@ class Live:
             self.browsers.discard(events)
 
     async def _listen(self) -> None:
+        """Keep each snapshot; what cannot be decoded is noted as the reason for silence."""
         while True:
             try:
                 async for snapshot in self._client.telemetry():
@@ -79,6 +83,7 @@ class Live:
                 self._why_silent = f"what comes is not understood: {printable(str(error))}"
 
     async def _tell(self) -> None:
+        """Publish new snapshots every FRAME_S, or how long nothing has been heard."""
         while True:
             await asyncio.sleep(FRAME_S)
             silent_s = time.monotonic() - self._heard_s
@@ -89,7 +94,8 @@ class Live:
                 self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
 
     async def _every(self, period_s: float, look: Callable[[], Awaitable[None]]) -> None:
-        """Looks now and then at a daemon that is heard: requests to one that is not would wait, and come at once."""
+        """Call `look` every `period_s` while the daemon is heard: requests to a silent daemon would wait, and come at
+        once."""
         while True:
             await asyncio.sleep(period_s)
             if time.monotonic() - self._heard_s < SILENT_S:
@@ -106,6 +112,7 @@ class Live:
         self._publish("portrait", self._portrait)
 
     def _publish(self, name: str, value: object) -> None:
+        """Queue an event for every browser; a full queue loses its oldest."""
         data = event(name, value)
         for events in self.browsers:
             if events.full():
@@ -113,6 +120,7 @@ class Live:
             events.put_nowait(data)
 
     def _learn(self, status: Status) -> None:
+        """Remember why and what to do for every limit and fault the daemon has told of."""
         self._explained["limits"] |= {each.code: each for each in status.limit_details}
         self._explained["faults"] |= {each.code: each for each in status.fault_details}
 
@@ -120,6 +128,7 @@ class Live:
         return {"status": self._status, "explained": self._explained}
 
     def _frame(self, snapshots: Sequence[Telemetry]) -> Frame:
+        """Make a frame with curves of `snapshots`, and limits and latenesses of all that are kept."""
         newest, kept = snapshots[-1], self._kept
         times = Counter(code for each in kept for code in each.limits)
         return Frame(
@@ -139,5 +148,5 @@ class Live:
 
 
 def event(name: str, value: object) -> bytes:
-    """A server-sent event with `value` as JSON."""
+    """Encode a server-sent event with `value` as JSON."""
     return b"event: %s\ndata: %s\n\n" % (name.encode(), msgspec.json.encode(value))

@@ -1,3 +1,5 @@
+"""A recording as the page shows it: its whole length once, and a frame for any moment."""
+
 import math
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,9 +15,9 @@ from tormagd.safety.codes import FAULTS, LIMITS
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
 
 STEP_S = 0.02
-"Between two points of a curve, as live."
+"Time between two points of a curve, as in a live page."
 AHEAD_NS = 10_000_000_000
-"So much more is read than one frame shows: the next is near."
+"How much more is read than one frame shows: the next frame is near."
 CURVES = {
     "asked_N": "setpoint_cf",
     "governed_N": "governed_cf",
@@ -24,11 +26,11 @@ CURVES = {
     "gap_wanted_mm": "gap_setpoint_mm",
     "field_mT": "field_mT",
 }
-"What the page calls a quantity, and what a recording does."
+"By a curve's name on the page, the quantity in a recording."
 
 
 class Believed(msgspec.Struct, frozen=True):
-    """A BeliefReport as it is recorded: without what is not known."""
+    """A BeliefReport as recorded: fields that were not known are absent, and None here."""
 
     value: float | None = None
     sd: float | None = None
@@ -37,13 +39,13 @@ class Believed(msgspec.Struct, frozen=True):
 
 
 class Moment(Glance, total=False):
-    """What a frame takes of a message: a snapshot tells the belief, too."""
+    """The fields that a frame reads from a message: an overview's, and the belief, which only snapshots tell."""
 
     belief: dict[str, Believed]
 
 
 class Moments:
-    """Messages of one kind: their times, s since the recording's start, and their quantities, of shape (n, 8)."""
+    """Ticks or snapshots of a recording: times in seconds since its start, shape (n,), and quantities, shape (n, 8)."""
 
     def __init__(self, seen: Sequence[Seen], start_ns: int) -> None:
         self.messages = [each.message for each in seen]
@@ -52,12 +54,16 @@ class Moments:
         self._values = known if seen else np.empty((0, len(QUANTITIES)))
 
     def newest(self, times_s: Floats) -> list[int]:
-        """Of each time the place of the newest message; -1 where that is too old to be true, or none was before."""
+        """Return for each time the index of the newest message; -1 where it is over BREAK_S old, or none came before.
+
+        Empty where there are no messages.
+        """
         at = np.searchsorted(self.t_s, times_s, side="right") - 1
         return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= BREAK_S, at, -1).tolist()
 
     def curve(self, name: str, times_s: Floats) -> list[float | None] | None:
-        """The quantity's newest value at each time; None where nothing of it is known."""
+        """Return the newest value of the quantity `name` at each time, None where too old; None where no value is known
+        at all."""
         values = self._values[:, QUANTITIES.index(name)]
         if not np.isfinite(values).any():
             return None
@@ -65,16 +71,16 @@ class Moments:
         return [float(value) if math.isfinite(value) else None for value in found]
 
     def within(self, from_s: float, to_s: float) -> range:
-        """The places of the messages between two times."""
+        """Return the indices of the messages from `from_s` up to, but not at, `to_s`."""
         first, last = np.searchsorted(self.t_s, (from_s, to_s))
         return range(int(first), int(last))
 
 
 class Recorded:
-    """A recording with messages. Times are seconds since its first one."""
+    """A recording with messages, for the page; times are seconds since its first message."""
 
     def __init__(self, file: RecordingFile) -> None:
-        """Raises ValueError where there is no message in it."""
+        """Raise ValueError where the recording has no message."""
         overview = file.overview
         if not overview.ticks and not overview.snapshots:
             raise ValueError("the recording has no messages: was the daemon running?")
@@ -84,7 +90,8 @@ class Recorded:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What the page begins with: what is recorded, the whole of it at a glance, and what its codes mean."""
+        """Return what the page begins with: name, times, scene, the force over the whole length, and what each code
+        means."""
         file, following = self._file, self._overview.following
         return {
             "kind": "recording",
@@ -106,7 +113,8 @@ class Recorded:
         }
 
     def frame(self, at_s: float) -> Frame:
-        """The seconds before `at_s`, which is taken to lie within the recording. Raises RecordingError."""
+        """Return the frame that ends at `at_s`, which is clamped to the recording. Raises RecordingError where it
+        cannot be read."""
         at_s = min(max(at_s, 0.0), self.duration_s)
         from_s = max(at_s - SHOWN_S, 0.0)
         at_ns = self._start_ns + round(at_s * 1e9)
@@ -140,14 +148,16 @@ class Recorded:
         )
 
     def _between(self, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-        """The ticks and the snapshots of this time, and somewhat more."""
+        """Return ticks and snapshots of at least this time; reads AHEAD_NS more on both sides and keeps them for the
+        next call."""
         if self._read is None or not self._read[0] <= from_ns < to_ns <= self._read[1]:
             span = from_ns - AHEAD_NS, to_ns + AHEAD_NS
             self._read = (*span, *moments(self._file, *span))
         return self._read[2:]
 
     def _glance(self) -> dict[str, Any]:
-        """The least and greatest measured force of each stretch, where faults and limits were, and marks."""
+        """Return the measured force of each stretch (else the asked one), when limits and faults were present, and the
+        marks."""
         overview = self._overview
         known = overview.series("measured_cf") or overview.series("setpoint_cf")
         spans: dict[str, Any] = {
@@ -163,14 +173,14 @@ class Recorded:
 
 
 def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-    """The ticks and the snapshots that were recorded in this time. Raises RecordingError."""
+    """Read the ticks and the snapshots from `from_ns` to `to_ns`, ns since 1970. Raises RecordingError."""
     seen, start_ns = file.between(from_ns, to_ns, Moment), file.overview.start_ns
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
     return Moments(ticks, start_ns), Moments(snapshots, start_ns)
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
-    """What the newest snapshot said; nothing where that is too old to be true, or said nothing."""
+    """Return the belief in the newest snapshot before `at_s`; empty where it is over BREAK_S old, or told none."""
     place = (snapshots.newest(np.array([at_s])) or [-1])[0]
     told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
     return {
@@ -181,7 +191,7 @@ def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
 
 
 def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
-    """The limits of this time, by their share of it."""
+    """Return the limits present from `from_s` to `at_s`, the largest share first."""
     held_s: defaultdict[str, float] = defaultdict(float)
     steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
     for place in shown.within(from_s, at_s):

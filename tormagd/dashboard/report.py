@@ -1,4 +1,5 @@
-"""A recording as one page to keep, send and print: no script, and nothing asked of elsewhere. Two, side by side."""
+"""A recording, or several side by side, as one HTML page to keep, send and print: no script, nothing loaded from
+elsewhere."""
 
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,18 +23,19 @@ img{max-width:100%}table{border-collapse:collapse;margin:.5rem 0}h2{margin-top:2
 th,td{padding:.25rem .8rem;text-align:left;vertical-align:top;border-bottom:1px solid #ddd}
 .bad{color:#b71c1c;font-weight:600}"""
 MOST_TOLD = 20
-"Moments of one fault that are listed."
+"How many moments of one fault are listed."
 
 
 class Reported(NamedTuple):
-    """A recording, and what its seals say."""
+    """A recording, and the verdict of its seals."""
 
     file: RecordingFile
     seal: Verdict
 
 
 def report(of: Sequence[Reported]) -> str:
-    """The page, as HTML. Raises ValueError for a recording without messages."""
+    """Return one HTML page on these recordings, side by side. Raises ValueError for a recording without messages, also
+    where its end cannot be read again."""
     names = [each.file.path.name for each in of]
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
@@ -58,6 +60,7 @@ def report(of: Sequence[Reported]) -> str:
 
 
 def _sealed(of: Reported) -> str:
+    """Say in HTML what the seals tell, and why a recording was cut or thinned."""
     kind = "" if of.seal.is_sound else ' class="bad"'
     cut = of.file.metadata.get(CUT, "")
     notes = [cut and f"cut by: {cut}", of.file.metadata.get(THINNED, "") and f"thinned: {of.file.metadata[THINNED]}"]
@@ -66,13 +69,15 @@ def _sealed(of: Reported) -> str:
 
 
 def _following(of: Sequence[Reported]) -> list[str]:
-    """That a segment is the next of the other, where its beginning says so."""
+    """Say in HTML which recordings follow each other, by the seals' digests; empty where none do."""
     names = {each.seal.last: each.file.path.name for each in of if each.seal.last}
     known = [(each.file.path.name, names[each.seal.follows]) for each in of if each.seal.follows in names]
     return [f"<p>{escape(name)} begins where {escape(before)} ends.</p>" for name, before in known]
 
 
 def _figures(of: Sequence[Reported]) -> list[list[str]]:
+    """Return the table's rows: for each recording its times, forces, counts, scene and device."""
+
     def known(each: Reported) -> dict[str, str]:
         overview, file = each.file.overview, each.file
         scene = file.described("scene", dict[str, Any]) or {}
@@ -96,6 +101,7 @@ def _figures(of: Sequence[Reported]) -> list[list[str]]:
 
 
 def _range(of: Reported, name: str) -> str:
+    """Say the range of a quantity over the recording, N."""
     known = of.file.overview.series(name)
     if known is None:
         return "not recorded"
@@ -111,7 +117,7 @@ def _picture(of: Reported) -> str:
 def _codes(
     of: Sequence[Reported], kind: str, explained: Mapping[Any, Explanation], told: Callable[[Codes, float], str]
 ) -> str:
-    """A table of the codes of a kind: of each recording when, then why, and what to do."""
+    """Return a table of the codes of a kind: for each recording when or how long (`told`), then why, and what to do."""
     names = dict.fromkeys(code for each in of for code in each.file.overview.codes[kind])
     texts = {str(code): known for code, known in explained.items()}
     rows = []
@@ -124,16 +130,19 @@ def _codes(
 
 
 def _held(codes: Codes, lasts_s: float) -> str:
+    """Say for how long a code held, and its share of the recording."""
     held_s = codes.held_ns * 1e-9
     return f"{held_s:.2f} s, {100.0 * held_s / max(lasts_s, 1e-3):.1f}%"
 
 
 def _moments(codes: Codes, _lasts_s: float) -> str:
+    """Say when a code's first MOST_TOLD spans began."""
     more = f" and {len(codes.spans_ns) - MOST_TOLD} more" if len(codes.spans_ns) > MOST_TOLD else ""
     return "at " + ", ".join(f"{begin * 1e-9:.2f}" for begin, _ in codes.spans_ns[:MOST_TOLD]) + f" s{more}"
 
 
 def _marks(of: Sequence[Reported]) -> list[list[str]]:
+    """Return a row for each mark, its text in its recording's column."""
     rows = []
     for place, each in enumerate(of):
         for mark in each.file.overview.marks:
@@ -144,6 +153,7 @@ def _marks(of: Sequence[Reported]) -> list[list[str]]:
 
 
 def _belief(of: Sequence[Reported]) -> list[list[str]]:
+    """Return a row for each quantity that was believed and acted at a recording's end."""
     found = []
     for each in of:
         end_ns = each.file.overview.end_ns
@@ -160,17 +170,19 @@ def _belief(of: Sequence[Reported]) -> list[list[str]]:
 
 
 def _lateness(of: Sequence[Reported]) -> list[list[str]]:
+    """Return a row for each bar of the lateness histogram."""
     bars = [f"under {LATE_US[0]:g}", *(f"{a:g} to {b:g}" for a, b in pairwise(LATE_US))]
     counts = [each.file.overview.late_counts for each in of]
     return [[bar, *(f"{of_one[i]:,}" for of_one in counts)] for i, bar in enumerate([*bars, f"over {LATE_US[-1]:g}"])]
 
 
 def _rows(columns: Sequence[Mapping[str, str]]) -> list[list[str]]:
-    """A row of each key, with what every column has of it."""
+    """Return a row for each key of any column, with each column's value, empty where it has none."""
     return [[key, *(column.get(key, "") for column in columns)] for key in dict.fromkeys(k for c in columns for k in c)]
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return an HTML table; "None." where it has no row."""
     lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
     if not lines:
         return "<p>None.</p>"

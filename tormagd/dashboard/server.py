@@ -1,4 +1,4 @@
-"""The page and what it asks for: on this machine's own address only, and nothing but to be read."""
+"""The dashboard's HTTP server: reachable only from this machine, and read-only."""
 
 import asyncio
 import contextlib
@@ -19,7 +19,7 @@ from tormagd.recording.reader import RecordingError
 
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
-"What a browser on this machine calls it. By another name that leads here, a page from elsewhere would read along."
+"Host names that are served. By another name for this address, a foreign page could read the answers."
 MOST_BROWSERS = 32
 PAGE = Path(__file__).parent / "page"
 HEADERS = {
@@ -30,7 +30,11 @@ HEADERS = {
 
 
 def application(shown: Live | Recorded) -> web.Application:
-    """The page for what is shown. Every route is a GET."""
+    """Return the web application for a live daemon or a recording. Every route is a GET.
+
+    `/live` streams events (503 beyond MOST_BROWSERS); `/frame?at_s=` gives a recording's frame, 410 where it cannot be
+    read.
+    """
 
     async def page(request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / "index.html")
@@ -67,7 +71,10 @@ def application(shown: Live | Recorded) -> web.Application:
 
 
 async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None]) -> None:
-    """Serves until SIGINT or SIGTERM; calls `ready` with the address. Raises OSError where the port is taken."""
+    """Serve the page on LOOPBACK until SIGINT or SIGTERM; `port` 0 takes a free one.
+
+    Calls `ready` once with the page's address. Raises OSError where the port is taken.
+    """
     over = asyncio.Event()
     runner = web.AppRunner(application(shown), access_log=None, shutdown_timeout=0.5)
     await runner.setup()
@@ -83,6 +90,8 @@ async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None])
 
 @web.middleware
 async def _only_this_machine(request: web.Request, handler: Handler) -> web.StreamResponse:
+    """Answer 403 to a request for a host name other than NAMES: a foreign page could reach the server by its own
+    name."""
     if request.url.host not in NAMES:
         raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
     return await handler(request)
@@ -97,6 +106,7 @@ def _json(value: object) -> web.Response:
 
 
 def _seconds(text: str) -> float:
+    """Parse the query's `at_s`; answers 400 where it is no finite number."""
     try:
         seconds = float(text)
     except ValueError:
