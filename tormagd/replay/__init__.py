@@ -1,1 +1,1 @@
-"""A black box run again: the very same core over what it was given, or the simulator in place of the device."""
+"""A black box run again: the same core over the recorded inputs, or the simulator in place of the device."""

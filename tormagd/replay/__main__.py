@@ -23,7 +23,11 @@ from tormagd_client.endpoints import ConfigError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Returns 0, or 2 where the file or an option cannot be used: why is on stderr, in one line."""
+    """Replay the file that the arguments name, print one JSON object, and return the exit code.
+
+    0 is done, 1 that stdout cannot be written, 2 that the file or an option cannot be used; then one line on stderr
+    says why. With `--set` or `--fault` the simulated device takes the real one's place.
+    """
     parser = argparse.ArgumentParser(prog="python -m tormagd.replay", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("file", type=Path)
     parser.add_argument("--from", dest="from_s", type=float, default=0.0)
@@ -64,6 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
+    """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it."""
     todo = script(known.columns, box.entries)
     config = changed(known.config, options.settings)
     simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)

@@ -1,4 +1,4 @@
-"""The conversation with the device run again: the very same `Connection`, over what was read and when."""
+"""The conversation with the device run again: the same `Connection`, fed what was read at the times recorded."""
 
 from collections.abc import Sequence
 from itertools import zip_longest
@@ -24,11 +24,14 @@ KNOWN = kinds(
     *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
     *(LinkQuality, Counts, Frame, FramingStatistics),
 )
-"All that a conversation's memory consists of."
+"The types in a connection's memory."
 
 
 class Found(NamedTuple):
-    """What differs: where, what was recorded and what is replayed; in or after which frame, where it is about those."""
+    """The first difference: its field, the recorded and the replayed value, and the frame it belongs to.
+
+    `frame` is None where the difference is not about frames.
+    """
 
     field: str
     recorded: Any
@@ -37,13 +40,14 @@ class Found(NamedTuple):
 
 
 def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
-    """Where two plain data, which stand at `where`, differ first; None where they are the same to the bit."""
+    """Return the first difference between two plain values, its field under `where`; None where they agree to the
+    bit."""
     found = first_difference(recorded, replayed)
     return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
 
 
 class Damage(msgspec.Struct, frozen=True):
-    """The first damaged frame: which of the file's, when, and why it was refused."""
+    """The first damaged frame: its number in the file, when it was read, and why it was refused."""
 
     frame: int
     time_s: float
@@ -51,25 +55,28 @@ class Damage(msgspec.Struct, frozen=True):
 
 
 class RecordedWire:
-    """The backend of a connection: what is read stands in the file, what is written is compared."""
+    """A backend that reads what the file holds, and keeps what the connection writes for comparison."""
 
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
         self.unread: Sequence[Any] = ()
-        "Pieces: one of bytes, or a bus's frames."
+        "What to read next: one piece of bytes, or frames of a bus."
         self.damaged: list[int] = []
-        "Of those that were read last, which were."
+        "Indices of the corrupt pieces in the last read."
         self.written: list[Sent] = []
         self.connection = Connection(Device(), lambda: self, lambda: None)
         self.connection.open(0.0)
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Counters since the port was opened."""
+        """Return the link's counters since the port was opened."""
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """The messages in what was read."""
+        """Decode the pieces in `unread` and empty it; `damaged` then lists the pieces with a corrupt frame.
+
+        Raises BackendError where another host drives the CAN node.
+        """
         messages: list[Message] = []
         pieces, self.unread, self.damaged = self.unread, (), []
         for place, piece in enumerate(pieces):
@@ -88,25 +95,31 @@ class RecordedWire:
             raise BackendError("another host drives the node") from error
 
     def send(self, message: Message) -> None:
-        """Keeps what it becomes."""
+        """Encode a message, and keep its bytes or frame in `written`."""
         self.written.append(self.stream.pack(message))
 
     def close(self) -> None:
-        """There is nothing to give back."""
+        """Do nothing: no port is open."""
 
 
 class Conversation:
-    """What is known of it between two entries; nothing before the first snapshot, or while no port was open."""
+    """The replayed connection between two entries of a black box, with its counts of frames.
+
+    Without a snapshot, or while no port was open, there is no connection: reading and comparing then do nothing.
+    """
 
     def __init__(self, frame: int) -> None:
         self._wire: RecordedWire | None = None
         self.frame = frame
-        "The file's newest, from 1; whoever reads the entries counts."
+        "Number of the newest frame in the file, from 1; set by the caller."
         self.frames = self.damaged = self.resynchronised = 0
         self.first_damage: Damage | None = None
 
     def begin(self, memory: Any) -> None:
-        """Goes on with what was remembered then. Raises InexactError, TypeError, LookupError for what nobody does."""
+        """Replace the connection by one with the `memory` of a snapshot, plain data; None means no open port.
+
+        Raises InexactError, TypeError or LookupError for a memory that no connection writes.
+        """
         self._wire = None
         if memory is not None:
             told = memory["stream"]
@@ -116,19 +129,21 @@ class Conversation:
             self._wire = wire
 
     def compare_memory(self, recorded: Any) -> Found | None:
-        """What it remembers otherwise than was recorded."""
+        """Return where the connection's memory differs from the recorded one; None where it does not, or none is
+        open."""
         if self._wire is None:
             return None
         return differing("state.connection", recorded, self._wire.connection.memory(), self.frame)
 
     def compare(self, recorded: Measurement | None) -> Found | None:
-        """What it measures otherwise than the recorded step was given."""
+        """Return where the connection's measurement differs from the recorded step's; None where it does not, or none
+        is open."""
         if self._wire is None:
             return None
         return differing("measurement", plain(recorded), plain(self._wire.connection.measurement), self.frame)
 
     def read(self, entry: Any) -> None:
-        """Something came."""
+        """Feed the connection a READ entry, count its frames, and keep the first damaged one in `first_damage`."""
         wire = self._wire
         if wire is None:
             return
@@ -144,7 +159,8 @@ class Conversation:
             self.first_damage = Damage(self.frame - len(pieces) + 1 + wire.damaged[0], now_s, why)
 
     def wrote(self, entry: Any, output: Duty) -> Found | None:
-        """A step's output went to the device: what was written otherwise."""
+        """Send a step's `output` again, and return the first frame that differs from the WROTE entry; None where none
+        does."""
         wire = self._wire
         if wire is None:
             return None
@@ -161,6 +177,7 @@ class Conversation:
 
 
 def _shown(frame: Any) -> str:
+    """Show a frame in hexadecimal, with its identifier on a bus; "nothing" for None."""
     if frame is None:
         return "nothing"
     if isinstance(frame, bytes):

@@ -1,4 +1,4 @@
-"""The core that a black box is of, built again from the file; and what differs between there and here."""
+"""Rebuilds a black box's core from the file, and lists what differs between its origin and here."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ NEEDED = (
     "scene_folder", "model_sha256", "columns",
 )  # fmt: skip
 SHOWN = 12
-"Digits of a hash that are told."
+"Digits of a hash that messages show."
 
 
 class ReplayError(ValueError):
@@ -29,7 +29,7 @@ class ReplayError(ValueError):
 
 
 class Recorded(NamedTuple):
-    """What a black box says of itself, checked."""
+    """The checked contents of a black box's header."""
 
     config: Config
     scene: Scene
@@ -40,7 +40,11 @@ class Recorded(NamedTuple):
 
 
 def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
-    """The header's contents; the model is looked for where it was, and in the folder `beside`. Raises ReplayError."""
+    """Check a black box's header and return its contents; its model will be looked for where it was, then in `beside`.
+
+    Raises ReplayError: a value is missing, of another format, damaged (by its hash), or a refused configuration or
+    scene.
+    """
     header = box.header
     missing = [name for name in NEEDED if name not in header]
     if missing:
@@ -70,8 +74,10 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
 
 
 def rebuilt(known: Recorded, config: Config | None = None) -> Core:
-    """The core, with another configuration if one is given. Raises ReplayError: the model is not here, or does not
-    fit."""
+    """Build the recorded core, with `config` in place of the recorded configuration unless that is None.
+
+    Raises ReplayError where no model with the recorded hash is found, or the core cannot be built.
+    """
     found = ""
     for folder in known.model_folders:
         try:
@@ -86,7 +92,10 @@ def rebuilt(known: Recorded, config: Config | None = None) -> Core:
 
 
 def differences(known: Recorded, configured: Config | None) -> list[str]:
-    """What is not as it was when the file was written, in plain words. `configured` is this machine's, if known."""
+    """List in plain words what differs from when the file was written: sources, platform, scene, configuration.
+
+    `configured` is this machine's configuration. With None it is not compared, and the recorded one names the scene.
+    """
     found = []
     here, there = sources_hash(), known.header["sources_sha256"]
     if here != there:
@@ -108,12 +117,14 @@ def differences(known: Recorded, configured: Config | None) -> list[str]:
 
 
 def _compare(found: list[str], what: str, there: str, data: bytes) -> None:
+    """Add a sentence to `found` where the hash of `data` is not `there`."""
     here = hashlib.sha256(data).hexdigest()
     if here != there:
         found.append(f"{what}: {there[:SHOWN]} was recorded and is used, here is {here[:SHOWN]}")
 
 
 def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
+    """Return a header's JSON object. Raises ReplayError where it is none, or does not match the hash beside it."""
     told = hashlib.sha256(header[name].encode()).hexdigest()
     if told != header[f"{name}_sha256"]:
         raise ReplayError(f"{name}: its hash is {told[:SHOWN]}, beside it stands {header[f'{name}_sha256'][:SHOWN]!r}")
@@ -124,6 +135,7 @@ def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
 
 
 def _json(header: dict[str, str], name: str) -> Any:
+    """Parse a header's JSON value. Raises ReplayError where it is none."""
     try:
         return json.loads(header[name])
     except (ValueError, RecursionError) as error:

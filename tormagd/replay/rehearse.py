@@ -1,7 +1,7 @@
-"""What would have happened instead: the simulated device in place of the real one, in virtual time, with the setpoints,
-commands and the handle's motion of a black box, and a configuration that may be another.
+"""What would have happened instead: the simulated device in place of the real one, in virtual time.
 
-The simulator is not the device that was recorded: so it runs with the recorded configuration too, to compare with.
+Setpoints, commands and the handle's motion are a black box's; the configuration may be another. The simulator is not
+the recorded device. So it runs with the recorded configuration too, to compare with.
 """
 
 import tomllib
@@ -29,21 +29,23 @@ HOMED_S, CONNECTED_S = 8.0, 0.5
 """In virtual time: by then the device is homed, and renders the first setpoint where the recorded one did at the file's
 beginning; or it is only connected, where that was not homed."""
 PATIENCE_S = 0.5
-"A command that is refused is given again for so long: the simulated device may come to a rest later, and it was taken."
+"How long a refused command is given again: the simulated device may come to rest later than the real one."
 SEED = 1
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
 
 
 class Happened(msgspec.Struct, frozen=True):
-    """Faults with when each first was latched, and limits with for how long each was held, s; times from the file's
-    first tick. `refused` are commands that were."""
+    """What a run met: faults by when each was first latched, limits by how long each held.
+
+    Both in s, faults from the file's first tick. `refused` names the commands that the core refused, and why.
+    """
 
     faults: dict[str, float]
     limits: dict[str, float]
     refused: list[str]
 
     def note(self, at_s: float, faults: Iterable[str], held: Iterable[str], for_s: float) -> None:
-        """What there was in one tick: its faults, and the limits that were held for so long."""
+        """Add one tick at `at_s`: its faults, and the limits in `held` for another `for_s` seconds."""
         for fault in faults:
             self.faults.setdefault(str(fault), round(at_s, 3))
         for limit in dict.fromkeys(map(str, held)):
@@ -51,7 +53,10 @@ class Happened(msgspec.Struct, frozen=True):
 
 
 class Script(NamedTuple):
-    """What a black box's core was asked for: times in s from its first tick."""
+    """What a black box's core was asked to do; times are in seconds from its first tick.
+
+    `setpoints` has one entry for each plan; None is a plan without a setpoint.
+    """
 
     lasts_s: float
     is_homed: bool
@@ -59,17 +64,20 @@ class Script(NamedTuple):
     hand: RecordedHand
     setpoints: list[tuple[float, TimedSetpoint | None]]
     commands: list[tuple[float, str]]
-    "Those that were taken."
+    "Commands that the core took, with their times."
     recorded: Happened
 
     @property
     def begins_s(self) -> float:
-        """When its first tick is, in virtual time."""
+        """Return when the file's first tick is in virtual time, s."""
         return HOMED_S if self.is_homed else CONNECTED_S
 
 
 def changed(config: Config, settings: Sequence[str]) -> Config:
-    """With `KEY=VALUE` settings, as in limits.skew_fault_mm=2. Raises ReplayError."""
+    """Return the configuration with `KEY=VALUE` settings, as in limits.skew_fault_mm=2; a value is TOML, or else text.
+
+    Raises ReplayError for an unknown key, or a value that the configuration refuses.
+    """
     tables: dict[str, Any] = msgspec.to_builtins(config)
     for setting in settings:
         key, equals, text = setting.partition("=")
@@ -92,7 +100,10 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
 
 
 def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
-    """What there is to be done again. Raises ReplayError."""
+    """Return what is to be done again: the setpoints, taken commands and handle positions of a black box's entries.
+
+    Raises ReplayError where an entry is malformed, or no tick is there.
+    """
     records = ticks_of(columns, entries)
     ticks = list(records.values())
     first_s = ticks[0].monotonic_s
@@ -123,8 +134,11 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
 
 
 def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Sequence[str]) -> Happened:
-    """The script in the closed loop. `faults` are those of the simulated device, as in encoder_jump@12.5, from the
-    file's first tick. Raises ReplayError."""
+    """Run the script in the closed loop against the simulated device, and return what it met.
+
+    `plant` names the simulated device. `faults` are its faults, as in encoder_jump@12.5, from the file's first tick.
+    Raises ReplayError: an unknown plant or fault, or a device that cannot be armed, or not in time.
+    """
     try:
         delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in map(parse_fault, faults)]
         hand = RecordedHand(tuple(time_s + todo.begins_s for time_s in todo.hand.times_s), todo.hand.positions_mm)
@@ -149,6 +163,7 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
 
 
 def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
+    """Give the script's commands and setpoints at their times; a refused command is given again for PATIENCE_S."""
     happened = Happened({}, {}, [])
     setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))
     newest: TimedSetpoint | None = None
@@ -173,6 +188,7 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
 
 
 def _recorded(ticks: list[TickRecord]) -> Happened:
+    """Return the faults and limits that the recorded ticks show."""
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
     before_s = first_s
     for tick in ticks:
@@ -186,7 +202,7 @@ def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:
 
 
 def _hand(ticks: list[TickRecord]) -> RecordedHand:
-    """As the encoder of the handle saw it; it rests before, and after."""
+    """Return the handle's positions as its encoder measured them; without one the handle stays at 0 mm."""
     places: dict[float, float] = {}
     for tick in ticks:
         if tick.sensed_s is not None and tick.device_handle_mm is not None:

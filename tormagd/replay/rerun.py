@@ -1,4 +1,4 @@
-"""The core over what it was given: bit for bit the same, or the first tick and field that differ."""
+"""Runs the core over its recorded inputs: it gives the same bits, or the first tick and field that differ."""
 
 from bisect import bisect_right
 from functools import reduce
@@ -31,12 +31,12 @@ from tormagd_client.messages import TickRecord
 UNTAKEN = (
     TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
 )  # fmt: skip
-"What the core raises at values of a kind that no part of it makes."
+"What the core may raise for values that it never makes itself."
 SETPOINT = tuple[
     float, float, float, float | None, float | None, tuple[float, ...], float, int, tuple[Limit, ...], float | None, Any
 ]
 NOT_THE_CORES = 1
-"The first column of a record is the clock's."
+"Number of leading columns that the core does not make: `t_ns`, from the clock."
 MEASURED = {
     "received_s": "received_s",
     "device_time_s": "device_time_s",
@@ -52,20 +52,26 @@ MEASURED = {
     "reported_s": "reported_s",
     "delay_s": "delay_s",
 }
-"The numbers of a measurement, and the columns that they stand in."
+"By field of a measurement, the column that holds it."
 QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s", "device_clock_drift")
-"The columns of its `LinkQuality`, in its order."
+"The columns of a measurement's LinkQuality, in field order."
 
 
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
-    """When a plan of a black box began, s, and for which setpoint. Raises InexactError and msgspec.ValidationError."""
+    """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a plan without one.
+
+    Raises InexactError or msgspec.ValidationError for a malformed entry.
+    """
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
     return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
 
 
 class Difference(msgspec.Struct, frozen=True):
-    """Where a replay first gave something else. `tick` counts from 1 at the file's first, `time_s` from there. `frame`
-    is where it is about what was written, or what was measured and remembered after that frame; it counts likewise."""
+    """Where a replay first differs. `tick` counts from 1, `time_s` from the file's first tick.
+
+    `frame` counts from 1, too: the frame written otherwise, or after which a measurement or a memory differs. None
+    where the difference is not about frames.
+    """
 
     tick: int
     time_s: float
@@ -76,11 +82,11 @@ class Difference(msgspec.Struct, frozen=True):
 
 
 class Rerun(msgspec.Struct, frozen=True):
-    """What came of it: `ticks` were the same to the bit, from `from_s` to `to_s` after the file's first; `snapshots` of
-    the whole state were compared too; over `gaps` something is missing, and it went on from the next snapshot.
+    """What a replay gave: `ticks` that agree to the bit, from `from_s` to `to_s` after the file's first tick.
 
-    `frames` that were read and written went through the same link, with the same measurements to the bit; `damaged` and
-    `resynchronised` count what was wrong with those that were read, and `first_damage` is where that began.
+    `snapshots` of the whole state were compared, too. At each of `gaps` something is missing, and the replay went on
+    from the next snapshot. `frames` went through the same link; `damaged` and `resynchronised` count what was wrong
+    with those read, and `first_damage` is the first. `difference` is None where none was found.
     """
 
     ticks: int
@@ -96,7 +102,10 @@ class Rerun(msgspec.Struct, frozen=True):
 
 
 def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
-    """The records, by the place of their entry. Raises ReplayError."""
+    """Return the tick records of a black box by the index of their entry.
+
+    Raises ReplayError where a tick does not fit `columns` or its types, or no tick is there.
+    """
     own = TickRecord.__struct_fields__
     order = None if columns == own else [columns.index(name) for name in own]
     records: dict[int, TickRecord] = {}
@@ -115,7 +124,11 @@ def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickReco
 
 
 def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: float = 0.0) -> Rerun:
-    """Runs `core` from the newest snapshot that is not after `from_s`, or the first. Raises ReplayError."""
+    """Run `core` over the entries, up to the first difference, and return what came of it.
+
+    Begins at the newest snapshot not after `from_s`, else at the first. Raises ReplayError: `from_s` outside the file,
+    no snapshot with a tick after it, or values that the core does not take.
+    """
     records = ticks_of(columns, entries)
     places = list(records)
     first_s = records[places[0]].monotonic_s
@@ -154,7 +167,8 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
 
 
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
-    """The place of the newest snapshot whose next tick is not after that, or of the first."""
+    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first. Raises
+    ReplayError."""
     found: int | None = None
     waiting: int | None = None
     for place, entry in enumerate(entries):
@@ -170,24 +184,28 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 
 
 class _Running:
-    """The core between two entries, and the conversation."""
+    """Core and conversation while they are replayed, entry by entry."""
 
     def __init__(self, core: Core, frame: int) -> None:
         self.conversation = Conversation(frame)
         self._of_frames: Found | None = None
-        "What frames show to differ: told with the tick, behind what its record shows."
+        "First difference in frames since the last tick; a difference in the tick's record comes first."
         self._stepper, self._planner = core.stepper(), core.planner()
         self._used = self._planner.planned
         self._failure: Exception | None = None
-        "Of the newest plan, until the core is known to have failed there, too."
+        "Error of the newest plan; None once an AFRESH entry shows that the recorded plan failed, too."
         self._output: Duty | None = None
         self._measurement: Measurement | None = None
         self.is_known = False
-        "Whether the states are the recorded core's."
+        "Whether the states are those of the recorded core."
         self.snapshots = self.gaps = 0
 
     def take(self, entry: Any, record: TickRecord) -> Found | None:
-        """One entry that is no tick; what differs. `record` is the next tick's. Raises UNTAKEN."""
+        """Take one entry that is no tick, and return what differs; None where nothing does.
+
+        `record` is the next tick's, which holds the inputs of a step. After a MISSING entry, steps and plans are passed
+        over until the next snapshot. Raises UNTAKEN.
+        """
         name = name_of(entry)
         self.conversation.frame += len(frames_in(entry))
         if name == journal.STATE:
@@ -205,6 +223,10 @@ class _Running:
         return None
 
     def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
+        """Do what one entry tells: step, plan, learning, command or fault. Raises ValueError for an unknown entry.
+
+        Of a plan that fails, the error is kept; it is a difference unless an AFRESH entry follows.
+        """
         match name:
             case journal.STEP:
                 self._measurement = measurement_of(record)
@@ -253,7 +275,11 @@ class _Running:
         return None
 
     def compare(self, record: TickRecord) -> Found | None:
-        """The first column that differs from the recorded one, or else what its frames show."""
+        """Return the first column that differs from the recorded tick, or else what its frames show.
+
+        None where nothing differs, or the states are not known. A failed plan that the record does not have counts as a
+        difference. Raises ValueError for a tick before any step.
+        """
         if not self.is_known:
             return None
         if self._output is None:
@@ -269,7 +295,8 @@ class _Running:
         return next(Found(*row) for row in rows if packed(row[1]) != packed(row[2]))
 
     def _begin(self, entry: Any) -> Found | None:
-        """Compares the states with the recorded ones, and goes on from these."""
+        """Compare the states with a snapshot where they are known, then take the snapshot's; return the first
+        difference."""
         differs, connection = None, entry[3]
         if self.is_known:
             self.snapshots += 1
@@ -284,7 +311,10 @@ class _Running:
 
 
 def measurement_of(record: TickRecord) -> Measurement | None:
-    """What the step was given."""
+    """Return the measurement that a tick's step was given; None where it had none.
+
+    Raises ValueError where only part of a measurement is recorded.
+    """
     if record.measurement is None:
         return None
     numbers = {name: getattr(record, column) for name, column in MEASURED.items()}
@@ -302,7 +332,7 @@ def measurement_of(record: TickRecord) -> Measurement | None:
 
 
 def name_of(entry: Any) -> str:
-    """An entry's name; empty for a tick."""
+    """Return a black box entry's name; empty for a tick."""
     if isinstance(entry, str):
         return entry
     if isinstance(entry, list) and entry and isinstance(entry[0], str):
@@ -311,5 +341,6 @@ def name_of(entry: Any) -> str:
 
 
 def _short(thing: object) -> str:
+    """Return a value's text, cut to 200 characters."""
     text = str(thing) if isinstance(thing, Exception | str) else repr(thing)
     return text if len(text) <= 200 else f"{text[:197]}..."
