@@ -1,4 +1,4 @@
-"""`tormagctl blackbox`: have the last half minute written, and fetch it."""
+"""`tormagctl blackbox`: have the daemon write its last half minute, and fetch the file."""
 
 import shutil
 import time
@@ -9,14 +9,14 @@ from tormagd_client.blocking import Client
 
 POLL_S = 0.1
 LONGEST_S = 30.0
-"Writing takes a second or two, at the lowest priority."
+"Longest wait for the file; writing takes a second or two, at low priority."
 
 
 def black_box(client: Client, copy: Path | None) -> Outcome:
-    """Asks for it and waits until it is on the disk; `copy` is where it is copied to.
+    """Have the daemon write its black box, wait until it is on the disk, and copy it to `copy` unless that is None.
 
-    Raises CommandError: USAGE where `copy` exists or cannot be made, REFUSED where the daemon keeps none, or it could
-    not be written.
+    Raises CommandError: USAGE where `copy` exists or the file cannot be copied; REFUSED where the daemon did not write
+    it within LONGEST_S. Raises as `Client.request` where the daemon keeps no black box.
     """
     if copy is not None and copy.exists():
         raise usage_error(f"{copy} exists", "give another name; nothing is overwritten")

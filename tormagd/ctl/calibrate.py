@@ -1,8 +1,7 @@
-"""`tormagctl calibrate`: which of the three it is to be; and of these, a guided sweep through the running daemon, and a
-model of the insert from it.
+"""`tormagctl calibrate`: choose what is calibrated; for an insert, sweep the force and have a model fitted.
 
-The sweep asks for forces, so every limit of the daemon stays in force. A process of its own (`FITTING`)
-turns it into training data, fits, judges and saves: neither the daemon nor this program carries a training.
+The sweep asks for forces through the running daemon, so every limit of the daemon stays in force. A process of its own
+(`FITTING`) makes training data of it, fits, judges and saves: neither the daemon nor this program carries a training.
 """
 
 import csv
@@ -29,7 +28,7 @@ from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
 
 COLUMNS = ("monotonic_s", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s", "measured_cf")
-"Of the control ticks, what a sweep is made of."
+"Columns of the control ticks that make a sweep."
 FILE_COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 EVERY = 4
 "Every fourth tick is kept: neighbours say nearly the same."
@@ -48,10 +47,11 @@ def calibrate_insert(
     rates_N_s: Sequence[float],
     wait_s: float,
 ) -> Outcome:
-    """Sweep the force up and down once for each of `rates_N_s`, fit, judge, save. The gap opens after the sweeps.
+    """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`.
 
-    Raises CommandError: USAGE, REFUSED (by the daemon; the handle stands still; a sweep or a fit that is not good
-    enough, and then there is no model file), FAULT, UNREACHABLE, `interrupted_run`.
+    `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. Raises CommandError:
+    USAGE, FAULT, UNREACHABLE, `interrupted_run`; REFUSED by the daemon, for a handle that stands still, an unknown
+    insert, or a sweep or fit that is not good enough. Then there is no model file.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
@@ -78,6 +78,7 @@ def calibrate_insert(
 
 
 def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
+    """Tell the person how to turn the handle, wait until it moves, and return the ticks of one sweep."""
     waveform = up_and_down(forces, rates_N_s[number])
     label = f"sweep {number + 1} of {len(rates_N_s)}"
     print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
@@ -87,13 +88,14 @@ def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> 
 
 
 def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
-    """From the least force to the most and back at a steady rate."""
+    """Return a waveform from the least force to the most and back, at `rate_N_s`."""
     half_s = (forces.most_N - forces.least_N) / rate_N_s
     return by_legs(forces.least_N, [(half_s, forces.most_N), (half_s, forces.least_N)])
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
-    """The file that `FITTING` reads: every fourth tick of each sweep that says everything."""
+    """Write the CSV file that `FITTING` reads: of each sweep every fourth tick, of those in which every value is
+    known."""
     start_s = min((float(sweep["monotonic_s"][0]) for sweep in sweeps if sweep["monotonic_s"].size), default=0.0)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -113,6 +115,10 @@ def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
 
 
 def _ask_fitter(*arguments: str) -> dict[str, Any]:
+    """Run the fitting process and return its answer; SIGINT and SIGTERM end it.
+
+    Raises CommandError (REFUSED) where it refuses, dies without an answer, or is interrupted.
+    """
     command = [sys.executable, "-m", FITTING, *arguments]
     with (
         interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted,
@@ -165,8 +171,11 @@ def calibrate(
     side: Literal["left", "right"],
     is_agreed: bool,
 ) -> Outcome:
-    """Of a device, an insert, or the motors. Raises CommandError: USAGE for options that do not fit each other and for
-    a faulty scene, and as the three do."""
+    """Calibrate one of: the device, an `insert`, or the `motors`; asks for agreement first unless `is_agreed`.
+
+    Raises CommandError: USAGE for options that do not fit each other, a file that exists or has no folder, a faulty
+    scene, or nobody to ask; and as the three calibrations do.
+    """
     if [insert is not None, motors, device].count(True) != 1:
         raise usage_error("give one of --insert NAME, --motors and --device", "tormagctl calibrate --help shows them")
     if insert is None and csv is not None:
@@ -197,7 +206,7 @@ def calibrate(
 
 
 def _agree() -> None:
-    """Armed on purpose: a person agrees, or a script says --yes."""
+    """Wait until a person presses Enter. Raises CommandError (USAGE) where stdin is no terminal."""
     if not is_terminal(sys.stdin):
         raise usage_error("nobody can agree to the carriages moving", "a script says --yes")
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)

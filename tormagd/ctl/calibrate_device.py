@@ -1,7 +1,7 @@
-"""`tormagctl calibrate --device`: the running daemon learns this device in under a minute, and keeps it as its profile.
+"""`tormagctl calibrate --device`: the running daemon learns this device in under a minute and keeps it as its profile.
 
-Nothing is fitted here. The daemon learns while it drives; what it lacks on its first day is the occasion: forces over
-the whole range, and a handle that turns back often enough for the sensor's zero. Then steps say how good that is.
+Nothing is fitted here: the daemon learns while it drives. This program gives it the occasion: forces over the whole
+range, and a handle that reverses often enough for the sensor's zero. Steps then say how good the profile is.
 """
 
 import sys
@@ -19,17 +19,17 @@ from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import ProfileReport, Status
 
 COLUMNS = ("monotonic_s", "measured_cf", "handle_rate_mm_s")
-"Of the control ticks, what the steps are judged by."
+"Columns of the control ticks by which the steps are judged."
 
 CLEAR_N = 0.1
-"Kept from F_min, which grows with the device that shows itself stronger."
+"Distance kept from F_min, which grows where the device proves stronger."
 RAMPS_S = (6.0, 4.0, 4.0)
 "Time from the least to the most force; then the same time back."
 STEP_SHARES = (1.0, 0.0, 0.5, 1.0, 0.25, 0.75)
 "Levels of the steps that judge, as shares of the range: none was held before."
 STEP_S = 2.0
 ARRIVED_S = 1.0
-"Of every step this much is left to the carriages and the fit."
+"Time at the start of every step that is left to the carriages and the fit."
 LEAST_SLIDING = 0.3
 "A handle that moves for less than this share of the time has taught little."
 KEPT_WITHIN_S = 5.0
@@ -37,7 +37,7 @@ DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
 
 
 def lesson(forces: Range) -> tuple[Waveform, Waveform]:
-    """What is asked so that the device shows itself, and the steps that judge what came of it."""
+    """Return two waveforms: ramps by which the device shows itself, and steps that judge what was learned."""
     low_N = forces.least_N + CLEAR_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (forces.most_N, low_N)]
     levels_N = [low_N + share * (forces.most_N - low_N) for share in STEP_SHARES]
@@ -49,10 +49,10 @@ def lesson(forces: Range) -> tuple[Waveform, Waveform]:
 
 
 def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
-    """Let the daemon learn the device, judge it by steps, and see that its profile is kept. The gap opens in the end.
+    """Let the daemon learn the device, judge it by steps, and wait until its profile is kept. The gap opens in the end.
 
-    Raises CommandError: REFUSED (also where no profile is kept, the handle hardly moves, or the force sensor is not
-    believed), FAULT, UNREACHABLE, `interrupted_run`.
+    `scene_most_N` is the greatest force to ask for. Raises CommandError: FAULT, UNREACHABLE, `interrupted_run`; REFUSED
+    by the daemon, and where no profile is kept, the handle hardly moves, or the daemon doubts the force sensor.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         profile = client.status().profile
@@ -74,9 +74,11 @@ def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -
 
 
 def judged(steps: Columns, waveform: Waveform, zero_N: float) -> dict[str, Any]:
-    """How far the force that the sensor shows is from what was asked, once it has arrived, N: `mean_error_N` and
-    `worst_error_N` over the steps' own means, and `noise_N`, the standard deviation within them. Raises CommandError
-    (REFUSED) where the handle hardly moved."""
+    """Return how far the measured force is from the asked one on the steps, by keys of `--json`, in N.
+
+    `mean_error_N` and `worst_error_N` are over the steps' means, less `zero_N`, after ARRIVED_S of each; `noise_N` is
+    the median standard deviation within one. Raises CommandError (REFUSED) where the handle hardly moved.
+    """
     require_sliding(steps)
     begin_s = float(steps["monotonic_s"][0])
     since_s = steps["monotonic_s"] - begin_s
@@ -100,14 +102,14 @@ def judged(steps: Columns, waveform: Waveform, zero_N: float) -> dict[str, Any]:
 
 
 def require_sliding(ticks: Columns) -> None:
-    """Raise CommandError (REFUSED) where the handle moved too little to teach anything."""
+    """Raise CommandError (REFUSED) where the handle moved for less than LEAST_SLIDING of the ticks."""
     share = float(_sliding(ticks).mean()) if ticks["handle_rate_mm_s"].size else 0.0
     if share < LEAST_SLIDING:
         raise _still(share)
 
 
 def require_believed(status: Status) -> None:
-    """Raise CommandError (REFUSED) where the daemon does not believe the force sensor: then nothing was learned."""
+    """Raise CommandError (REFUSED) where the daemon doubts the force sensor: then nothing was learned."""
     doubt = next((limit for limit in status.limit_details if limit.code in DOUBTS), None)
     if doubt is not None:
         raise CommandError(
@@ -129,6 +131,8 @@ def _still(share: float) -> CommandError:
 
 
 def _kept(client: Client) -> ProfileReport:
+    """Wait until the daemon has written the profile anew. Raises CommandError (REFUSED) where it has not within
+    KEPT_WITHIN_S."""
     began_s = time.monotonic()
     while True:
         profile = client.status().profile

@@ -1,7 +1,7 @@
 """`tormagctl calibrate --motors`: a log of one motor's voltage, current and motion, for `tormag-lab identify-motor`.
 
-Only forces are asked for, so every limit of the daemon stays in force. They are chosen for what they make the carriages
-do: slow ramps show friction, fast ones the speed term, jumps the inertia.
+Only forces are asked for, so every limit of the daemon stays in force. They are chosen for the motion they cause: slow
+ramps show friction, fast ones the speed term, jumps the inertia.
 """
 
 import csv
@@ -30,11 +30,11 @@ COLUMNS = (
     "measured_cf",
     "reference_gap_mm",
 )
-"Of the control ticks, what a motor log is made of."
+"Columns of the control ticks that make a motor log."
 LOG_COLUMNS = ("t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm")
 
 CLEAR_N = 0.1
-"Kept from F_min: at the open end the firmware holds back a duty that would push on."
+"Distance kept from F_min: at the open end the firmware holds back a duty that would push on."
 RAMPS_S = (12.0, 6.0, 3.0)
 "Time from the least to the most force; then the same time back."
 JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.0)
@@ -43,13 +43,14 @@ JUMP_S = 0.6
 ROUNDS = 2
 "The whole is done twice: one half is fitted, the other judges."
 LEAST_HZ = 900.0
-"Of control. A log of 500 Hz tells a motor's delay wrong, and the rest two to three times less exactly."
+"Least control rate. A log of 500 Hz gets a motor's delay wrong, and the rest two to three times less exact."
 LONGEST_HOLE_S = 0.02
 "A longer silence of the device is not bridged."
 
 
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
-    """The forces to ask for: ramps, then jumps, `rounds` times."""
+    """Return the waveform to ask for: ramps, then jumps, `rounds` times, from CLEAR_N above the least force to the
+    most."""
     low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]
     # each there in a millisecond, and held
@@ -58,9 +59,11 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
 
 
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
-    """Drive both carriages through `excitation` and write the log of one. The gap opens in the end.
+    """Drive both carriages through `excitation`, and write the log of one to the new file `path`.
 
-    Raises CommandError: USAGE where the file exists or cannot be made, REFUSED, FAULT, UNREACHABLE.
+    The gap opens in the end. Raises CommandError: FAULT, UNREACHABLE, `interrupted_run`; REFUSED by the daemon, for a
+    control rate under LEAST_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this
+    shows only after the drive.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         waveform = excitation(reach(client, scene_most_N))
@@ -91,12 +94,12 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
 
 def motor_log(ticks: Columns, side: Side) -> Columns:
-    """The motor log CSV's columns from control ticks, evenly spaced on the device's clock, time from 0.
+    """Return the motor log's columns from control ticks, evenly spaced on the device's clock, with time from 0.
 
     A row's voltage is the one sent in answer to the row's position: duty times supply. Positions are from the home
-    switch, opening positive; `force_N` is the force at the roller, which says nothing about the motor. A tick without
-    news from the device is left out; what is missing is filled in: voltages held, the rest along straight lines.
-    Raises CommandError (REFUSED) where the device was silent for more than 20 ms.
+    switch, positive as the gap opens; `force_N` is the force at the roller and says nothing about the motor. Ticks
+    without news from the device are left out. Between measurements voltages are held, other values interpolated. Raises
+    CommandError (REFUSED) where the device was silent for more than LONGEST_HOLE_S, or throughout.
     """
     known = np.isfinite(np.column_stack([ticks[name] for name in COLUMNS])).all(axis=1)
     time_s = ticks["device_time_s"][known]

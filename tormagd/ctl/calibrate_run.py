@@ -39,7 +39,7 @@ HANDLE_PATIENCE_S = 30.0
 
 
 def interrupted_run() -> CommandError:
-    """The person ended the run; nothing is kept of it."""
+    """Return the error (REFUSED) for a run that the person ended; nothing of it is kept."""
     return CommandError(
         Exit.REFUSED,
         "interrupted",
@@ -49,14 +49,15 @@ def interrupted_run() -> CommandError:
 
 
 class Range(NamedTuple):
-    """The forces that the daemon can give with the model it has now, N."""
+    """The forces that a calibration may ask for, N: what the daemon gives with its present model, up to the scene's
+    most."""
 
     least_N: float
     most_N: float
 
 
 def seconds_bar(duration_s: float, label: str) -> "tqdm[Any]":
-    """A progress bar over time, on a terminal only."""
+    """Return a progress bar over `duration_s`, shown only where stderr is a terminal."""
     return tqdm(
         total=duration_s,
         desc=label,
@@ -81,10 +82,10 @@ class Run:
         self._heard_s = time.monotonic()
 
     def play(self, waveform: Waveform, bar: "tqdm[Any]") -> Columns:
-        """Publish `waveform` and return what the ticks of that time said: one array for each column asked for.
+        """Publish `waveform` in real time, and return what its ticks tell: an array for each column asked for.
 
-        A value that was null is NaN. Raises CommandError: FAULT or REFUSED where the device stops rendering on the way,
-        UNREACHABLE where the daemon goes, `interrupted_run`.
+        NaN is a value not known, or a word. Raises CommandError: FAULT or REFUSED where the device stops rendering
+        meanwhile, and `interrupted_run`; UNREACHABLE where the daemon goes.
         """
         rows: list[list[float]] = []
         start_s = time.monotonic()
@@ -95,7 +96,8 @@ class Run:
         return dict(zip(self._columns, table.T, strict=True))
 
     def exchange(self, force_N: float) -> list[list[float]]:
-        """Publish one force and return the rows that came until the next one is due. Raises as `play`."""
+        """Publish one force, and return the rows of ticks until the next force is due, 1/RATE_HZ later. Raises as
+        `play`."""
         if self._is_interrupted():
             raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
@@ -109,8 +111,10 @@ class Run:
         return rows
 
     def wait_for_handle(self, force_N: float) -> None:
-        """Publish one force until the handle moves. Needs the column `handle_rate_mm_s`. Raises as `play`, and REFUSED
-        where it stands still for HANDLE_PATIENCE_S."""
+        """Publish one force until the handle moves; needs the column `handle_rate_mm_s`.
+
+        Raises as `play`, and CommandError (REFUSED) where the handle stands still for HANDLE_PATIENCE_S.
+        """
         rate = self._columns.index("handle_rate_mm_s")
         until_s = time.monotonic() + HANDLE_PATIENCE_S
         while not any(abs(row[rate]) >= MOVING_MM_S for row in self.exchange(force_N)):
@@ -123,6 +127,10 @@ class Run:
                 )
 
     def _rows(self, data: bytes) -> list[list[float]]:
+        """Decode a batch into rows of floats, and note that the daemon was heard.
+
+        Raises CommandError where the batch is another version's, or a tick was not ENABLED.
+        """
         try:
             batch = decode_ticks(data)
             state, *places = [batch.columns.index(name) for name in ("operating_state", *self._columns)]
@@ -141,6 +149,7 @@ class Run:
         return [[float(each) if isinstance(each, int | float) else math.nan for each in row] for row in taken]
 
     def _require_enabled(self, state: Value) -> None:
+        """Raise CommandError (FAULT or REFUSED) unless a tick's state is ENABLED; asks the daemon for the fault."""
         if state == "ENABLED":
             return
         first = next(iter(self._client.status().fault_details), None)
@@ -153,7 +162,10 @@ class Run:
 
 
 def reach(client: Client, scene_most_N: float) -> Range:
-    """What can be asked for. Raises CommandError where somebody else publishes."""
+    """Return the forces that can be asked for.
+
+    Raises CommandError (REFUSED) where another source holds the brake, or published within RECENT_SETPOINT_MS.
+    """
     status = client.status()
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
@@ -170,9 +182,10 @@ def reach(client: Client, scene_most_N: float) -> Range:
 
 @contextmanager
 def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: float) -> Iterator[Run]:
-    """Home where needed, enable, and give a `Run`; in the end, however it comes, disable: the gap opens, drives off.
+    """Home where needed, enable, and give a `Run`; at the end of the context disable, so that the gap opens.
 
-    Raises CommandError as `home` and `enable` do, and UNREACHABLE where no ticks are published.
+    Disables after an error, too. Raises CommandError as `home` does, and `interrupted_run`; UnreachableError where no
+    ticks of an enabled device come within `wait_s`; ClientError where the daemon refuses to enable.
     """
     context = zmq.Context()
     try:
@@ -200,6 +213,7 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
 
 
 def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
+    """Receive ticks until a whole batch is ENABLED. Raises UnreachableError where none is within `wait_s`."""
     # the newest tick from before `enable` took effect must not be read as a fall out of ENABLED
     until_s = time.monotonic() + wait_s
     while time.monotonic() < until_s and ticks.poll(round(wait_s * 1e3)):
@@ -211,6 +225,7 @@ def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
 
 
 def _enable(client: Client) -> None:
+    """Enable the device, and try again for SILENT_S where its measurements are not fresh."""
     # on a busy machine the newest measurement may be a little old once
     until_s = time.monotonic() + SILENT_S
     while True:

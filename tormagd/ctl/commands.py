@@ -1,4 +1,4 @@
-"""What `tormagctl` can be asked: one table of its commands, each with its options, and the function that does it."""
+"""The commands of `tormagctl`, in one table: each with its options and the function that carries it out."""
 
 import argparse
 import math
@@ -17,9 +17,12 @@ Option = tuple[tuple[str, ...], dict[str, Any]]
 
 
 class Command(NamedTuple):
-    """`function`, as in `status.status`, is in this room. It takes the command's options by their names, and of what
-    `tormagctl` knows besides those in `needs`: `client`, `command`, `config`, `config_file`, `endpoints`, `parser` and
-    `wait_s`. `has_daemon`: the configuration has to be right, and the endpoints, whether it needs them or not."""
+    """One command. `function` names a module of `tormagd.ctl` and a function in it, as in `status.status`.
+
+    The function takes the command's options by name, and each of `needs`: `client`, `command`, `config`, `config_file`,
+    `endpoints`, `parser`, `wait_s`. With `has_daemon` the configuration and endpoints must be valid even where not
+    needed.
+    """
 
     help: str
     function: str
@@ -29,12 +32,12 @@ class Command(NamedTuple):
 
 
 def option(*names: str, **settings: Any) -> Option:
-    """An argument of a command."""
+    """Describe one argument of a command, by the names and settings that `add_argument` takes."""
     return names, settings
 
 
 def number(text: str) -> float:
-    """A finite number. These functions raise ArgumentTypeError, which says what is allowed."""
+    """Parse a finite number. Raises ArgumentTypeError, which says what is allowed."""
     try:
         value = float(text)
     except ValueError:
@@ -45,7 +48,7 @@ def number(text: str) -> float:
 
 
 class Within(NamedTuple):
-    """A number of this range."""
+    """Parses a number from `least` to `most`; raises ArgumentTypeError for any other."""
 
     least: float
     most: float
@@ -59,12 +62,12 @@ class Within(NamedTuple):
 
 
 def port(text: str) -> int:
-    """A TCP port; 0 for one that is free."""
+    """Parse a TCP port; 0 takes one that is free. Raises ArgumentTypeError."""
     return int(Within(0, 65_535)(text))
 
 
 def rates(text: str) -> tuple[float, ...]:
-    """Rates of sweeps, N/s."""
+    """Parse 3 to 60 sweep rates, N/s, separated by commas. Raises ArgumentTypeError."""
     found = tuple(Within(0.02, 10.0, " N/s")(part) for part in text.split(","))
     if not 3 <= len(found) <= 60:
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 3..60 rates")
@@ -72,7 +75,7 @@ def rates(text: str) -> tuple[float, ...]:
 
 
 def source(text: str) -> str:
-    """A publisher's name."""
+    """Check a publisher's name: 1..64 printable characters. Raises ArgumentTypeError."""
     if not 0 < len(text) <= 64 or not text.isprintable():
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
     return text
@@ -97,7 +100,7 @@ def _operate(help_text: str) -> Command:
 
 
 def _waiting(usual_s: float) -> tuple[Option, ...]:
-    """The options of a command that waits until the carriages have arrived."""
+    """Return the options of a command that waits until the carriages have arrived."""
     return (
         option(
             "--timeout",

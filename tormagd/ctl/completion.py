@@ -9,18 +9,22 @@ from tormagd.ctl.outcome import Outcome
 
 
 def completion(parser: ArgumentParser, shell: str) -> Outcome:
-    """The script for `shell`."""
+    """Return the completion script for `shell`, as result and as text."""
     text = script(parser, shell)
     return Outcome({"shell": shell, "script": text}, text)
 
 
 def script(parser: ArgumentParser, shell: str) -> str:
-    """The script that completes `parser`'s program in `shell`, `bash` or `zsh`: what is a path, by the files there."""
+    """Return the script by which `shell`, bash or zsh, completes the program of `parser`; paths complete to files.
+
+    Marks the parser's path arguments for shtab.
+    """
     _complete_paths(parser)
     return str(shtab.complete(parser, shell=shell))
 
 
 def _complete_paths(parser: ArgumentParser) -> None:
+    """Mark path arguments, also of subcommands, for completion by files."""
     for action in parser._actions:
         if action.type is Path or action.metavar == "FILE":
             action.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab looks for it here

@@ -1,4 +1,5 @@
-"""`tormagctl dashboard`: a page for a browser on this machine, of the daemon live or of a recording. It only looks."""
+"""`tormagctl dashboard`: a page for a browser on this machine, showing the daemon live or a recording. It changes
+nothing."""
 
 import asyncio
 import sys
@@ -16,9 +17,9 @@ from tormagd_client.endpoints import Endpoints
 
 
 def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
-    """Serves the page until Ctrl-C or SIGTERM.
+    """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording.
 
-    Raises CommandError (USAGE) where the port is taken or `path` cannot be read, and as `AsyncClient.status`.
+    Raises CommandError (USAGE) where the port is taken or the recording cannot be read, and as `AsyncClient.status`.
     """
     start_s = time.monotonic()
     try:

@@ -1,9 +1,9 @@
 """`tormagctl doctor`: what on this machine would hurt real time or access, each with its remedy.
 
-Each check is a small function of the machine (and the configuration) that returns one finding; with `--measure` some
-more judge what was measured (`headroom.py`). A daemon that runs here is asked by which configuration, and what it was
-granted; without one, what would be granted is that of whoever calls. None of them changes anything. A *fail* keeps
-tormagd from doing what it is configured to do; a *warn* costs timing.
+Each check is a small function of the machine and the configuration that returns one finding and changes nothing. With
+`--measure` some more judge what was measured (`headroom.py`). A daemon that runs here tells its configuration and what
+it was granted; without one, the caller's rights are judged. A *fail* keeps tormagd from doing what it is configured to
+do; a *warn* costs timing.
 """
 
 import os
@@ -33,9 +33,9 @@ MEMORY_TO_LOCK_BYTES = 1_000_000_000
 GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
 FAST_LATENCY_MS = 1
 LATE_SHARE = 0.25
-"Of a control period: a bare timer that is later than this at p99 leaves the daemon too little of it."
+"Share of a control period: a bare timer later than this at p99 leaves the daemon too little."
 MISSED_SHARE = 0.001
-"Of its beats that a bare timer may miss."
+"Share of its beats that a bare timer may miss."
 STOP_OTHERS = "stop what else runs here; top shows it"
 BY_UNIT = "run tormagd by its systemd unit, or add "
 HERE = r"ipc://|tcp://(127\.|localhost:)"
@@ -64,7 +64,7 @@ class Verdict(StrEnum):
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One line of the report: what was found, and where that is not good, what to do in plain words."""
+    """One line of the report: what was found, and what to do about it; an empty `remedy` where all is well."""
 
     name: str
     verdict: Verdict
@@ -73,7 +73,7 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 class Running(NamedTuple):
-    """A daemon on this machine: how it stands, and its configuration with the file that this is from."""
+    """A daemon on this machine: its status, its configuration, and the configuration's file; None for its defaults."""
 
     status: Status
     config: Config
@@ -81,9 +81,10 @@ class Running(NamedTuple):
 
 
 def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_s: float, measure: bool) -> Outcome:
-    """Run every check on this machine, those of what can be measured too. The exit code is REFUSED where one failed.
+    """Check this machine, and with `measure` also what it holds; the outcome is REFUSED where a check failed.
 
-    The configuration is that of the daemon that answers, else that of `config_file`.
+    Judges the configuration of the daemon that answers, else `config`, read from `config_file`. Raises CommandError
+    where the measurement fails.
     """
     machine = Machine(Path("/"))
     known: Running | ClientError = running(endpoints, wait_s)
@@ -93,7 +94,10 @@ def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_
 
 
 def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
-    """The daemon that answers at the control endpoint, or why none does."""
+    """Ask the daemon at the control endpoint for its status and configuration; return the error where that fails.
+
+    An endpoint on another machine is not asked: that is an error, too.
+    """
     if not re.match(HERE, endpoints.control):
         return ClientError("elsewhere", f"{endpoints.control} is another machine's", "run tormagctl doctor there")
     try:
@@ -110,7 +114,11 @@ def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
 def judged(
     config: Config, machine: Machine, found: Headroom | None = None, known: Running | ClientError | None = None
 ) -> Outcome:
-    """The same of any machine, and of what is known of a daemon on it."""
+    """Return the report on a machine, on the daemon `known` there, and on the headroom `found`.
+
+    `known` is an error where no daemon could be asked: then the caller's rights are judged. None leaves daemon or
+    headroom out. The outcome is REFUSED where a check failed.
+    """
     if isinstance(known, Running):
         findings = (*of_daemon(known), *(check(_in_force(known), machine) for check in OF_MACHINE))
     else:
@@ -131,17 +139,17 @@ def judged(
 
 
 def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Verdict = Verdict.WARN) -> Finding:
-    """Good, which needs no remedy; or `otherwise`."""
+    """Return an OK finding without a remedy, or one with `remedy` and the verdict `otherwise`."""
     return Finding(name, Verdict.OK, found) if is_good else Finding(name, otherwise, found, remedy)
 
 
 def examine(config: Config, machine: Machine) -> tuple[Finding, ...]:
-    """Every check's finding, in the order of the report."""
+    """Run every check, and return the findings in the order of the report."""
     return tuple(check(config, machine) for check in CHECKS)
 
 
 def nobody(why: ClientError | None) -> tuple[Finding, ...]:
-    """That no daemon could be asked, and why; nothing where none was."""
+    """Return a warning that no daemon could be asked, and why; empty for None."""
     if why is None:
         return ()
     found = f"none was asked ({why.message}); what it would be granted is judged by who calls this"
@@ -149,7 +157,8 @@ def nobody(why: ClientError | None) -> tuple[Finding, ...]:
 
 
 def of_daemon(known: Running) -> tuple[Finding, ...]:
-    """What a daemon says of itself: its configuration, its build, what the kernel granted it, and its device."""
+    """Return findings on what a daemon says of itself: configuration, build, what the kernel granted, and its
+    device."""
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
     findings = [
@@ -173,7 +182,7 @@ def of_daemon(known: Running) -> tuple[Finding, ...]:
 
 
 def _in_force(known: Running) -> Config:
-    """A daemon's configuration, without a lock of its memory that was refused."""
+    """Return a daemon's configuration as it is in force: `lock_memory` is False where the kernel refused it."""
     config = known.config
     if "realtime.lock_memory" not in refused(known.status.not_granted):
         return config
@@ -181,7 +190,7 @@ def _in_force(known: Running) -> Config:
 
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
-    """What was measured, as findings: what the machine gives, what the core takes, and whether it holds its rates."""
+    """Return findings on a measurement: the timer, what others took, the core's cost, and the two configured rates."""
     held = {row.loop: row for row in rates(config, found) if row.configured}
     return (
         bare_timer(found),
@@ -192,7 +201,7 @@ def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
 
 
 def bare_timer(found: Headroom) -> Finding:
-    """How late a thread is woken that asks for nothing else."""
+    """Judge how late a thread wakes that does nothing else, at the control rate."""
     late_us, rate_hz = found.bare.lateness_us, found.bare.rate_hz
     return _finding(
         "bare timer",
@@ -204,7 +213,7 @@ def bare_timer(found: Headroom) -> Finding:
 
 
 def others(found: Headroom) -> Finding:
-    """What a hypervisor and other programs took meanwhile, by the kernel's word."""
+    """Judge what a hypervisor and other programs took during the measurement, by the kernel's counters."""
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
     is_stolen = found.steal > MOST_STOLEN
     return _finding(
@@ -216,7 +225,7 @@ def others(found: Headroom) -> Finding:
 
 
 def core(found: Headroom) -> Finding:
-    """What the core itself takes of a processor."""
+    """Report what the core's step and plan take of a processor; always OK."""
     step, plan = found.step_us, found.plan_us
     return Finding(
         "core",
@@ -227,13 +236,13 @@ def core(found: Headroom) -> Finding:
 
 
 def configured_rate(row: Rate) -> Finding:
-    """Whether one of the configured rates is held, and with margin."""
+    """Judge one configured rate: OK with margin, WARN without, FAIL where it takes more than there is."""
     verdict = Verdict.OK if row.holds else Verdict.WARN if row.used <= 1.0 else Verdict.FAIL
     return Finding(f"{row.loop} rate", verdict, f"{row.hz} Hz takes {row.used:.0%} of what there is", row.change)
 
 
 def preemption(config: Config, machine: Machine) -> Finding:
-    """How soon the kernel lets go of a processor."""
+    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT only."""
     version = machine.text("/proc/version") or ""
     is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
     # the model in force stands in brackets or parentheses; reading it takes root
@@ -256,7 +265,7 @@ def preemption(config: Config, machine: Machine) -> Finding:
 
 
 def governor(config: Config, machine: Machine) -> Finding:
-    """Whether processors slow down between ticks."""
+    """Judge whether processors slow down between ticks: every scaling governor has to be performance."""
     files = machine.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governors = {text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))}
     return _finding(
@@ -268,7 +277,8 @@ def governor(config: Config, machine: Machine) -> Finding:
 
 
 def scheduling(config: Config, machine: Machine) -> Finding:
-    """Whether this user's processes may use SCHED_FIFO, at the priority the configuration asks for."""
+    """Judge whether the caller may use SCHED_FIFO at the configured priority; FAIL where not, WARN where none is
+    configured."""
     wanted = config.realtime.fifo_priority
     allowed = 99 if machine.has_capability(CAP_SYS_NICE) else int(machine.limit("Max realtime priority"))
     return _finding(
@@ -283,7 +293,7 @@ def scheduling(config: Config, machine: Machine) -> Finding:
 
 
 def memory_lock(config: Config, machine: Machine) -> Finding:
-    """Whether the daemon may keep its memory from being paged out."""
+    """Judge whether the caller may lock the daemon's memory; FAIL where not and it is configured."""
     limit = float("inf") if machine.has_capability(CAP_IPC_LOCK) else machine.limit("Max locked memory")
     return _finding(
         "memlock",
@@ -295,7 +305,7 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
-    """Whether control can have a processor to itself."""
+    """Judge whether control can have a processor to itself; FAIL where a configured one is not online."""
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:
@@ -309,7 +319,7 @@ def cores(config: Config, machine: Machine) -> Finding:
 
 
 def load(config: Config, machine: Machine) -> Finding:
-    """Whether others want the processors as well."""
+    """Judge whether other programs want the processors: the one-minute load average."""
     fields = (machine.text("/proc/loadavg") or "").split()
     if not fields:
         return Finding("load", Verdict.WARN, "not known", "mount /proc")
@@ -318,7 +328,7 @@ def load(config: Config, machine: Machine) -> Finding:
 
 
 def clock_source(config: Config, machine: Machine) -> Finding:
-    """Whether reading the time is fast and even."""
+    """Judge whether reading the time is fast and even, by the kernel's clock source; OK where it is not known."""
     name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     return _finding(
         "clock source",
@@ -329,7 +339,7 @@ def clock_source(config: Config, machine: Machine) -> Finding:
 
 
 def swap(config: Config, machine: Machine) -> Finding:
-    """Whether memory can be paged out to a disk."""
+    """Judge whether the daemon's memory can be paged out: swap is on, and memory is not locked."""
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
         return Finding("swap", Verdict.OK, "off")
@@ -339,7 +349,7 @@ def swap(config: Config, machine: Machine) -> Finding:
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
-    """Whether the kernel stops processes to make huge pages of their memory."""
+    """Judge whether the kernel stops processes to make huge pages: transparent huge pages may not be "always"."""
     active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
     found = active[1] if active else "not in this kernel"
     return _finding(
@@ -351,7 +361,7 @@ def huge_pages(config: Config, machine: Machine) -> Finding:
 
 
 def run_directory(config: Config, machine: Machine) -> Finding:
-    """Whether sockets can be made where the configuration wants them."""
+    """Judge whether the caller can make sockets where the configuration wants them; OK where they need no directory."""
     address = config.endpoints.control
     if not address.startswith("ipc:///"):
         return Finding("run directory", Verdict.OK, f"none needed for {address}")
@@ -375,7 +385,7 @@ def run_directory(config: Config, machine: Machine) -> Finding:
 
 
 def port(config: Config, machine: Machine) -> Finding:
-    """Whether the device's port is there and open to this user. A port that is no path is a CAN channel."""
+    """Judge whether the device's port is there and open to the caller; a name that is no path is a CAN interface."""
     name = config.device.port
     if not name.startswith("/"):
         is_there = machine.path(f"/sys/class/net/{name}").exists()
@@ -402,7 +412,7 @@ def port(config: Config, machine: Machine) -> Finding:
 
 
 def port_holder(config: Config, machine: Machine) -> Finding:
-    """Whether another process has the port. tormagd itself is meant to."""
+    """Judge whether a process other than tormagd has the port open; FAIL names it."""
     name = config.device.port
     target = machine.resolved(name)
     others = machine.holders([target])[0][target] if name.startswith("/") else []
@@ -417,7 +427,7 @@ def port_holder(config: Config, machine: Machine) -> Finding:
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:
-    """How long a USB serial chip keeps received bytes back."""
+    """Judge how long a USB serial chip keeps received bytes back; OK where the port has no such timer."""
     adapter = os.path.basename(machine.resolved(config.device.port))  # noqa: PTH119
     file = f"/sys/bus/usb-serial/devices/{adapter}/latency_timer"
     latency_ms = machine.number(file) if adapter else None
@@ -431,14 +441,14 @@ def usb_latency(config: Config, machine: Machine) -> Finding:
 
 
 def build(config: Config, machine: Machine) -> Finding:
-    """Which build of the core is installed; the daemon of the same installation runs the same one."""
+    """Judge whether the installed core is compiled; a daemon of this installation runs the same build."""
     runs = settle()
     return _finding("build", runs.is_compiled, str(runs) if runs.is_compiled else f"{runs}; {COST}", REMEDY)
 
 
 Check = Callable[[Config, Machine], Finding]
 OF_CALLER: tuple[Check, ...] = (build, scheduling, memory_lock, run_directory, port)
-"What whoever calls has and may do, which stands for a daemon that he starts."
+"Checks of the caller's rights and installation, which stand for a daemon that the caller starts."
 OF_MACHINE: tuple[Check, ...] = (
     preemption,
     governor,
@@ -454,7 +464,7 @@ CHECKS = (*OF_CALLER, *OF_MACHINE)
 
 
 def _table(table: tuple[Rate, ...]) -> str:
-    """The rates that this machine holds, a row each."""
+    """Return the table of all rates, a row each: its use, whether it is held with margin, and what would hold it."""
     lines = [
         f"\nrates (at most {MOST_USED:.0%} used is held with margin; * is configured):",
         "  loop          Hz    used  held  to hold it",

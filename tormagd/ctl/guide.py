@@ -6,11 +6,11 @@ from tormagd.ctl.outcome import Outcome, usage_error
 from tormagd.named_file import did_you_mean, shipped
 
 FOLDERS = ("guides", "reference", ".")
-"Of the pages, in the order in which they are listed."
+"Folders of the pages, in the order of the list."
 
 
 def guide(name: str | None) -> Outcome:
-    """The text of one page, or without a name a list of all. Raises CommandError (USAGE) for one that is not there."""
+    """Return the text of one page; for None, list all pages. Raises CommandError (USAGE) for an unknown name."""
     folders = [files("tormagd") / "docs" / folder for folder in FOLDERS]
     pages = {
         page: (folder / f"{page}.md").read_text(encoding="utf-8")

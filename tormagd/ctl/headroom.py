@@ -1,7 +1,7 @@
 """`tormagctl doctor --measure`: which control and inference rates this machine holds with margin.
 
-The measuring is `python -m tormagd.headroom`, a process of its own that needs neither daemon nor device; here its
-figures are judged. What the kernel says meanwhile of steal and of processes that waited stands beside them.
+`python -m tormagd.headroom` measures, in a process of its own that needs neither daemon nor device. Here its figures
+are judged, beside what the kernel counts meanwhile of steal and of processes that waited.
 """
 
 import time
@@ -18,26 +18,27 @@ from tormagd.ctl.process import answer_of
 from tormagd_client.messages import ExecReport
 
 LONGEST_S = 120.0
-"It takes 6 s on an idle machine, half of them to load the libraries."
+"Longest wait; the measurement takes 6 s on an idle machine, half of them to load libraries."
 RATES_HZ = (LEAST_INFERENCE_HZ, 125, 250, 500, 1_000, 2_000, 4_000)
 TICK_OVER_STEP = 1.25
 "What a control tick takes over its step alone: the link and the write besides. Measured on the interpreted daemon."
 PERIOD_OVER_STEP = 3.5
 "What a period takes of the processor over the step, plans apart: reading, record, telemetry, ZeroMQ. Measured alike."
 MOST_USED = 0.7
-"Of a period, or of a processor. What is left is for clients that ask, and for hours when the machine gives less."
+"Share of a period or a processor. The rest is for clients that ask, and for hours when the machine gives less."
 MOST_STOLEN, MOST_WAITED = 0.01, 0.1
 "Shares of the time above which what others take is worth a warning."
 
 
 class Quantiles(ExecReport, frozen=True, kw_only=True):
-    """Of a duration, us."""
+    """Quantiles and mean of a duration, us."""
 
     mean: float
 
 
 class Bare(msgspec.Struct, frozen=True):
-    """The bare timer's lateness at the configured control rate, and the share of beats that it missed."""
+    """A bare timer's lateness at the configured control rate, the share of beats it missed, and what the kernel
+    refused."""
 
     rate_hz: int
     lateness_us: Quantiles
@@ -46,7 +47,11 @@ class Bare(msgspec.Struct, frozen=True):
 
 
 class Headroom(msgspec.Struct, frozen=True):
-    """What `python -m tormagd.headroom` prints, and what the kernel counted while it ran, as shares of the time."""
+    """What `python -m tormagd.headroom` prints, and the shares of its time that others took.
+
+    `steal` a hypervisor gave to others. For `waited` of the time something waited for a processor; None where the
+    kernel does not say.
+    """
 
     machine_us: float
     build: str
@@ -58,8 +63,11 @@ class Headroom(msgspec.Struct, frozen=True):
 
 
 class Rate(msgspec.Struct, frozen=True):
-    """One rate of one loop beside the other loop's configured one: `used` is the share of a period, or of a processor,
-    whichever is fuller; where it is not held, `change` says what to change."""
+    """One rate of one loop, beside the other loop's configured rate.
+
+    `used` is the share taken of a period or of a processor, the larger of both. `change` says what to change where the
+    rate is not held; empty where it is.
+    """
 
     loop: str
     hz: int
@@ -70,7 +78,10 @@ class Rate(msgspec.Struct, frozen=True):
 
 
 def measured(path: Path | None, machine: Machine) -> Headroom:
-    """Measures for the configuration in `path`. Raises CommandError where that cannot be done."""
+    """Measure this machine in a process of its own, for the configuration in `path`; None takes the defaults.
+
+    Raises CommandError (REFUSED) where the process fails or takes over LONGEST_S.
+    """
     before, started_s = machine.taken(), time.monotonic()
     try:
         printed = answer_of("tormagd.headroom", [f"--config={path}"] if path else [], LONGEST_S)
@@ -84,7 +95,10 @@ def measured(path: Path | None, machine: Machine) -> Headroom:
 
 
 def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | None]:
-    """What was stolen, and for how much of the time something waited for a processor."""
+    """Return the share of time stolen between two readings, and the share in which something waited for a processor.
+
+    `took_s` lies between them. The second share is None where the kernel does not say.
+    """
     steal = (after.stolen - before.stolen) / max(after.ticks - before.ticks, 1)
     if before.waited_us is None or after.waited_us is None:
         return steal, None
@@ -92,7 +106,7 @@ def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | N
 
 
 def rates(config: Config, found: Headroom) -> Iterator[Rate]:
-    """Every rate that the configuration could name, both loops, the configured ones among them."""
+    """Judge, for both loops, every rate of RATES_HZ and the configured ones; inference never above the control rate."""
     control_hz, inference_hz = config.rates.control_hz, config.rates.inference_hz
     for hz in sorted({*RATES_HZ, control_hz}):
         yield _judged("control", hz, hz == control_hz, found, hz, min(inference_hz, hz))
@@ -101,8 +115,10 @@ def rates(config: Config, found: Headroom) -> Iterator[Rate]:
 
 
 def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: int, inference_hz: int) -> Rate:
-    """A control tick has to be done in its period however late it is woken, a plan in what the tick leaves; and
-    all of it is one thread."""
+    """Judge one rate: a control tick has to fit its period however late it wakes, a plan what the tick leaves.
+
+    All of it is one thread, so the sum has to fit one processor, too.
+    """
     late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us
     period = 1e-6 * control_hz
     if loop == "control":

@@ -12,15 +12,18 @@ HINT = "tormagctl keys generate --help; the guide has the whole exchange"
 
 
 def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) -> Outcome:
-    """Makes them, of `clients` by role, or shows the fingerprints of those that are there."""
+    """Generate keys in the folder `path`, or for `action` "show" show fingerprints there; `clients` are names by role.
+
+    Raises CommandError (USAGE) as `generate_keys` and `show_keys`.
+    """
     return show_keys(path) if action == "show" else generate_keys(path, clients, client)
 
 
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
-    """Make the daemon's pair where there is none, and a pair for each of `clients`, by role; or one `client`'s alone.
+    """Make the daemon's key pair where there is none, and one for each of `clients`, by role; or only one for `client`.
 
-    The folder gets `server.key_secret`, `server.key`, each `NAME.key_secret`, and a folder for each role, with every
-    `NAME.key` that is let in. Raises CommandError (USAGE): something is there already, or cannot be made.
+    The folder gets `server.key_secret`, `server.key`, each `NAME.key_secret`, and a folder for each role with every
+    `NAME.key` that is let in. Raises CommandError (USAGE) where a file exists or cannot be made, or both are given.
     """
     names = [name for listed in clients.values() for name in listed]
     if client is not None and names:
@@ -38,7 +41,10 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
 
 
 def show_keys(path: Path) -> Outcome:
-    """The fingerprint of the key in a file, or of every `NAME.key` in a folder."""
+    """Return the fingerprint of the key in a file, or of every `NAME.key` in a folder.
+
+    Raises CommandError (USAGE) for a file that holds no key.
+    """
     with as_usage_error(ConfigError, hint="give a .key or .key_secret file, or a folder of them"):
         found = load_folder(path) if path.is_dir() else [(path.stem, load_public(path).decode())]
         keys = [{"name": name, "fingerprint": fingerprint(public)} for name, public in found]
@@ -46,6 +52,7 @@ def show_keys(path: Path) -> Outcome:
 
 
 def _made(name: str, role: str, secret_in: Path, public_in: Path) -> dict[str, str]:
+    """Make one key pair, its secret and its public part in different folders, and describe it."""
     secret, public = generate(name, secret_in, public_in)
     return {
         "name": name,

@@ -10,10 +10,10 @@ from tormagd_client.printable import printable
 
 
 class Taken(NamedTuple):
-    """The kernel's counters of what others took; the difference of two says it of the time between them.
+    """The kernel's counters of what others took; the difference of two readings tells of the time between them.
 
-    `stolen` of `ticks` the hypervisor gave to others; for `waited_us` something was ready to run and had no processor,
-    None where this kernel does not say.
+    `stolen` of `ticks` the hypervisor gave to others. For `waited_us` something was ready to run and had no processor;
+    None where the kernel does not say.
     """
 
     stolen: int
@@ -22,57 +22,59 @@ class Taken(NamedTuple):
 
 
 class Machine:
-    """A file system root; every path below is absolute on the machine it describes."""
+    """A machine described by the file system under `root`; every path that a method takes is absolute on that
+    machine."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def path(self, absolute: str) -> Path:
-        """Where `absolute` is under the root."""
+        """Return where `absolute` is under the root."""
         return self.root / absolute.lstrip("/")
 
     def text(self, absolute: str) -> str | None:
-        """The content of a file, stripped; None where it is not there or not ours to read."""
+        """Read a file's text, stripped; None where it does not exist or cannot be read."""
         try:
             return self.path(absolute).read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
             return None
 
     def number(self, absolute: str) -> int | None:
-        """The whole number in a file; None where there is none."""
+        """Read the whole number in a file; None where it holds none."""
         text = self.text(absolute)
         return int(text) if text is not None and re.fullmatch(r"\d+", text) else None
 
     def limit(self, name: str) -> float:
-        """The soft limit `name` of this process, infinity for unlimited; 0 where it is not listed."""
+        """Return this process's soft limit `name`, infinity for unlimited; 0 where it is not listed."""
         found = re.search(rf"^{name}\s+(\S+)", self.text("/proc/self/limits") or "", re.MULTILINE)
         return 0.0 if found is None else float(found[1].replace("unlimited", "inf"))
 
     def has_capability(self, bit: int) -> bool:
-        """Whether this process holds an effective capability, by its number in capabilities(7)."""
+        """Return whether this process holds an effective capability, by its number in capabilities(7)."""
         found = re.search(r"^CapEff:\s*([0-9a-f]+)$", self.text("/proc/self/status") or "", re.MULTILINE)
         return found is not None and bool(int(found[1], 16) >> bit & 1)
 
     def cores(self) -> int:
-        """The number of processors online; 1 where the kernel does not say."""
+        """Return the number of processors online; 1 where the kernel does not say."""
         ranges = re.findall(r"(\d+)(?:-(\d+))?", self.text("/sys/devices/system/cpu/online") or "0")
         return sum(int(last or first) - int(first) + 1 for first, last in ranges) or 1
 
     def taken(self) -> Taken:
-        """The counters now (proc_stat(5), Documentation/accounting/psi); zeros where there is no such file."""
+        """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi); zeros without such a
+        file."""
         first = (self.text("/proc/stat") or "").split("\n", 1)[0]
         fields = [int(field) for field in first.split()[1:9]]  # beyond: guests, who are counted as users already
         some = re.search(r"^some .*total=(\d+)$", self.text("/proc/pressure/cpu") or "", re.MULTILINE)
         return Taken(fields[7] if len(fields) == 8 else 0, sum(fields), int(some[1]) if some else None)
 
     def resolved(self, absolute: str) -> str:
-        """The path that `absolute` leads to, following symbolic links inside the root."""
+        """Return the path that `absolute` leads to, following symbolic links inside the root."""
         there, root = os.path.realpath(self.path(absolute)), os.path.realpath(self.root)
         return f"/{os.path.relpath(there, root)}"
 
     def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
-        """Process id and name of everybody who has one of these open, as far as we may see, not this process; and the
-        number of processes whose open files we may not see."""
+        """Return, by path, id and name of each process that has it open, this one excepted; and how many cannot be
+        looked into."""
         holding: dict[str, list[tuple[int, str]]] = {path: [] for path in paths}
         hidden = 0
         for process in sorted(self.path("/proc").glob("[0-9]*")):
@@ -91,11 +93,11 @@ class Machine:
         return holding, hidden
 
     def process_name(self, process_id: int) -> str:
-        """What a process calls itself; `?` where there is none."""
+        """Return what a process calls itself; `?` where there is none."""
         return printable(self.text(f"/proc/{process_id}/comm") or "?")
 
     def lock_owners(self, absolute: str) -> list[int]:
-        """The processes that hold a lock on a file, other users' too: the kernel lists locks for everybody."""
+        """List the processes, of any user, that hold a flock on a file; empty where there is no such file."""
         try:
             status = self.path(absolute).stat()
         except OSError:

@@ -1,6 +1,6 @@
 """The command line of `tormagctl`: arguments in, one outcome and an exit code out.
 
-Every command's module is imported when it runs: `tormagctl status` answers without loading plots or solvers.
+A command's module is imported when it runs, so `tormagctl status` answers without loading plots or solvers.
 """
 
 import argparse
@@ -46,7 +46,10 @@ EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code."""
+    """Run one command, print its outcome or error, and return the exit code; 130 after Ctrl-C.
+
+    `arguments` None takes those of the process. A missing extra is a usage error that names it.
+    """
     write_in_any_encoding()
     given = sys.argv[1:] if arguments is None else arguments
     try:
@@ -75,6 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Outcome:
+    """Import the command's function and call it with its options and what it needs; opens a client where needed."""
     command = COMMANDS[options.command]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
@@ -100,8 +104,10 @@ def _run(options: argparse.Namespace) -> Outcome:
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
-    """The configured ones with what the options say instead. An ipc address's neighbours go with it: they are in one
-    directory wherever the daemon uses its own names."""
+    """Return the configured endpoints and keys, changed by options and environment.
+
+    `ipc://DIR/control` changes all of them: the daemon's own names stand in one directory. Raises CommandError (USAGE).
+    """
     changed: dict[str, object] = {}
     keys = {
         "client_secret": options.key or os.environ.get(KEY),
@@ -126,7 +132,7 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
 
 
 def parser() -> argparse.ArgumentParser:
-    """What `tormagctl` understands; completions and man pages are made from it, too."""
+    """Return the parser of `tormagctl`'s arguments; completions and man pages are made from it, too."""
     # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
     shared = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     _add(shared, SHARED)

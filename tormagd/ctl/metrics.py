@@ -35,9 +35,10 @@ UP = "Whether the daemon answers"
 
 
 def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
-    """The metrics as text, once; with a `port` at 127.0.0.1, anew at each scrape, until Ctrl-C or SIGTERM.
+    """Return the metrics as text; with a `port` of 127.0.0.1, serve them until Ctrl-C or SIGTERM.
 
-    Raises CommandError (USAGE) where the port is taken, and as `Client.status` where there is no daemon at the start.
+    Each scrape asks the daemon anew. Raises CommandError (USAGE) where the port is taken, and as `Client.status` where
+    no daemon answers at the start.
     """
     with Client(endpoints, wait_s) as client:
         client.status()
@@ -62,17 +63,18 @@ def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
 
 
 class Scrape(Collector):
-    """Asks the daemon anew each time, by a connection of its own: scrapes come in threads of their own."""
+    """A collector that asks the daemon anew at each scrape, by a connection of its own: scrapes come in separate
+    threads."""
 
     def __init__(self, endpoints: Endpoints, wait_s: float) -> None:
         self._endpoints, self._wait_s = endpoints, wait_s
 
     def describe(self) -> list[Metric]:
-        """No names beforehand: the daemon is not asked for a registration."""
+        """Name no metrics beforehand, so that registering does not ask the daemon."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """`tormag_up`, and all the rest while it is 1."""
+        """Yield `tormag_up`, and all other metrics while the daemon answers."""
         try:
             with Client(self._endpoints, self._wait_s) as client:
                 status = client.status()
@@ -95,8 +97,7 @@ def _family(
     values: Mapping[tuple[str, ...], float | None],
     unit: float = 1.0,
 ) -> Iterator[Metric]:
-    """A metric, with its values by those of its labels; what is not known has no sample, and what has no labels either
-    is not there."""
+    """Yield one metric with a sample for each known value, by its labels; none at all without labels and value."""
     family = kind(f"tormag_{name}", text, labels=labels)
     for key, value in values.items():
         if value is not None:
@@ -106,6 +107,7 @@ def _family(
 
 
 def _families(status: Status) -> Iterator[Metric]:
+    """Yield every metric of a status, in base units."""
     link, setpoints, rates, followed = status.link, status.setpoints, status.rates, status.following
     error_N, aligned_N, delay_ms = (None, None, None) if followed is None else msgspec.structs.astuple(followed)
     sources, trip_us = setpoints.by_source, status.link.round_trip_us

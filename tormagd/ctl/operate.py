@@ -1,5 +1,5 @@
-"""The commands that change what the device does: arm, enable, disable, pause, resume, stop, clear-fault, take,
-confirm, home."""
+"""The commands that change what the device does: arm, enable, disable, pause, resume, stop, clear-fault, take, confirm,
+home."""
 
 import sys
 import time
@@ -12,7 +12,7 @@ from tormagd_client.messages import Explained, Status
 
 POLL_S = 0.05
 BEGIN_S = 2.0
-"By then a device that took the command has said that it is busy, over the slowest link."
+"By then a device that took the command is busy, over the slowest link."
 
 DONE: dict[str, tuple[str, tuple[str, ...]]] = {
     "enable": ("enabled", ("ENABLED",)),
@@ -23,7 +23,7 @@ DONE: dict[str, tuple[str, tuple[str, ...]]] = {
     # while nothing is latched there is nothing to clear
     "clear-fault": ("fault cleared. next: tormagctl arm", ("DISABLED", "ENABLED", "PAUSED")),
 }
-"What a command has done, and the operating states after it was."
+"By command, what it has done, and the operating states that show it."
 STOPPED_WITHOUT_DEVICE = (
     "latched, but no device is connected: nothing could be sent, and the gap does not open. The device is told to open "
     "it when it is back; tormagctl status shows the link"
@@ -33,15 +33,16 @@ IS_OPEN = {
     "stop": "stopped and latched; the gap is open. tormagctl arm when it is safe to go on",
 }
 STAYED_SHUT = ("NOT_OPENING", "DEVICE_RETRACT_FAILED")
-"The faults that say of a gap that it does not open."
+"Faults that say that the gap does not open."
 COMES_BACK_S = 0.6
-"So long the daemon waits for the device to say that a fault is gone (CLEARING_S), and then calls it a fault again."
+"How long the daemon waits for the device to drop a cleared fault (CLEARING_S) before it latches the fault again."
 
 
 def arm(client: Client, timeout_s: float) -> Outcome:
-    """Have the daemon clear, home and enable, as far as that is needed, and say each step on stderr.
+    """Have the daemon clear faults, home and enable, as far as needed, and say each step on stderr.
 
-    Raises CommandError as `operate` does. Ctrl-C takes the word back: the gap opens.
+    Raises CommandError (REFUSED) where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables: the
+    gap opens.
     """
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
@@ -56,10 +57,11 @@ def arm(client: Client, timeout_s: float) -> Outcome:
 
 
 def operate(client: Client, command: str) -> Outcome:
-    """Give one command that the daemon carries out or refuses at once. Without a device it takes `stop` only.
+    """Give one command that the daemon carries out or refuses at once.
 
-    The outcome of that is REFUSED: the gap was to open. Raises CommandError also where the answer does not say that it
-    was done, and FAULT where what was cleared comes back.
+    `stop` without a device gives an outcome of REFUSED: the gap does not open. After a fault was cleared, watches for
+    COMES_BACK_S. Raises CommandError: REFUSED where the answer does not show the state, FAULT where the fault comes
+    back; and as `Client.request`.
     """
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
@@ -80,9 +82,9 @@ def operate(client: Client, command: str) -> Outcome:
 
 
 def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
-    """Give `disable` or `stop`, and wait until the gap is open.
+    """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open.
 
-    Raises CommandError as `operate` does: FAULT where the device is given up, or what `disable` met on the way; REFUSED
+    Raises CommandError as `operate`; FAULT where the device cannot open the gap, or `disable` meets any fault; REFUSED
     where the gap is not known to be open within `timeout_s`.
     """
     begun = operate(client, command)
@@ -105,7 +107,7 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
 
 
 def take(client: Client, source: str) -> Outcome:
-    """Give the brake to `source`, whoever holds it."""
+    """Give the brake to `source`, whoever holds it. Raises CommandError (REFUSED) where another holds it then."""
     result = client.request("take", source=source)
     if result.get("source") != source:
         raise _not_done(f"the daemon answers that {result.get('source')!r} holds the brake, not {source!r}")
@@ -115,8 +117,11 @@ def take(client: Client, source: str) -> Outcome:
 
 
 def confirm(client: Client, what: str) -> Outcome:
-    """Settle a dispute between readings and believed device: `what` is "device", it has changed, or "sensor", it is
-    wrong. Raises CommandError (REFUSED) where nothing is disputed."""
+    """Settle a dispute between force sensor and believed device: which of them, `what`, is to be doubted.
+
+    "device": it has changed, and is learned anew. "sensor": it is wrong. Raises RefusedError where nothing is disputed,
+    CommandError (REFUSED) where the daemon confirms something else.
+    """
     result = client.request("confirm", what=what)
     if result.get("confirmed") != what:
         raise _not_done(f"the daemon answers that {result.get('confirmed')!r} is confirmed, not {what!r}")
@@ -129,10 +134,10 @@ def _not_done(what: str) -> CommandError:
 
 
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
-    """Home both carriages and wait until it is done.
+    """Home both carriages, and with `is_waiting` wait until they are homed.
 
-    Raises CommandError: REFUSED (by the daemon, did not begin, ended without being homed, not within `timeout_s`),
-    FAULT (the device latched a fault on the way).
+    Raises CommandError: REFUSED where homing does not begin within BEGIN_S, ends without being homed, or takes over
+    `timeout_s`; FAULT where the device latches a fault meanwhile; and as `Client.request`.
     """
     was_homed = client.status().is_homed
     result = client.request("home")
@@ -162,7 +167,8 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
 
 
 def _looks(client: Client, doing: str, timeout_s: float) -> Iterator[tuple[float, Status]]:
-    """The status again and again for so long, with the seconds since the first; on a terminal a line of progress."""
+    """Yield seconds since the start and status, every POLL_S for `timeout_s`; on a terminal draws a line of
+    progress."""
     started_s = time.monotonic()
     shows_progress = is_terminal(sys.stderr)
     try:
@@ -179,7 +185,7 @@ def _looks(client: Client, doing: str, timeout_s: float) -> Iterator[tuple[float
 
 
 def require_no_fault(state: Status, what: str) -> None:
-    """Raise CommandError (FAULT) where the device is in FAULT: which, why, and what to do."""
+    """Raise CommandError (FAULT) where the device is in FAULT: which fault, why, and what to do."""
     if state.operating_state != "FAULT":
         return
     # what the device met says more than that somebody stopped it

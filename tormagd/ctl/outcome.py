@@ -19,7 +19,7 @@ from tormagd_client.printable import printable
 
 NARROWEST = 20
 LABEL = re.compile(r"\S{0,24} +")
-"What a line begins with: its label and the space behind it."
+"A line's label and the space behind it."
 
 
 class Exit(IntEnum):
@@ -33,7 +33,7 @@ class Exit(IntEnum):
 
 
 class CommandError(ClientError):
-    """A command that did not do what was asked, for a reason that `tormagctl` itself has found."""
+    """A command that did not do what was asked, for a reason that `tormagctl` itself found."""
 
     def __init__(self, exit_code: Exit, code: str, message: str, hint: str) -> None:
         super().__init__(code, message, hint)
@@ -41,7 +41,7 @@ class CommandError(ClientError):
 
 
 def exit_code(error: ClientError) -> Exit:
-    """What `tormagctl` ends with after this error."""
+    """Return the exit code for an error: its own for a CommandError, REFUSED for an unknown kind."""
     if isinstance(error, CommandError):
         return error.exit_code
     codes = {InFaultError: Exit.FAULT, UnreachableError: Exit.UNREACHABLE, SettingError: Exit.USAGE}
@@ -49,13 +49,13 @@ def exit_code(error: ClientError) -> Exit:
 
 
 def usage_error(message: str, hint: str) -> CommandError:
-    """Something in the arguments, or in a file they name, cannot be used."""
+    """Return a CommandError for an argument, or a file it names, that cannot be used."""
     return CommandError(Exit.USAGE, "usage", message, hint)
 
 
 @contextmanager
 def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
-    """What is raised within, of these kinds, is something that cannot be used: its own words are a usage error's."""
+    """Turn an exception of these kinds raised within this context into a usage error with the same text."""
     try:
         yield
     except kinds as error:
@@ -64,7 +64,8 @@ def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """A command that was carried out: its result (the stable keys of `--json`), and the same as text for a person."""
+    """What a command gave: its result (the stable keys of `--json`), the same as text for a person, and the exit
+    code."""
 
     result: dict[str, Any]
     text: str
@@ -72,8 +73,10 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
-    """On stdout: one JSON object `{command, ok, result, error}`, or the text. What `tormagctl` ends with: REFUSED where
-    all was done, and the answer could not be written."""
+    """Print the outcome to stdout, as text or as one JSON object `{command, ok, result, error}`; return the exit code.
+
+    REFUSED where all was done, but the answer could not be written.
+    """
     is_done = outcome.exit_code is Exit.DONE
     text = _object(command, is_done, outcome.result, None) if as_json else outcome.text
     is_written = write_answer(text, f"tormagctl {command}")
@@ -81,7 +84,7 @@ def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
 
 
 def print_error(command: str, error: ClientError, as_json: bool) -> None:
-    """The error and its remedy on stderr, and with `--json` the object on stdout as well."""
+    """Print the error and its remedy to stderr, and with `as_json` the JSON object to stdout as well."""
     colour = Colour(sys.stderr)
     said, hint = colour.red(printable(error.message)), printable(error.hint)
     write_line(f"{f'tormagctl {command}'.rstrip()}: {said}\n  next: {hint}", sys.stderr)
@@ -95,7 +98,8 @@ def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[s
 
 
 def folded(text: str) -> str:
-    """`text` for a person: on a terminal, what is longer than a line of it goes on under its own words."""
+    """Wrap `text` to the terminal's width, with a line's rest indented under its words; unchanged where stdout is no
+    terminal."""
     if not is_terminal(sys.stdout):
         return text
     width = max(shutil.get_terminal_size().columns, NARROWEST)
@@ -108,12 +112,13 @@ def folded(text: str) -> str:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Whether a person watches `stream`; nobody does where it is closed."""
+    """Return whether `stream` is a terminal; False for None, a closed stream."""
     return stream is not None and stream.isatty()
 
 
 class Colour:
-    """ANSI colours for one stream; plain text where it is no terminal, or where NO_COLOR is set and not empty."""
+    """ANSI colours for one stream; plain text where it is no terminal, TERM is dumb, or NO_COLOR is set and not
+    empty."""
 
     def __init__(self, stream: TextIO | None) -> None:
         self._is_on = is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

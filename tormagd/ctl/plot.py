@@ -8,7 +8,10 @@ from tormagd.recording.reader import RecordingError, RecordingFile
 
 
 def plot(source: Path, target: Path) -> Outcome:
-    """Draw `source` into `target`. Raises CommandError (USAGE) where one cannot be read or the other not written."""
+    """Draw the recording `source` into the picture file `target`, whose suffix says its format.
+
+    Raises CommandError (USAGE) where the recording cannot be read or is empty, or the picture not be written.
+    """
     with as_usage_error(RecordingError, hint="give a file that tormagctl record has made"):
         recording = RecordingFile(source)
     overview = recording.overview

@@ -1,7 +1,7 @@
-"""`tormagctl ports`: where a device could be connected, and who holds what is there.
+"""`tormagctl ports`: where a device could be connected, and which processes hold those ports.
 
-Serial ports are those of the kernel's drivers, and the configured one. A process that has a port open is found by its
-open files, which only root sees of everybody; a lock on a port shows in the kernel's list of locks to anybody.
+Serial ports are those of the kernel's drivers, and the configured one. Open files show who has a port open; only root
+sees everybody's. A lock on a port shows in the kernel's list of locks to anybody.
 """
 
 import logging
@@ -21,7 +21,7 @@ from tormagd_client.printable import printable
 DETECTION_S = 2.0
 "python-can asks every interface at once; what has not answered by then is left out."
 NOT_ASKED = ("serial", "socketcand", "virtual")
-"Serial ports once more; a listening of several seconds for beacons on the network; what reaches no other process."
+"Interfaces left out: they repeat serial ports, listen for seconds for network beacons, or reach no other process."
 
 
 class Holder(msgspec.Struct, frozen=True):
@@ -46,7 +46,10 @@ class SerialPort(msgspec.Struct, frozen=True):
 
 
 class CanChannel(msgspec.Struct, frozen=True):
-    """A CAN channel that python-can could connect with now. Several processes may use one at the same time."""
+    """A CAN channel that python-can could connect to now, or the configured one.
+
+    Several processes may use one together. `is_up` is None where it cannot be told.
+    """
 
     interface: str
     channel: str
@@ -55,7 +58,8 @@ class CanChannel(msgspec.Struct, frozen=True):
 
 
 class Ports(msgspec.Struct, frozen=True):
-    """The keys of `--json`."""
+    """What `tormagctl ports` found: the keys of `--json`. `hidden_processes` counts those whose open files are not
+    shown to us."""
 
     serial: tuple[SerialPort, ...]
     can: tuple[CanChannel, ...]
@@ -63,7 +67,7 @@ class Ports(msgspec.Struct, frozen=True):
 
 
 def ports(config: Config, root: Path = Path("/")) -> Outcome:
-    """What is there now."""
+    """Look for serial ports and CAN channels now, for at most about DETECTION_S, and report them."""
     # it says at every start which makers' libraries are not installed
     logging.getLogger("can").setLevel(logging.CRITICAL)
     import can
@@ -76,7 +80,11 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
 
 
 def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:
-    """The ports among `listed` (pyserial's ListPortInfo) and the configured one; the channels python-can `detected`."""
+    """Describe serial ports, CAN channels, and the processes that hold ports.
+
+    `listed` are pyserial's ListPortInfo, `detected` python-can's configurations. A configured serial port is added
+    where it exists, a configured CAN channel always.
+    """
     known = {machine.resolved(info.device): info for info in listed}
     configured = machine.resolved(config.device.port) if _is_line(config) else ""
     if configured and machine.path(configured).exists():
@@ -96,6 +104,8 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
 def _serial_port(
     machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
 ) -> SerialPort:
+    """Describe one serial port; `info` is None for one that pyserial does not list. A locking process counts as a
+    holder."""
     locking = machine.lock_owners(path)
     names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
     has_usb_id = info is not None and info.vid is not None
@@ -112,13 +122,13 @@ def _serial_port(
 
 
 def _is_line(config: Config) -> bool:
-    """Whether the configured port is a serial port: a CAN adapter may be one, too."""
+    """Return whether the configured port is a serial port, as it is for an slcan adapter, too."""
     is_adapter = config.device.options.get("interface") == "slcan"
     return config.device.port.startswith("/") and (config.device.backend != "can" or is_adapter)
 
 
 def _is_up(machine: Machine, channel: str) -> bool | None:
-    """None where nobody can tell; a channel that is a path is one where it is there."""
+    """Return whether a CAN channel is up, or its path exists; None where it cannot be told."""
     if "/" in channel:
         return machine.path(channel).exists()
     state = machine.text(f"/sys/class/net/{channel}/operstate")

@@ -1,4 +1,4 @@
-"""A module of tormagd that runs in a process of its own: what operates a daemon does not load its core."""
+"""Runs a module of tormagd in a process of its own: `tormagctl` does not load the core."""
 
 import subprocess
 import sys
@@ -6,7 +6,10 @@ from collections.abc import Iterable
 
 
 def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
-    """What `python -m MODULE` prints. Raises TimeoutError, or ChildProcessError with the last line of its complaint."""
+    """Run `python -m MODULE` and return what it prints to stdout.
+
+    Raises TimeoutError after `longest_s`, which ends it; ChildProcessError, with stderr's last line, for a failure.
+    """
     command = [sys.executable, "-P", "-m", module, *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=longest_s, check=False)

@@ -27,13 +27,14 @@ from tormagd_client.wire import keys_of
 
 POLL_MS = 100
 LONGEST_END_S = 60.0
-"What has arrived until the end is written down, but no longer than that."
+"Longest time at the end for writing what has already arrived."
 SILENT_S = 1.0
-"A daemon that was silent for so long at the end has gone."
+"A daemon that is silent for this long at the end has gone."
 
 
 class Recorder:
-    """A writer, and the folder whose segments it writes, if it is one."""
+    """Writes a recording to the file `path`; or, where `path` is a folder, to segments in it within the folder's
+    budget."""
 
     def __init__(
         self,
@@ -43,14 +44,15 @@ class Recorder:
         key: bytes,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        """Raises OSError."""
+        """Create the first file. Raises OSError where it exists, cannot be made, or the folder has no room."""
         self._folder = RecordingFolder(path, budget_of(settings), clock) if path.is_dir() else None
         room = disk_room if self._folder is None else self._folder.room
         file = path if self._folder is None else self._folder.new()
         self.writer = RecordingWriter(file, about, key, room, settings.one_tick_of)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Writes ticks, and goes on in a new segment where that is due. Raises OSError."""
+        """Write ticks, and begin a new segment where one is due; ends the recording where there is no room. Raises
+        OSError."""
         writer, folder = self.writer, self._folder
         writer.ticks(batch)
         if folder is not None and folder.is_due(writer.size, writer.lasted_s):
@@ -61,7 +63,8 @@ class Recorder:
             writer.rotate(path)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Writes a snapshot; where it tells of a new mark, the segment is one that is kept. Raises OSError."""
+        """Write a snapshot; one with a new mark renames the segment (and maybe the one before) so that it is kept.
+        Raises OSError."""
         before = self.writer.mark
         self.writer.telemetry(message)
         new = None if self.writer.mark == before else self.writer.mark
@@ -70,7 +73,7 @@ class Recorder:
 
 
 def budget_of(settings: Recordings) -> Budget:
-    """What the configuration allows a folder."""
+    """Return what the configuration allows a folder of recordings."""
     return Budget(
         segment_bytes=round(settings.segment_MB * 1e6),
         segment_s=settings.segment_minutes * 60.0,
@@ -81,22 +84,22 @@ def budget_of(settings: Recordings) -> Budget:
 
 
 def key_of(config: Config) -> bytes:
-    """The key of seals; empty where none is configured. Raises CommandError (USAGE) where it cannot be read."""
+    """Read the configured sealing key; empty where none is configured. Raises CommandError (USAGE) where it cannot be
+    read."""
     with as_usage_error(OSError, ValueError, hint="[recordings] key names a file of 16 to 64 bytes"):
         return read_key(config.recordings.key)
 
 
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
-    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM; in a folder, to segments, within its
-    budget.
+    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder.
 
-    What is recorded is asked of the daemon and written down first, and again at the end: a device may have been
-    connected, or have shown itself, meanwhile.
+    What the daemon runs is asked and written first, and again at the end: its device may have been connected meanwhile.
+    A message that cannot be read is counted, and the first one's reason told on stderr. The outcome is REFUSED where
+    ticks were lost, UNREACHABLE where the daemon was gone at the end.
 
-    Raises CommandError: USAGE where the file exists or cannot be made, UNREACHABLE where nothing is published within
-    `wait_s`, or the daemon cannot be asked what it runs; then there is no file. REFUSED where the disk takes no more;
-    what it took stays. A message that cannot be read is counted, and the first one's reason told. The outcome's exit
-    code is REFUSED where ticks were lost, UNREACHABLE where the daemon was gone at the end.
+    Raises CommandError: USAGE where the file exists or cannot be made; UNREACHABLE, and then without a file, where
+    nothing is published within `wait_s` or the daemon does not answer; REFUSED where the disk takes no more, and what
+    it took stays.
     """
     key, keys = key_of(config), keys_of(endpoints.curve)
     context = zmq.Context()
@@ -133,7 +136,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
-    """What is recorded, as metadata: what is not a text of its own is JSON; what is not known is left out."""
+    """Ask the daemon what it runs, and return it as metadata: JSON unless a string; unknown values are left out."""
     with Client(endpoints, wait_s) as client:
         known = msgspec.to_builtins(client.describe())
     return {
@@ -144,6 +147,7 @@ def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
 
 
 def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
+    """Wait until a socket has a message; False after `wait_s`, or once interrupted."""
     poller = zmq.Poller()
     for socket in sockets:
         poller.register(socket, zmq.POLLIN)
@@ -160,6 +164,7 @@ def _record(
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
+    """Write what arrives until the time or an interrupt ends it, then what still waits, and return the outcome."""
     writer, unreadable = recorder.writer, 0
     start_s = heard_s = time.monotonic()
     is_over = False

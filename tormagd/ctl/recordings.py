@@ -15,15 +15,19 @@ from tormagd_client.blocking import Client
 
 
 def mark(client: Client, text: str) -> Outcome:
-    """Put an event into telemetry, and so into what is recorded, which is then kept."""
+    """Put an event into telemetry, and so into every recording; a folder's present segment is then kept from pruning.
+
+    Raises as `Client.request`.
+    """
     result = client.request("mark", text=text)
     return Outcome(result, f"marked: {text}")
 
 
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
-    """List a folder, take away what is over its budget, mark a recording of it, or export one.
+    """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy.
 
-    Raises CommandError (USAGE) where a path cannot be used.
+    `path` None takes the configured folder to list or prune. The outcome is REFUSED where pruning was not enough, or a
+    copy's seals show a change. Raises CommandError (USAGE) where a path cannot be used.
     """
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):
@@ -52,6 +56,7 @@ def _list(folder: RecordingFolder) -> Outcome:
 
 
 def _row(segment: Segment) -> dict[str, Any]:
+    """Describe one segment by its overview; without one, `said` tells why."""
     row: dict[str, Any] = {
         "name": segment.path.name,
         "began_s": segment.began_s,
@@ -73,6 +78,7 @@ def _row(segment: Segment) -> dict[str, Any]:
 
 
 def _prune(folder: RecordingFolder) -> Outcome:
+    """Delete what is over the budget; REFUSED where that is not enough."""
     gone = folder.prune()
     over = folder.make_room(0)
     names = [each.path.name for each in gone]
@@ -81,7 +87,7 @@ def _prune(folder: RecordingFolder) -> Outcome:
 
 
 def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
-    """A copy, and what its seals say."""
+    """Copy a recording to a new file, check the copy's seals, and say their verdict; half a copy is deleted."""
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target

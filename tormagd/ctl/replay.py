@@ -1,6 +1,6 @@
-"""`tormagctl replay`: a black box run again, bit for bit, or with the simulator in place of the device.
+"""`tormagctl replay`: run a black box again, bit for bit, or with the simulator in place of the device.
 
-The running is `python -m tormagd.replay`, a process of its own.
+`python -m tormagd.replay` does it, in a process of its own.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,11 @@ def replay(
     faults: Sequence[str],
     config_file: Path | None,
 ) -> Outcome:
-    """Runs the file. An outcome that is not bit-exact, or of a file that was altered, has the exit code REFUSED. Raises
-    CommandError (USAGE) where file or options cannot be used."""
+    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulator.
+
+    The outcome is REFUSED where the replay is not bit-exact, or the file was altered. Raises CommandError (USAGE) where
+    file or options cannot be used, or it takes over LONGEST_S.
+    """
     arguments = [
         f"--from={from_s!r}",
         f"--plant={plant}",
@@ -54,6 +57,7 @@ def replay(
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
+    """Return the report's text, and whether the replay was bit-exact."""
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     first, difference = done["first_damage"], done["difference"]
     if first is not None:
@@ -73,6 +77,7 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
 
 
 def _instead(result: dict[str, Any]) -> str:
+    """Compare in words what was recorded with what the simulator met, as configured then and with the settings."""
     told = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
     if result["instead"] is not None:
         told[f"simulated with {', '.join(result['settings'])}"] = result["instead"]

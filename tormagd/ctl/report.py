@@ -12,8 +12,10 @@ from tormagd.recording.seal import verified
 
 
 def report(config: Config, sources: list[Path], target: Path) -> Outcome:
-    """Write the page to `target`. The outcome is REFUSED where a recording was altered. Raises CommandError (USAGE)
-    where one cannot be read, or the page not written."""
+    """Write an HTML page on one or two recordings to `target`; the outcome is REFUSED where the seals show a change.
+
+    Raises CommandError (USAGE): more than two, one that cannot be read, or a page that cannot be written.
+    """
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"
         raise usage_error(said, "tormagctl report A.mcap B.mcap -o AB.html")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # whoever lists scenes needs no sockets
     from tormagd_client.blocking import Client
 
 LONGEST_S = 30.0
-"Of the daemon's own check, which takes half a second."
+"Longest wait for the daemon's own check, which takes half a second, or for its change of scene."
 POLL_S = 0.05
 
 
@@ -33,7 +33,10 @@ def scene(
     endpoints: Endpoints,
     wait_s: float,
 ) -> Outcome:
-    """One of the six; without a name, of the configuration's scene. Raises CommandError."""
+    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new.
+
+    `share`, `tolerance_N` or `out` choose how the scene is served. Raises CommandError as the six do.
+    """
     named = name or config.scene
     if share is not None or tolerance_N is not None or out is not None:
         from tormagd.ctl.scene_served import serve_scene
@@ -61,7 +64,10 @@ def scene(
 
 
 def use_scene(client: "Client", name: str) -> Outcome:
-    """Have a disabled daemon change its scene, and wait until it has. Raises CommandError (REFUSED) where it stays."""
+    """Have a disabled daemon change its scene, and wait until it has.
+
+    Raises CommandError (REFUSED) where the daemon refuses the scene or is not ready within LONGEST_S.
+    """
     scene = str(Path(name).absolute()) if name not in shipped_scenes() and Path(name).exists() else name
     client.request("use-scene", scene=scene)
     until_s = time.monotonic() + LONGEST_S
@@ -78,7 +84,7 @@ def use_scene(client: "Client", name: str) -> Outcome:
 
 
 def list_scenes() -> Outcome:
-    """The shipped scenes with their descriptions."""
+    """List the shipped scenes with their descriptions."""
     scenes = [load_scene(name) for name in shipped_scenes()]
     width = max(len(scene.name) for scene in scenes)
     return Outcome(
@@ -88,14 +94,15 @@ def list_scenes() -> Outcome:
 
 
 def show_scene(name: str) -> Outcome:
-    """Everything one scene states, defaults included. Raises CommandError (USAGE) for an unknown or faulty one."""
+    """Return everything a scene states, defaults included, as TOML. Raises CommandError (USAGE) for an unknown or
+    faulty one."""
     stated = msgspec.to_builtins(_loaded(name))
     tables = {key: value for key, value in stated.items() if value is not None}
     return Outcome(tables, as_toml(tables))
 
 
 def as_toml(tables: dict[str, Any]) -> str:
-    """The text of a scene file with these keys and tables."""
+    """Return the text of a scene file with these keys and tables."""
     lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
     for title, table in tables.items():
         if isinstance(table, dict):
@@ -104,7 +111,7 @@ def as_toml(tables: dict[str, Any]) -> str:
 
 
 def torque_range(scene: Scene) -> str:
-    """The forces as torques at the handle's shaft; nothing for a pad."""
+    """Return the scene's forces as torques at the handle's shaft, in words; empty for a pad, which has no shaft."""
     radius_mm, force = scene.roller_radius_mm, scene.force
     if radius_mm is None:
         return ""
@@ -119,9 +126,11 @@ def _line(key: str, value: object) -> str:
 
 
 def check_scene(name: str, config: Path | None) -> Outcome:
-    """Say whether a daemon with this configuration takes the scene, what its device gives of it, and whether its cost
-    is within its budget. Raises CommandError where it does not, and for a faulty
-    scene."""
+    """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost.
+
+    `config` None means the defaults. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more
+    than its budget; USAGE for a faulty scene.
+    """
     derived = _derived(name, config)
     scene = _loaded(name)
     file = measured()
@@ -169,7 +178,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
 
 
 def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
-    """How soon a force comes from where the brake waits, and from nearer."""
+    """Say how soon a force comes from where the brake waits, and from nearer; empty where nothing was derived."""
     if not approaches_s:
         return []
     (wait_N, now_s), *nearer = approaches_s
@@ -181,8 +190,10 @@ def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]
 
 
 def explain_scene(name: str, config: Path | None) -> Outcome:
-    """Show every way to serve a scene that was measured, the chosen one, and how that was judged. Raises CommandError
-    where nothing was measured, for a scene that the daemon refuses, and for a faulty one."""
+    """Show every way to serve a scene that was measured, the chosen one, and how well that served other signals.
+
+    Raises CommandError: REFUSED where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
+    """
     derived = _derived(name, config)
     file = measured()
     found = measured_as(_loaded(name), file)
@@ -209,6 +220,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
 
 
 def _tried(tried: Tried, share: Share | None, chosen: Way, runs: Way) -> str:
+    """Return one way's row: errors on three samples, share of a processor, whether chosen, whether it runs here."""
     marks = [word for way, word in ((chosen, "chosen"), (runs, "runs here")) if way == tried.way]
     errors = " ".join(f"{1e3 * error_N:6.1f}" for error_N in tried.rms_N)
     taken = "not measured" if share is None else f"{share.daemon:.1%}"
@@ -216,17 +228,18 @@ def _tried(tried: Tried, share: Share | None, chosen: Way, runs: Way) -> str:
 
 
 def way_of(derived: dict[str, Any]) -> Way:
-    """The way that the daemon's own check says it would serve the scene."""
+    """Return the way (rates and search) by which the daemon's own check would serve the scene."""
     return Way(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
 
 
 def told(way: Way) -> str:
-    """Rates and search, for a person."""
+    """Say a way's rates and search, for a person."""
     return f"{way.control_hz} / {way.inference_hz} Hz, {way.search}"
 
 
 def measured_as(scene: Scene, file: Measured) -> MeasuredScene:
-    """What was measured of a scene that asks for just this. Raises CommandError where nothing was."""
+    """Return what was measured of a scene that asks for exactly what `scene` does. Raises CommandError (REFUSED) for
+    none."""
     found = file.scene(scene.fingerprint)
     if found is None:
         raise CommandError(
@@ -239,12 +252,16 @@ def measured_as(scene: Scene, file: Measured) -> MeasuredScene:
 
 
 def _loaded(name: str) -> Scene:
+    """Load a scene. Raises CommandError (USAGE) for an unknown or faulty one."""
     with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
         return load_scene(name)
 
 
 def _derived(name: str, config: Path | None) -> dict[str, Any]:
-    """What the daemon's own check says of the scene. It loads what no command of this tool does: model and solvers."""
+    """Run the daemon's own check of the scene in a process of its own, and return what it derives.
+
+    Raises CommandError (REFUSED) where the check refuses the scene, or takes over LONGEST_S.
+    """
     arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
     try:
         derived: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.daemon.main", arguments, LONGEST_S))["derived"]

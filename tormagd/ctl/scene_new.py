@@ -1,4 +1,4 @@
-"""`tormagctl scene new`: a scene file from a recorded force, or from answers; an insert is found by trying them."""
+"""`tormagctl scene new`: make a scene file from a recorded force or from answers; the insert is found by trying."""
 
 import math
 import os
@@ -17,9 +17,9 @@ from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError
 
 INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
-"Those with a shipped model, from the softest, whose least force is the lowest."
+"Inserts with a shipped model, from the softest, whose least force is the lowest."
 TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
-"Of the range, half of a tenth; and of the greatest force, where a hand tells a tenth apart, at the least."
+"Proposed tolerance: this share of the range, and at least this share of the greatest force."
 RESERVED = 0.8
 """Of the greatest force that the model gives: a device may be a fifth weaker than its model, by friction, modulus,
 field and what its elastomer relaxes. A soft insert is asked for more only where no stiffer one follows fast enough."""
@@ -28,8 +28,11 @@ Tables = dict[str, Any]
 
 
 def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcome:
-    """Writes the scene file `out`, a new one. Raises CommandError: USAGE for files and answers that cannot be
-    used, and where nobody can be asked; REFUSED where no shipped insert renders what the scene asks for."""
+    """Write the new scene file `out` from a recorded force, or for None from a person's answers, with a fitting insert.
+
+    Raises CommandError: USAGE for files and answers that cannot be used, or nobody to ask; REFUSED where no shipped
+    insert renders the scene. Then there is no file.
+    """
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
@@ -45,7 +48,10 @@ def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcom
 
 
 def _softest(out: Path, tables: Tables, config: Path | None) -> tuple[str, Outcome]:
-    """Writes the file with the softest insert that renders it in reserve, or else with the softest that renders it."""
+    """Write the file with the softest insert that gives the scene with RESERVED to spare, else the softest at all.
+
+    Raises CommandError, and deletes the file, where no insert gives it or the check fails.
+    """
     taken: dict[str, Outcome] = {}
     refused = {}
     for insert in INSERTS:
@@ -82,10 +88,13 @@ def _write(out: Path, tables: Tables, insert: str) -> None:
 
 
 def _has_reserve(tables: Tables, checked: Outcome) -> bool:
+    """Return whether the scene's greatest force is at most RESERVED of the device's."""
     return bool(tables["force"]["most_N"] <= RESERVED * checked.result["most_N"])
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
+    """Propose a scene from a recorded force. Raises CommandError (USAGE) for a bad file, or a force that does not
+    change."""
     with as_usage_error(ConfigError, hint="a CSV with the columns t_s,force_N"):
         time_s, force_N = recorded(force_file)
     least_N, most_N = _rounded(float(force_N.min()), math.floor), _rounded(float(force_N.max()), math.ceil)
@@ -101,6 +110,7 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
 
 
 def _from_answers(name: str) -> Tables:
+    """Ask a person for each value of a scene. Raises CommandError (USAGE) where stdin is no terminal, or ends."""
     if not is_terminal(sys.stdin):
         raise usage_error("there is nobody to ask", "give a recorded force: --force FORCE.csv, columns t_s,force_N")
     print("A scene states one task; Enter takes what stands in brackets.", file=sys.stderr)
@@ -119,6 +129,7 @@ def _from_answers(name: str) -> Tables:
 
 
 def _answer(question: str, usual: str) -> str:
+    """Ask one question on stderr; an empty line takes `usual`. Raises CommandError (USAGE) where stdin ends."""
     print(f"{question} [{usual}]: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:
@@ -127,6 +138,7 @@ def _answer(question: str, usual: str) -> str:
 
 
 def _number(question: str, usual: float) -> float:
+    """Ask until the answer is a number."""
     while True:
         answer = _answer(question, f"{usual:g}")
         try:
@@ -145,6 +157,7 @@ def _tables(
     signal: Tables,
     handle_mm_s: tuple[float, float],
 ) -> Tables:
+    """Return a scene's tables without an insert, at the least rates."""
     force = {"least_N": least_N, "most_N": most_N, "resolution_N": resolution_N, "tolerance_rms_N": tolerance_N}
     return {
         "name": name,
@@ -157,6 +170,6 @@ def _tables(
 
 
 def _rounded(value: float, direction: Callable[[float], int]) -> float:
-    """To two digits."""
+    """Round to two digits, by `math.floor` or `math.ceil`."""
     unit = 10.0 ** (math.floor(math.log10(value or 1.0)) - 1)
     return float(f"{direction(round(value / unit, 6)) * unit:.3g}")

@@ -14,9 +14,12 @@ from tormagd_client.endpoints import ConfigError
 
 
 def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
-    """Choose among the measured ways the most exact that takes at most `share` of a processor, or the cheapest whose
-    error is at most `tolerance_N`; write the scene served so into `out`, a new file. Raises CommandError: USAGE for
-    options and files that cannot be used, REFUSED where nothing was measured or no way does that."""
+    """Choose the most exact measured way that takes at most `share` of a processor, or the cheapest within an error.
+
+    The error is `tolerance_N`, RMS. With `out` writes the scene, served that way, to this new file. Raises
+    CommandError: USAGE for options and files that cannot be used; REFUSED where nothing was measured, or no way is good
+    enough.
+    """
     if action != "check" or (share is None) == (tolerance_N is None):
         raise usage_error(
             "--share, --tolerance and --out choose how a scene is served",
@@ -44,8 +47,10 @@ Served = tuple[Tried, Share]
 
 
 def _most_wanted(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
-    """Return the most exact way that takes at most `share`, or without one the cheapest within `tolerance_N`. Raises
-    CommandError where no way does."""
+    """Return the most exact way that takes at most `share`, or for None the cheapest within `tolerance_N`.
+
+    Raises CommandError (REFUSED) where no way does.
+    """
 
     def price(way: Served) -> float:
         return way[1].daemon
@@ -68,7 +73,7 @@ def _most_wanted(ways: list[Served], share: float | None, tolerance_N: float) ->
 
 
 def _write(name: str, way: Way, out: Path) -> None:
-    """Write the scene with these rates and this search, its files found from where it is now."""
+    """Write the scene with these rates and this search; paths in it stay valid. Raises CommandError (USAGE)."""
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
     tables = {key: value for key, value in tables.items() if value is not None}

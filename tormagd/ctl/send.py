@@ -34,12 +34,12 @@ def send(
     preview_ms: float,
     is_blind: bool,
 ) -> Outcome:
-    """Publish a shape or a CSV file for `duration_s` or until interrupted, and see what becomes of it, unless
-    `is_blind`. Without a duration a file lasts as long as it is, a computed shape ten seconds.
+    """Publish a shape or a CSV file for `duration_s` or until interrupted, and report what became of it.
 
-    Raises CommandError: USAGE for what is not to be sent; UNREACHABLE where no daemon answers or subscribes within
-    `wait_s`, or where it leaves on the way; FAULT as soon as the device is in FAULT; REFUSED where the scene does not
-    allow such forces (nothing is sent), or the setpoints were not rendered.
+    `duration_s` None means the file's length, or ten seconds for a shape. With `is_blind` the daemon is not asked.
+    Raises CommandError: USAGE for what cannot be sent; UNREACHABLE where no daemon answers or subscribes within
+    `wait_s`, or it goes meanwhile; FAULT as soon as the device is in FAULT; REFUSED where the scene does not allow the
+    forces (nothing is sent), or they were not rendered.
     """
     with as_usage_error(
         WaveformError,
@@ -89,7 +89,8 @@ def send(
 
 
 def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> Watch:
-    """Raises CommandError, REFUSED, where the scene does not allow such forces."""
+    """Check the forces against the daemon's scene and return a watch. Raises CommandError (REFUSED) where not
+    allowed."""
     try:
         known = client.describe()
     except UnreachableError as error:
@@ -111,8 +112,11 @@ def _publish(
     is_interrupted: Callable[[], bool],
     watch: Watch | None,
 ) -> dict[str, Any]:
-    """Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
-    successor is due already is left out: the newest one wins anyway. Each carries the `preview` that follow it."""
+    """Publish setpoints until the time or an interrupt, look at the daemon in between, and return the counts.
+
+    Each deadline counts from the start, so that lateness does not add up. A setpoint whose successor is already due is
+    left out. Each carries the `preview` that follow it. Raises CommandError (UNREACHABLE) where the daemon goes.
+    """
     sent = skipped = index = 0
     worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()

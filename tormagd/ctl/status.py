@@ -1,4 +1,4 @@
-"""`tormagctl status` and `firmware`: the daemon's own snapshot, and its link's report, as they are or as text."""
+"""`tormagctl status` and `firmware`: the daemon's status and its link's report, as JSON or as text."""
 
 import re
 import sys
@@ -25,16 +25,17 @@ from tormagd_client.wire import understood
 
 UNKNOWN = "-"
 OLD_MS = 1_000.0
-"An older setpoint may be valid still, and is not of now."
+"An older setpoint may still be valid; its age is shown."
 SURE_WINDOWS = 20
-"A drift is shown once it is that of ten seconds."
+"A clock's drift is shown once it is fitted over this many windows: ten seconds."
 SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
 LINK_COUNTS = ("losses", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 LINK_COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")
 
 
 def status(client: Client) -> Outcome:
-    """What the daemon is doing. The exit code is FAULT while the device is in FAULT."""
+    """Report what the daemon is doing; the outcome is FAULT while the device is in FAULT. Raises as
+    `Client.request`."""
     result = client.request("status")
     known = understood(result, Status)
     code = Exit.FAULT if known.operating_state == "FAULT" else Exit.DONE
@@ -42,7 +43,7 @@ def status(client: Client) -> Outcome:
 
 
 def status_text(known: Status, colour: Colour) -> str:
-    """The snapshot in a dozen lines, most important first; what the daemon does not know shows as `-`."""
+    """Return a status as lines of text, the most important first; an unknown value shows as `-`."""
     state = known.operating_state
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
     is_running = known.link.state == "RUNNING"
@@ -86,7 +87,8 @@ def status_text(known: Status, colour: Colour) -> str:
 
 
 def _peers(peers: PeersReport, colour: Colour) -> list[str]:
-    """Who was not let in or sent too much, with the newest and the worst of them; nothing while nobody was."""
+    """Return lines on peers that were refused or sent too much: counts, newest refusal, worst sender; empty for
+    none."""
     return [
         *_said("peers     ", peers.refused and f"{peers.refused} refused", colour.yellow),
         *_said("peers     ", peers.dropped and f"{peers.dropped} messages not read", colour.yellow),
@@ -98,8 +100,7 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 
 
 def _device(known: Status, colour: Colour) -> list[str]:
-    """What the device has shown of itself, what of it acts, since when it is known, and why what was kept is not
-    used."""
+    """Return lines on what the device has shown of itself, how old that is, and why a kept profile is not used."""
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
     # without a folder nothing was to be kept
@@ -113,13 +114,13 @@ def _device(known: Status, colour: Colour) -> list[str]:
 
 
 def _long_ago(known: Status) -> str:
-    """When a setpoint came that is valid for long; nothing for one of now."""
+    """Say how long ago the setpoint came, where that is over OLD_MS; empty for a recent one, or none."""
     age_ms = known.setpoint_age_ms
     return "" if known.setpoint_cf is None or age_ms is None or age_ms < OLD_MS else f" {age_ms * 1e-3:.0f} s ago"
 
 
 def followed(report: FollowingReport | None) -> str:
-    """How well the force was followed lately; nothing where that is not known."""
+    """Say how well the force was followed lately; empty for None."""
     if report is None:
         return ""
     aligned = f"{report.aligned_rms_N * 1e3:.0f} mN with a delay of {report.delay_ms:.0f} ms taken out"
@@ -127,19 +128,19 @@ def followed(report: FollowingReport | None) -> str:
 
 
 def refused(not_granted: Iterable[str]) -> dict[str, str]:
-    """What the kernel refused, with the reason, by the key of the configuration that asks for it."""
+    """Return what the kernel refused, by configuration key; each value is the whole text of the refusal."""
     return {re.split("[ :]", each, maxsplit=1)[0]: each for each in not_granted}
 
 
 def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
-    """A force at the roller as the torque at the handle's shaft, in brackets; nothing where either is not known."""
+    """Return a force at the roller as torque at the handle's shaft, in brackets; empty where either value is None."""
     if force_N is None or roller_radius_mm is None:
         return ""
     return f" ({force_N * roller_radius_mm:.1f} mNm)"
 
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
-    """What of it acts, without some names, in one line: each value with its deviation and unit."""
+    """Return the beliefs that act, except those named in `but`, in one line: value, deviation and unit of each."""
     return ", ".join(
         f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
         for name, it in belief.items()
@@ -148,7 +149,7 @@ def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> s
 
 
 def _core(build: str, colour: Colour) -> list[str]:
-    """Which build of the core runs, and what it costs; nothing where an older daemon does not say."""
+    """Return lines on the core's build, and what an interpreted one costs; empty where an older daemon does not say."""
     if build in ("", "compiled"):
         return _said("core      ", build, str)
     return [f"core      {colour.yellow(build)}", *_explained(COST, REMEDY, str)]
@@ -159,12 +160,13 @@ def _number(value: float | None, unit: str, digits: int = 3) -> str:
 
 
 def _counts(report: LinkReport | SetpointReport, names: tuple[str, ...]) -> str:
+    """Return the named counters in one line; unknown ones are left out."""
     numbers = [(getattr(report, name), name) for name in names]
     return ", ".join(f"{number} {name}" for number, name in numbers if number is not None)
 
 
 def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
-    """A source's line, and what is wrong with its clock."""
+    """Return lines on one source: state, delay, losses, clock, and what is wrong."""
     paint = {"holds": colour.green, "refused": colour.yellow}.get(source.state, str)
     delay, behind = source.delay_us, source.clock_behind_ms
     words = {"holds": "holds the brake", "refused": "refused", "stale": f"silent for {source.silent_ms * 1e-3:.1f} s"}
@@ -185,7 +187,7 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
 
 
 def _way(way: WayReport | None, colour: Colour) -> list[str]:
-    """From the stamp to the force, part by part; nothing before the first setpoint."""
+    """Return lines on the delay from a setpoint's stamp to its force, part by part; empty before the first setpoint."""
     if way is None or way.to_duty_us.max == 0.0:
         return []
     to_duty, total_ms = way.to_duty_us, way.total_ms
@@ -208,6 +210,7 @@ def _way(way: WayReport | None, colour: Colour) -> list[str]:
 
 
 def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:
+    """Return a line for each code, with cause and remedy where they are known."""
     known = {explained.code: explained for explained in details}
     unknown = Explained("", "", "")
     told = ((code, known.get(code, unknown)) for code in codes)
@@ -221,7 +224,7 @@ def _explained(cause: str, remedy: str, paint: Callable[[str], str]) -> list[str
 
 
 def _said(label: str, text: str | int | None, paint: Callable[[str], str]) -> list[str]:
-    """A line of this text; none where there is nothing to say."""
+    """Return one labelled line; empty where there is no text, or 0."""
     return [f"{label}{paint(str(text))}"] if text else []
 
 
@@ -235,20 +238,20 @@ def _rate(name: str, group: RateReport, colour: Colour) -> str:
 
 
 def _late_ticks(blamed: Mapping[str, int]) -> list[str]:
-    """Who made control ticks late, the one who made most of them first; nothing while none was late."""
+    """Return a line on who made control ticks late, the worst first; empty where none was late."""
     worst_first = sorted(blamed, key=lambda name: (-blamed[name], name))
     return [f"late by   {', '.join(f'{blamed[name]} {name}' for name in worst_first)}"] if blamed else []
 
 
 def firmware(client: Client) -> Outcome:
-    """The daemon's report on its link: the keys of `--json` are those of `link` in the status."""
+    """Report the daemon's link; the keys of `--json` are those of `link` in the status. Raises as `Client.request`."""
     result = client.request("status")
     known = understood(result, Status).link
     return Outcome(result["link"], folded(firmware_text(known, Colour(sys.stdout))))
 
 
 def firmware_text(link: LinkReport, colour: Colour) -> str:
-    """The report in half a dozen lines; what is not known shows as `-`."""
+    """Return the link's report as a dozen lines; an unknown value shows as `-`."""
     paint = colour.green if link.state == "RUNNING" else colour.yellow
     last = f", the last: {link.last_loss}" if link.last_loss else ""
     ours, theirs = link.daemon_schema, link.firmware_schema

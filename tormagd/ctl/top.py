@@ -1,4 +1,4 @@
-"""`tormagctl top`: what the daemon does, live in a terminal. It only looks."""
+"""`tormagctl top`: what the daemon does, live in a terminal. It changes nothing."""
 
 import contextlib
 import select
@@ -22,13 +22,16 @@ from tormagd_client.wire import Pending, understood
 
 REDRAW_S = 0.2
 ASK_S = 1.0
-"Between two looks at the daemon's status; sooner where a code shows that has not been explained yet."
+"Period of asking for the status; sooner where a code shows that is not explained yet."
 KEPT = 1_000
-"Snapshots: what held the force back in the last 20 s is shown, or it would come and go too fast to be read."
+"Snapshots kept, of 20 s: shorter limits would come and go too fast to be read."
 
 
 def top(client: Client) -> Outcome:
-    """Shows it until `q`, Ctrl-C or SIGTERM. Raises CommandError (USAGE) without a terminal, and as `Client.status`."""
+    """Draw the daemon's state until `q`, Ctrl-C or SIGTERM; the terminal is restored then.
+
+    Raises CommandError (USAGE) without a terminal to draw on, and as `Client.status` and `Watcher.look`.
+    """
     console = Console(highlight=False)
     if not (is_terminal(sys.stdin) and console.is_terminal) or console.is_dumb_terminal:
         raise usage_error("top needs a terminal that can be drawn on", "tormagctl status, with --json for a script")
@@ -50,7 +53,7 @@ def top(client: Client) -> Outcome:
 
 
 class Watcher:
-    """Gathers what is to be shown. Waits for nothing but the first status."""
+    """Gathers telemetry and status for the screen; waits for the daemon only when made, for the first status."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -61,7 +64,10 @@ class Watcher:
         self._ask_s = self._heard_s = time.monotonic()
 
     def look(self) -> Seen:
-        """What is known by now. Raises as `Client.answer`, and UnreachableError for what is no telemetry."""
+        """Take what has arrived and return what is known by now; asks for the status now and then.
+
+        Raises as `Client.answer`, and UnreachableError for a message that is no telemetry.
+        """
         now_s = time.monotonic()
         try:
             arrived = self._client.telemetry()
@@ -75,7 +81,10 @@ class Watcher:
         return Seen(self._telemetry, self._status, self._explained, now_s - self._heard_s)
 
     def _ask(self, now_s: float, codes: set[str]) -> None:
-        """Asks for the status now and then, and takes the answer; only of a daemon that is heard."""
+        """Take the answer to the last request, and ask again after ASK_S, or for a code not explained yet.
+
+        Called only while the daemon is heard: requests to a silent one would pile up.
+        """
         result = None if self._asked is None else self._client.answer(self._asked)
         if result is not None:
             self._status = understood(result, Status)

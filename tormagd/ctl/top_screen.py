@@ -16,13 +16,13 @@ from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 
 COLUMN_NS = 100_000_000
-"What one character of a sparkline stands for."
+"Time that one character of a sparkline stands for."
 STANDARD_ROWS = 24
-"A terminal of so many rows has sparklines of one row; what it has more, they share."
+"A terminal of this many rows has sparklines of one row; sparklines share any further rows."
 LABEL, VALUE, ENDS = 10, 10, 12
 "Characters of a row's name, of its newest value with the unit, and of the ends of its scale."
 NARROW = 60
-"On fewer characters the scales' ends are left out."
+"Width in characters below which the ends of the scales are left out."
 SILENT_S = 0.5
 EIGHTHS = " ▁▂▃▄▅▆▇█"
 STATE_STYLES = {"ENABLED": "black on green", "PAUSED": "black on yellow", "FAULT": "bold white on red"}
@@ -30,8 +30,8 @@ GRADE_STYLES = {"warning": "yellow", "error": "red"}
 
 
 class Seen(NamedTuple):
-    """What is known: snapshots, the oldest first, the newest status, the newest explanation of each code, and for how
-    long nothing has come."""
+    """What is known: telemetry, the oldest first, the newest status, an explanation of each code, and the silence
+    since, s."""
 
     telemetry: Sequence[Telemetry]
     status: Status
@@ -40,7 +40,8 @@ class Seen(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A row with a sparkline. Curves of one `scale` are drawn to the same; it is no narrower than `least`."""
+    """A row with a sparkline. Curves with the same `scale` share one, no narrower than `least`; `of_column` joins
+    values."""
 
     label: str
     unit: str
@@ -63,7 +64,10 @@ CURVES = (
 
 
 def screen(seen: Seen, width: int, height: int) -> RenderableType:
-    """All of it: state, curves, loops and link, then faults and limits with their remedies, as far as they fit."""
+    """Return the whole screen: state, curves, loops and link, then faults and limits with remedies, as far as they fit.
+
+    `width` and `height` are in characters.
+    """
     more = max(height - STANDARD_ROWS, 0) // len(CURVES)
     wide = width - 2
     parts = (
@@ -76,6 +80,7 @@ def screen(seen: Seen, width: int, height: int) -> RenderableType:
 
 
 def _head(seen: Seen, width: int) -> Text:
+    """Return the first line: state, torque, how long nothing was heard, scene, uptime and version."""
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state = printable(newest.operating_state)
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
@@ -101,7 +106,8 @@ def _head(seen: Seen, width: int) -> Text:
 
 
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
-    """Each curve with its name, newest value, course and the ends of its scale."""
+    """Return a row for each curve: name, newest value, sparkline, and the ends of its scale where the terminal is wide
+    enough."""
     ends_wide = ENDS if width >= NARROW else 0
     count = max(width - LABEL - VALUE - ends_wide - 3, 8)
     table = _grid(LABEL, VALUE, count, *([ends_wide] if ends_wide else []))
@@ -132,7 +138,7 @@ def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
 
 
 def _grid(*widths: int, is_cut: bool = True) -> Table:
-    """Columns of these widths; what is longer is cut, or goes on in the next line."""
+    """Return a table with columns of these widths; longer text is cut, or wrapped without `is_cut`."""
     table = Table.grid(padding=(0, 1, 0, 0))
     for width in widths:
         table.add_column(width=width, no_wrap=is_cut, overflow="ellipsis")
@@ -140,7 +146,7 @@ def _grid(*widths: int, is_cut: bool = True) -> Table:
 
 
 def _timing(status: Status, width: int) -> Table:
-    """How well the loops keep their time, how the wire carries, and who publishes."""
+    """Return rows on how loops keep time, the link, who publishes, what the kernel refused, following and belief."""
     table = _grid(LABEL, width - LABEL - 1)
     for name in ("control", "inference", "search"):
         group = status.rates.get(name)
@@ -172,7 +178,7 @@ def _timing(status: Status, width: int) -> Table:
 
 
 def _codes(seen: Seen, width: int) -> Table:
-    """Faults first, then what has held the force back lately, the longest first, each with cause and remedy."""
+    """Return rows of faults, then of limits that held lately, the longest first, each with cause and remedy."""
     newest = seen.telemetry[-1] if seen.telemetry else seen.status
     times = Counter(code for each in seen.telemetry for code in each.limits)
     table = _grid(LABEL, width - LABEL - 1, is_cut=False)
@@ -201,9 +207,9 @@ def columns(
     period_ns: int,
     of_column: Callable[[list[float]], float],
 ) -> list[float | None]:
-    """The newest `count` periods, the oldest first: what `of_column` makes of each one's values, None where none is.
+    """Return the newest `count` periods, the oldest first: `of_column` of each period's values, None where it has none.
 
-    Periods are those of the clock, so that a column stays what it is while the picture moves on.
+    Periods are aligned to the clock, so that a column keeps its value while the picture moves on.
     """
     if not times_ns:
         return [None] * count
@@ -217,7 +223,8 @@ def columns(
 
 
 def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
-    """The range that all values lie in, no narrower than `least`: noise is not to look like a signal."""
+    """Return the range of all known values, widened to `least` so that noise does not look like a signal; 0..least for
+    none."""
     known = [value for value in values if value is not None]
     if not known:
         return 0.0, least
@@ -227,7 +234,8 @@ def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
 
 
 def sparkline(values: Sequence[float | None], low: float, high: float, rows: int) -> list[str]:
-    """`rows` lines of bars from `low` (one eighth of a character) to `high` (all rows), the top line first."""
+    """Return `rows` lines of bars, the top line first: `low` is one eighth of a character, `high` all rows, None
+    blank."""
     steps = len(EIGHTHS) - 1
     full = rows * steps
     eighths = [

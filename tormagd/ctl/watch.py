@@ -1,4 +1,4 @@
-"""What becomes of the setpoints that are sent: whether the daemon takes them, and the device renders them."""
+"""What becomes of setpoints that are sent: whether the daemon takes them, and the device renders them."""
 
 import sys
 import time
@@ -14,20 +14,22 @@ from tormagd_client.messages import Description, Explained, Status
 from tormagd_client.wire import Pending, understood
 
 LOOK_S = 0.1
-"Between two looks at the daemon's status. It is a new one every 20 ms, and reading it takes a quarter of one."
+"Period of asking for the status, which is new every 20 ms and takes 5 ms to read."
 LAST_ANSWER_S = 1.0
-"It has answered all the time: a daemon that has gone is not waited for."
+"Longest wait for the last status: the daemon has answered all the time."
 ARRIVAL_S = 0.5
-"By then the last setpoint has arrived: an answer may overtake it."
+"By then the last setpoint has arrived, even where an answer overtook it."
 LEAST_TAKEN = 0.9
-"Share of the setpoints that has to be taken; the first ones of a clock that is not known yet may not be."
+"Share of the setpoints that has to be taken; the first ones may be refused while their clock is not known."
 SPOILING = ("RANGE", "F_MAX")
-"Limits that say: another force than the one asked for. Below F_min a device gives F_min, which is what 0 N means."
+"Limits that mean another force than asked. F_MIN is not among them: 0 N asks for what the device gives at least."
 
 
 class Fate(msgspec.Struct, frozen=True):
-    """How many setpoints were taken, in which share of the looks they were rendered (None: there was none in so short a
-    time), and what held the force at times."""
+    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and what held them.
+
+    `rendered_share` is None where the time was too short for a look.
+    """
 
     accepted: int
     rendered_share: float | None
@@ -35,7 +37,8 @@ class Fate(msgspec.Struct, frozen=True):
 
 
 def require_range(known: Description, least_N: float, most_N: float) -> None:
-    """Raises CommandError (REFUSED) where the daemon's scene does not allow forces of that range."""
+    """Raise CommandError unless the daemon's scene allows these forces: REFUSED, or UNREACHABLE for another version's
+    scene."""
     try:
         force = msgspec.convert(known.scene["force"], dict[str, Any])
         allowed = msgspec.convert((force["least_N"], force["most_N"]), tuple[float, float])
@@ -57,10 +60,10 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 
 
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
-    """Why the setpoints of `source` are not rendered, as the error that it is; None while they are.
+    """Return why the setpoints of `source` are not rendered, as an error (REFUSED); None while they are.
 
-    With `is_over` they have been: whether the newest one is still valid does not matter any more. Raises CommandError
-    (FAULT) where the device is in FAULT: nothing is sent to it any more.
+    With `is_over` only state and source count: limits and the newest setpoint's age do not matter any more. Raises
+    CommandError (FAULT) where the device is in FAULT: then nothing more is to be sent.
     """
     require_no_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
@@ -95,7 +98,10 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
 
 
 class Watch:
-    """Looks at the daemon's status now and then while setpoints of one source are sent. Waits for nothing."""
+    """Looks at the daemon's status while one source's setpoints are sent; waits only when made, and in `finish`.
+
+    Raises CommandError (FAULT) where the device is in FAULT already.
+    """
 
     def __init__(self, client: Client, source: str) -> None:
         self._client, self._source = client, source
@@ -110,8 +116,11 @@ class Watch:
         self._limits: dict[str, None] = {}
 
     def look(self) -> None:
-        """Between two setpoints. Raises CommandError (FAULT) where the device is in FAULT; tells a person on stderr
-        of what else keeps the force from being rendered."""
+        """Take a status that has arrived, or ask for one after LOOK_S, without waiting; call it between setpoints.
+
+        Says on stderr what newly keeps the force from being rendered. Raises CommandError (FAULT) where the device is
+        in FAULT.
+        """
         now_s = time.monotonic()
         if self._look_s is None:  # an answer may overtake the first setpoint
             self._look_s = now_s + LOOK_S
@@ -135,7 +144,11 @@ class Watch:
         self._held = held
 
     def finish(self, sent: int) -> Fate:
-        """What became of the `sent` setpoints. Raises CommandError where they were not all taken and rendered."""
+        """Wait up to ARRIVAL_S until the daemon has taken all `sent` setpoints, and return what became of them.
+
+        Raises CommandError: REFUSED where under LEAST_TAKEN of them were taken, the force was held back after it had
+        come, or never came; FAULT where the device is in FAULT.
+        """
         until_s = time.monotonic() + ARRIVAL_S
         while True:
             status = self._client.status(LAST_ANSWER_S)
@@ -161,5 +174,6 @@ class Watch:
 
 
 def _accepted(status: Status, source: str) -> int:
+    """Return how many setpoints of `source` the daemon has taken; 0 for an unknown source."""
     report = status.setpoints.by_source.get(source)
     return 0 if report is None else report.accepted

@@ -19,7 +19,7 @@ class WaveformError(ValueError):
 
 
 class Sample(NamedTuple):
-    """What is asked at one moment."""
+    """What is asked at one moment; None for a displacement or rate that is not told."""
 
     force_N: float
     displacement_mm: float | None = None
@@ -27,8 +27,8 @@ class Sample(NamedTuple):
 
 
 class Waveform(NamedTuple):
-    """`at(t_s)` for t_s in 0..duration_s, of forces from `least_N` to `most_N`. A shape that can go on for ever has
-    duration_s = inf."""
+    """A force over time: `at(t_s)` for 0..`duration_s`, from `least_N` to `most_N`; a shape without end lasts
+    infinity."""
 
     duration_s: float
     at: Callable[[float], Sample]
@@ -37,13 +37,14 @@ class Waveform(NamedTuple):
 
 
 def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
-    """Straight lines from a force on: each leg lasts so long, s, and ends at such a force, N."""
+    """Return straight lines from `start_N` on: each leg is its duration, s, and the force at its end, N."""
     times_s = [0.0, *accumulate(lasts_s for lasts_s, _ in legs)]
     return _lines(times_s, [start_N, *(force_N for _, force_N in legs)])
 
 
 def _lines(times_s: Sequence[float], forces_N: Sequence[float], *others: Sequence[float] | None) -> Waveform:
-    """Straight lines between samples; `others` are in the order of Sample's other fields, None where there is none."""
+    """Return straight lines between samples; `others` are Sample's other columns in its order, None where there is
+    none."""
 
     def at(t_s: float) -> Sample:
         right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
@@ -62,10 +63,11 @@ SHAPES = ("step", "sine", "ramp", "pulse")
 
 
 def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s: float) -> Waveform:
-    """One of SHAPES between two forces. Raises WaveformError.
+    """Return one of SHAPES between two forces, N.
 
-    step: to_N from half of the time on. ramp: a straight line. sine: begins at from_N, swings to to_N and back.
-    pulse: a synthetic arterial pulse, one beat per 1/frequency_hz.
+    step: `to_N` from half of the time on. ramp: a straight line. sine: begins at `from_N`, swings to `to_N` and back.
+    pulse: a synthetic arterial pulse, one beat per 1/`frequency_hz`. Raises WaveformError: an unknown name, a force
+    outside 0..MAX_FORCE_N, or a step or ramp without end.
     """
     for label, value in (("from-N", from_N), ("to-N", to_N)):
         if not 0.0 <= value <= MAX_FORCE_N:
@@ -92,14 +94,15 @@ def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s
 
 
 def beat(phase: float) -> float:
-    """One synthetic heart beat, 0..1, over `phase` 0..1: a systolic bell, and a lower one for the reflected wave."""
+    """Return one synthetic heart beat, 0..1, at `phase` 0..1: a systolic bell, and a lower one for the reflected
+    wave."""
     bells = math.exp(-(((phase - 0.25) / 0.09) ** 2)) + 0.35 * math.exp(-(((phase - 0.55) / 0.12) ** 2))
     # the second bell adds 0.06 % to the first one's top
     return min(1.0, bells)
 
 
 def read_csv(path: Path) -> Waveform:
-    """The waveform of a file of forces, straight lines between its rows. Time is counted from the first row.
+    """Read a file of forces into a waveform of straight lines between its rows, with time from the first row.
 
     Raises ForceFileError.
     """
