@@ -1,9 +1,9 @@
 """The black box's file: an MCAP file with three channels, which holds all that running the core again needs.
 
 `/core` holds the core's inputs and results, exact to the bit and in their order. Each of its messages is one part that
-the daemon handed over, in msgpack. `/ticks` and `/frames` are derived from it, in JSON: `/ticks` as in a recording, for
-viewers and `tormagctl plot`; `/frames` what passed between daemon and device. The metadata record `black_box` is the
-file's header. `tormagctl replay` runs such a file.
+the daemon handed over, in msgpack. `/ticks` and `/frames` are derived from it, in JSON. `/ticks` is as in a recording,
+for viewers and `tormagctl plot`. `/frames` is what passed between daemon and device. The metadata record `black_box` is
+the file's header. `tormagctl replay` runs such a file.
 """
 
 import json
@@ -243,8 +243,10 @@ class _Reading:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
 
     def _compare(self, topic: str, sent: Sent) -> None:
-        """Note in `odd` where a message is not the next one derived; frames may differ in time by one constant
-        offset."""
+        """Take the next derived message, and note in `odd` where the file's message differs.
+
+        Frames may differ in time by a constant, within MAX_TIME_DIFFERENCE_NS.
+        """
         expected = self._expected[topic].popleft() if self._expected[topic] else None
         if expected is None or (sent.sequence, sent.data) != (expected.sequence, expected.data):
             is_same = False

@@ -124,12 +124,13 @@ class RecordingFolder:
     def prune(self, coming_bytes: int = 0) -> list[Segment]:
         """Delete segments too old, and the oldest until `coming_bytes` more fit the budget; return those deleted.
 
-        Keeps what is marked, is being written, has no time in its name, or is a link.
+        Keeps what is marked, is being written, has no time in its name, or is a link. A segment that somebody else
+        deleted meanwhile counts as deleted.
         """
         left, gone = self.segments(), []
         for segment in list(left):
             is_old = segment.began_s is not None and self._clock() - segment.began_s > self.budget.most_s
-            if (is_old or self._over(left, coming_bytes)) and self._is_taken(segment):
+            if (is_old or self._over(left, coming_bytes)) and self._delete(segment):
                 left.remove(segment)
                 gone.append(segment)
         return gone
@@ -159,8 +160,9 @@ class RecordingFolder:
             return f"{free / 1e6:.1f} MB are free, and {self.budget.free_bytes / 1e6:.1f} stay so for black boxes"
         return ""
 
-    def _is_taken(self, segment: Segment) -> bool:
-        """Delete a segment and return True; False where it is marked, unnamed, a link, or being written."""
+    def _delete(self, segment: Segment) -> bool:
+        """Delete a segment and return True; False where it is marked, has no time in its name, is a link, or is being
+        written."""
         if segment.is_marked or segment.began_s is None or segment.path.is_symlink():
             return False
         with contextlib.suppress(FileNotFoundError), segment.path.open("rb") as file:

@@ -22,8 +22,8 @@ from tormagd.output import write_line
 
 KEPT_S = 30.0
 MOST_BYTES = 48_000_000
-"""The ring holds no more than either. Half a minute at 1 kHz with 500 setpoints a second is 18 MB; at rates or with
-previews for which this is too little, it reaches less far back."""
+"""The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB; at higher
+rates or with previews the ring reaches less far back."""
 MOST_FILES = 20
 "The oldest file is deleted when there are more."
 MOST_PACKET = 4_000_000
@@ -72,7 +72,7 @@ class Keeper:
 
         Each file is written in a thread of its own, one at a time.
         """
-        while self._is_heard():
+        while self._hear():
             if self._writing is not None and self._writing.is_alive():
                 continue  # one at a time
             due = next((each for each in self._due if each[0] <= time.monotonic()), None)
@@ -86,7 +86,7 @@ class Keeper:
         for _, write in self._due:
             self._write(write, self._begun, self._ring.parts())
 
-    def _is_heard(self) -> bool:
+    def _hear(self) -> bool:
         """Wait for one packet from the daemon and take it; False once the daemon has ended.
 
         Where the socket closes without End, a file named DAEMON-DIED becomes due.

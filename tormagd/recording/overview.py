@@ -138,7 +138,7 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
     def packed(self) -> bytes:
-        """Encode the overview as it stands in a file: msgpack."""
+        """Encode the overview in msgpack, as it stands in a recording."""
         return msgspec.msgpack.encode(self)
 
 
@@ -310,6 +310,7 @@ class _Stretches:
                 sides[i] = array("f", [of(side[a:b]) for a, b in zip(firsts, ends, strict=True)])
 
     def made(self) -> Curves:
+        """Return the curves as bytes; a stretch without a value of a quantity has NaN."""
         sides: tuple[dict[str, bytes], dict[str, bytes]] = ({}, {})
         for known, arrays in zip(sides, (self._low, self._high), strict=True):
             for name, side in zip(QUANTITIES, arrays, strict=True):
@@ -364,7 +365,10 @@ class _Codes:
             self._held[kind, code] += by_ns
 
     def _begin(self, kind: str, since_ns: int, codes: tuple[str, ...]) -> None:
-        """Continue spans that reach `since_ns`, and begin new ones. Codes over MOST_CODES count as OTHER."""
+        """Continue spans that reach `since_ns`, begin new ones, and remember `codes` as the last message's.
+
+        New codes beyond a third of MOST_CODES count as OTHER; spans beyond MOST_SPANS are joined.
+        """
         known = self._known[kind]
         if len(known) >= MOST_CODES // len(KINDS) - 1:
             codes = tuple(code if code in known else OTHER for code in codes)

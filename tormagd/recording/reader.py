@@ -72,7 +72,7 @@ def readable(name: str) -> Iterator[None]:
 
 
 def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Callable[[Sent], None]) -> bool:
-    """Read an MCAP file from its beginning: each message goes to `message`, any other record to `take`.
+    """Read an MCAP file from its beginning: each message goes to `message`, any other record, also a chunk, to `take`.
 
     Returns whether the file ends as it should; False for one cut short. Raises RecordingError, naming the file `name`:
     not MCAP, empty, damaged, or refused by a callback that raises UNREADABLE.
@@ -177,9 +177,8 @@ def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Con
 class RecordingFile:
     """A recording on the disk, of any length: its overview, and any seconds of it.
 
-    Where the file has no overview (its recorder was killed, or is older), it is made from all messages; with
-    `is_scanned` False such a file is refused. Raises RecordingError: not readable, not MCAP, damaged, or not written by
-    tormagd.
+    A file whose recorder was killed, or is older, has no overview: it is made from all messages. With `is_scanned`
+    False such a file is refused. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd.
     """
 
     def __init__(self, path: Path, *, is_scanned: bool = True) -> None:

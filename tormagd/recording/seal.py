@@ -32,8 +32,10 @@ _BODY = struct.Struct(f"<B{DIGEST_BYTES}s")
 
 
 def read_key(file: str) -> bytes:
-    """Read the sealing key from a file; empty where `file` is empty. Raises OSError, and ValueError for a wrong
-    length."""
+    """Read the sealing key from a file, without surrounding white space; empty where `file` is an empty name.
+
+    Raises OSError, and ValueError where the key is not of LEAST_KEY..MOST_KEY bytes.
+    """
     if not file:
         return b""
     key = read_bounded(Path(file), MOST_KEY + 1).strip()
@@ -173,8 +175,10 @@ class _Check:
         self._digest(record)
 
     def _digest(self, record: Record) -> None:
-        """Add a record to the digest and the summary's CRC; before the first metadata, keep it until the hash
-        begins."""
+        """Add a record to the hash, or while there is none, to the bytes that the hash will begin with.
+
+        Also adds a record of the summary to its CRC, and notes where the summary begins.
+        """
         raw = record.raw() if record.opcode != END else b""
         if self._hash is not None:
             self._hash.update(raw)

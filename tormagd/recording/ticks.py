@@ -48,9 +48,10 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
 def listening(
     context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
 ) -> "zmq.Socket[bytes]":
-    """Connect a SUB socket to `address`, with the daemon's telemetry or ticks under `topic`, and return it.
+    """Connect a new SUB socket to `address`, for telemetry or ticks under `topic`, and return it.
 
-    `keys` None means an open endpoint. Raises SettingError where the address is not one.
+    An empty topic takes all. `keys` None means an open endpoint. Raises SettingError for an address that ZeroMQ cannot
+    use.
     """
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)

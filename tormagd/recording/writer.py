@@ -240,7 +240,7 @@ class RecordingWriter:
             self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
 
     def _channel_of(self, message: dict[str, Value]) -> int:
-        """Return the tick channel whose schema `message` obeys, and register one where there is none."""
+        """Return the tick channel whose schema `message` obeys; registers one where a column's type is new."""
         kinds = self._kinds
         if not self._tick_channel or any(kinds.get(name) != _KINDS[type(value)] for name, value in message.items()):
             kinds |= {name: _KINDS[type(value)] for name, value in message.items()}
