@@ -94,8 +94,10 @@ class Live:
                 self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
 
     async def _every(self, period_s: float, look: Callable[[], Awaitable[None]]) -> None:
-        """Call `look` every `period_s` while the daemon is heard: requests to a silent daemon would wait, and come at
-        once."""
+        """Call `look` every `period_s` while the daemon is heard; a client's error is passed over.
+
+        Requests to a silent daemon would wait, and come at once.
+        """
         while True:
             await asyncio.sleep(period_s)
             if time.monotonic() - self._heard_s < SILENT_S:

@@ -180,7 +180,8 @@ def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Mom
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
-    """Return the belief in the newest snapshot before `at_s`; empty where it is over BREAK_S old, or told none."""
+    """Return the belief in the newest snapshot before `at_s`, without unknown values; empty where it is over BREAK_S
+    old."""
     place = (snapshots.newest(np.array([at_s])) or [-1])[0]
     told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
     return {

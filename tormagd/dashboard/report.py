@@ -40,7 +40,7 @@ def report(of: Sequence[Reported]) -> str:
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
         *(_sealed(each) for each in of),
-        *_following(of),
+        *_succession(of),
         _table(["", *names], _figures(of)),
         *(_picture(each) for each in of),
         "<h2>What held the force back</h2>",
@@ -68,7 +68,7 @@ def _sealed(of: Reported) -> str:
     return f"<p{kind}>{escape(said)}.</p>"
 
 
-def _following(of: Sequence[Reported]) -> list[str]:
+def _succession(of: Sequence[Reported]) -> list[str]:
     """Say in HTML which recordings follow each other, by the seals' digests; empty where none do."""
     names = {each.seal.last: each.file.path.name for each in of if each.seal.last}
     known = [(each.file.path.name, names[each.seal.follows]) for each in of if each.seal.follows in names]
