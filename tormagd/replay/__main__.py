@@ -25,7 +25,7 @@ from tormagd_client.endpoints import ConfigError
 def main(arguments: list[str] | None = None) -> int:
     """Replay the file that the arguments name, print one JSON object, and return the exit code.
 
-    0 is done, 1 that stdout cannot be written, 2 that the file or an option cannot be used; then one line on stderr
+    0 is done, 1 is a stdout that cannot be written. 2 is a file or an option that cannot be used: one line on stderr
     says why. With `--set` or `--fault` the simulated device takes the real one's place.
     """
     parser = argparse.ArgumentParser(prog="python -m tormagd.replay", description=(__doc__ or "").splitlines()[0])

@@ -87,6 +87,8 @@ class RecordedWire:
         return messages
 
     def _unpack(self, piece: Any) -> list[Message]:
+        """Decode one piece: bytes of a serial port, or a frame of a bus. Raises BackendError where another host drives
+        the node."""
         if isinstance(self.stream, FrameStream):
             return self.stream.unpack(piece)
         try:
@@ -159,8 +161,10 @@ class Conversation:
             self.first_damage = Damage(self.frame - len(pieces) + 1 + wire.damaged[0], now_s, why)
 
     def wrote(self, entry: Any, output: Duty) -> Found | None:
-        """Send a step's `output` again, and return the first frame that differs from the WROTE entry; None where none
-        does."""
+        """Send a step's `output` again, and return the first frame that differs from the WROTE entry.
+
+        None where none differs, or no port was open.
+        """
         wire = self._wire
         if wire is None:
             return None

@@ -26,8 +26,8 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import TickRecord
 
 HOMED_S, CONNECTED_S = 8.0, 0.5
-"""In virtual time: by then the device is homed, and renders the first setpoint where the recorded one did at the file's
-beginning; or it is only connected, where that was not homed."""
+"""When the file's first tick is, in virtual time. By HOMED_S the device is homed, and renders the first setpoint as
+the recorded one did. By CONNECTED_S it is only connected, for a recorded device that was not homed."""
 PATIENCE_S = 0.5
 "How long a refused command is given again: the simulated device may come to rest later than the real one."
 SEED = 1
