@@ -49,9 +49,9 @@ def calibrate_insert(
 ) -> Outcome:
     """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`.
 
-    `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. Raises CommandError:
-    USAGE, FAULT, UNREACHABLE, `interrupted_run`; REFUSED by the daemon, for a handle that stands still, an unknown
-    insert, or a sweep or fit that is not good enough. Then there is no model file.
+    `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. Raises as `armed` and
+    `Run.play`. Raises CommandError (REFUSED) for an unknown insert, a still handle, another publisher, or a sweep or
+    fit that is not good enough. Then there is no model file.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
@@ -149,6 +149,7 @@ def _ask_fitter(*arguments: str) -> dict[str, Any]:
 
 
 def _text(result: dict[str, Any]) -> str:
+    """Say how well the fitted model was judged, and what to do with it."""
     metrics = result["metrics"]
     return (
         f"{result['model']}: {result['insert']}, {result['created']}, {result['rows']} rows. On sweeps kept from the "
@@ -173,8 +174,8 @@ def calibrate(
 ) -> Outcome:
     """Calibrate one of: the device, an `insert`, or the `motors`; asks for agreement first unless `is_agreed`.
 
-    Raises CommandError: USAGE for options that do not fit each other, a file that exists or has no folder, a faulty
-    scene, or nobody to ask; and as the three calibrations do.
+    Raises CommandError (USAGE) for options that do not fit each other, a file that exists or has no folder, or a faulty
+    scene. Without agreement, stdin has to be a terminal. Raises as the three calibrations do.
     """
     if [insert is not None, motors, device].count(True) != 1:
         raise usage_error("give one of --insert NAME, --motors and --device", "tormagctl calibrate --help shows them")

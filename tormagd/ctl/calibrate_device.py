@@ -51,8 +51,8 @@ def lesson(forces: Range) -> tuple[Waveform, Waveform]:
 def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
     """Let the daemon learn the device, judge it by steps, and wait until its profile is kept. The gap opens in the end.
 
-    `scene_most_N` is the greatest force to ask for. Raises CommandError: FAULT, UNREACHABLE, `interrupted_run`; REFUSED
-    by the daemon, and where no profile is kept, the handle hardly moves, or the daemon doubts the force sensor.
+    `scene_most_N` is the greatest force to ask for. Raises as `armed` and `Run.play`. Raises CommandError (REFUSED)
+    where no profile is kept, the handle hardly moves, or the daemon doubts the force sensor.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         profile = client.status().profile
@@ -122,6 +122,7 @@ def _sliding(ticks: Columns) -> "np.ndarray[Any, np.dtype[np.bool_]]":
 
 
 def _still(share: float) -> CommandError:
+    """Return the error (REFUSED) for a handle that moved for only this share of the time."""
     return CommandError(
         Exit.REFUSED,
         "handle_still",
@@ -144,6 +145,7 @@ def _kept(client: Client) -> ProfileReport:
 
 
 def _not_kept(profile: ProfileReport) -> CommandError:
+    """Return the error (REFUSED) for a daemon that keeps no profile."""
     return CommandError(
         Exit.REFUSED,
         "not_kept",
@@ -153,6 +155,7 @@ def _not_kept(profile: ProfileReport) -> CommandError:
 
 
 def _text(result: dict[str, Any]) -> str:
+    """Say what the device showed of itself, how well the steps were followed, and where the profile is."""
     return (
         f"device {result['serial_number']}: {result['scale']:.3f} +- {result['scale_sd']:.3f} times the model's force, "
         f"{result['offset_N'] * 1e3:+.0f} +- {result['offset_sd_N'] * 1e3:.0f} mN; its sensor reads "

@@ -61,9 +61,9 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
     """Drive both carriages through `excitation`, and write the log of one to the new file `path`.
 
-    The gap opens in the end. Raises CommandError: FAULT, UNREACHABLE, `interrupted_run`; REFUSED by the daemon, for a
-    control rate under LEAST_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this
-    shows only after the drive.
+    The gap opens in the end. Raises as `armed` and `Run.play`. Raises CommandError (REFUSED) for a control rate under
+    LEAST_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this shows only after the
+    drive.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         waveform = excitation(reach(client, scene_most_N))

@@ -127,7 +127,7 @@ class Run:
                 )
 
     def _rows(self, data: bytes) -> list[list[float]]:
-        """Decode a batch into rows of floats, and note that the daemon was heard.
+        """Decode a batch into rows of floats, NaN for a word or an unknown value, and note that the daemon was heard.
 
         Raises CommandError where the batch is another version's, or a tick was not ENABLED.
         """

@@ -33,6 +33,8 @@ def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float)
 
 
 async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
+    """Serve the page of the daemon, listening to it meanwhile. Raises as `AsyncClient.status` where it does not
+    answer."""
     async with AsyncClient(endpoints, wait_s) as client:
         shown = Live(client, await client.status(), await client.describe())
         listening = asyncio.create_task(shown.run())

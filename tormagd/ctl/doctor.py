@@ -293,7 +293,7 @@ def scheduling(config: Config, machine: Machine) -> Finding:
 
 
 def memory_lock(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller may lock the daemon's memory; FAIL where not and it is configured."""
+    """Judge whether the caller may lock MEMORY_TO_LOCK_BYTES; where not, FAIL if that is configured, else WARN."""
     limit = float("inf") if machine.has_capability(CAP_IPC_LOCK) else machine.limit("Max locked memory")
     return _finding(
         "memlock",
@@ -478,6 +478,7 @@ def _table(table: tuple[Rate, ...]) -> str:
 
 
 def _text(findings: tuple[Finding, ...]) -> str:
+    """Return a line for each finding, with the remedy on the next line."""
     colour = Colour(sys.stdout)
     paint = {Verdict.OK: colour.green, Verdict.WARN: colour.yellow, Verdict.FAIL: colour.red}
     return "\n".join(

@@ -104,9 +104,10 @@ def _run(options: argparse.Namespace) -> Outcome:
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
-    """Return the configured endpoints and keys, changed by options and environment.
+    """Return the configured endpoints and keys with the changes that options and environment make.
 
-    `ipc://DIR/control` changes all of them: the daemon's own names stand in one directory. Raises CommandError (USAGE).
+    An endpoint `ipc://DIR/control` stands for all endpoints in DIR, under the daemon's own names. Raises CommandError
+    (USAGE) for an address or keys that cannot be used.
     """
     changed: dict[str, object] = {}
     keys = {

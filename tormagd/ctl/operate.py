@@ -84,14 +84,14 @@ def operate(client: Client, command: str) -> Outcome:
 def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
     """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open.
 
-    Raises CommandError as `operate`; FAULT where the device cannot open the gap, or `disable` meets any fault; REFUSED
+    Raises as `operate`. Raises CommandError: FAULT where the gap cannot open, or `disable` meets any fault; REFUSED
     where the gap is not known to be open within `timeout_s`.
     """
     begun = operate(client, command)
     if begun.exit_code is not Exit.DONE or not is_waiting:
         return begun
     gap_mm = None
-    for elapsed_s, state in _looks(client, "opening", timeout_s):
+    for elapsed_s, state in _statuses(client, "opening", timeout_s):
         gap_mm = state.gap_mm
         if state.is_open and not state.is_busy:
             return Outcome({**begun.result, "seconds": round(elapsed_s, 2)}, IS_OPEN[command])
@@ -136,15 +136,15 @@ def _not_done(what: str) -> CommandError:
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     """Home both carriages, and with `is_waiting` wait until they are homed.
 
-    Raises CommandError: REFUSED where homing does not begin within BEGIN_S, ends without being homed, or takes over
-    `timeout_s`; FAULT where the device latches a fault meanwhile; and as `Client.request`.
+    Raises CommandError (FAULT) where the device latches a fault meanwhile. REFUSED is a homing that does not begin
+    within BEGIN_S, leaves the device not homed, or takes over `timeout_s`. Raises as `Client.request`.
     """
     was_homed = client.status().is_homed
     result = client.request("home")
     if not is_waiting:
         return Outcome(result, "homing; tormagctl status shows when it is done")
     has_begun = False
-    for elapsed_s, state in _looks(client, "homing", timeout_s):
+    for elapsed_s, state in _statuses(client, "homing", timeout_s):
         require_no_fault(state, "fault while homing")
         # a homing that was over between two looks still shows, as a device that is homed and was not
         has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
@@ -166,7 +166,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     )
 
 
-def _looks(client: Client, doing: str, timeout_s: float) -> Iterator[tuple[float, Status]]:
+def _statuses(client: Client, doing: str, timeout_s: float) -> Iterator[tuple[float, Status]]:
     """Yield seconds since the start and status, every POLL_S for `timeout_s`; on a terminal draws a line of
     progress."""
     started_s = time.monotonic()

@@ -97,9 +97,9 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
     A message that cannot be read is counted, and the first one's reason told on stderr. The outcome is REFUSED where
     ticks were lost, UNREACHABLE where the daemon was gone at the end.
 
-    Raises CommandError: USAGE where the file exists or cannot be made; UNREACHABLE, and then without a file, where
-    nothing is published within `wait_s` or the daemon does not answer; REFUSED where the disk takes no more, and what
-    it took stays.
+    Raises CommandError (USAGE) where the file exists or cannot be made. UNREACHABLE is a daemon that publishes nothing
+    within `wait_s`, or does not answer: then there is no file. REFUSED is a disk that takes no more: what was written
+    stays.
     """
     key, keys = key_of(config), keys_of(endpoints.curve)
     context = zmq.Context()

@@ -44,6 +44,7 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
 
 
 def _list(folder: RecordingFolder) -> Outcome:
+    """Describe each segment of the folder, and say their total size; damaged ones are listed with the reason."""
     rows = [_row(segment) for segment in folder.segments()]
     size_MB = sum(row["MB"] for row in rows)
     lines = [

@@ -178,7 +178,10 @@ def check_scene(name: str, config: Path | None) -> Outcome:
 
 
 def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
-    """Say how soon a force comes from where the brake waits, and from nearer; empty where nothing was derived."""
+    """Say how soon a force comes from where the brake waits, and from higher standby forces: that halfway to the most.
+
+    `approaches_s` are standby forces, N, with times, s, the present one first; empty for none.
+    """
     if not approaches_s:
         return []
     (wait_N, now_s), *nearer = approaches_s

@@ -21,8 +21,8 @@ INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
 TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
 "Proposed tolerance: this share of the range, and at least this share of the greatest force."
 RESERVED = 0.8
-"""Of the greatest force that the model gives: a device may be a fifth weaker than its model, by friction, modulus,
-field and what its elastomer relaxes. A soft insert is asked for more only where no stiffer one follows fast enough."""
+"""Share of the greatest force that the model gives. A device may be a fifth weaker than its model, by friction,
+modulus, field and relaxation. A soft insert is asked for more only where no stiffer one follows fast enough."""
 
 Tables = dict[str, Any]
 
@@ -93,8 +93,10 @@ def _has_reserve(tables: Tables, checked: Outcome) -> bool:
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
-    """Propose a scene from a recorded force. Raises CommandError (USAGE) for a bad file, or a force that does not
-    change."""
+    """Propose a scene's tables for a recorded force: its range, rounded outwards, a tolerance, a steady handle.
+
+    Raises CommandError (USAGE) for a bad file, or a force that does not change.
+    """
     with as_usage_error(ConfigError, hint="a CSV with the columns t_s,force_N"):
         time_s, force_N = recorded(force_file)
     least_N, most_N = _rounded(float(force_N.min()), math.floor), _rounded(float(force_N.max()), math.ceil)
@@ -110,7 +112,10 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
 
 
 def _from_answers(name: str) -> Tables:
-    """Ask a person for each value of a scene. Raises CommandError (USAGE) where stdin is no terminal, or ends."""
+    """Ask a person for each value of a scene, each with a proposal, and return its tables.
+
+    Raises CommandError (USAGE) where stdin is no terminal, or ends.
+    """
     if not is_terminal(sys.stdin):
         raise usage_error("there is nobody to ask", "give a recorded force: --force FORCE.csv, columns t_s,force_N")
     print("A scene states one task; Enter takes what stands in brackets.", file=sys.stderr)

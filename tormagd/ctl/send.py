@@ -34,12 +34,14 @@ def send(
     preview_ms: float,
     is_blind: bool,
 ) -> Outcome:
-    """Publish a shape or a CSV file for `duration_s` or until interrupted, and report what became of it.
+    """Publish `what`, a shape or a CSV file, at `rate_hz`, and report what became of it.
 
-    `duration_s` None means the file's length, or ten seconds for a shape. With `is_blind` the daemon is not asked.
-    Raises CommandError: USAGE for what cannot be sent; UNREACHABLE where no daemon answers or subscribes within
-    `wait_s`, or it goes meanwhile; FAULT as soon as the device is in FAULT; REFUSED where the scene does not allow the
-    forces (nothing is sent), or they were not rendered.
+    It ends after `duration_s` or an interrupt; None means the file's length, or ten seconds for a shape. Each setpoint
+    carries those of the next `preview_ms`. With `is_blind` the daemon is not asked.
+
+    Raises CommandError (USAGE) for what cannot be sent. UNREACHABLE is a daemon that does not answer or subscribe
+    within `wait_s`, or goes. FAULT comes as soon as the device is in FAULT. REFUSED are forces that the scene does not
+    allow, before any is sent, or that were not rendered.
     """
     with as_usage_error(
         WaveformError,

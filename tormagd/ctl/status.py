@@ -210,7 +210,7 @@ def _way(way: WayReport | None, colour: Colour) -> list[str]:
 
 
 def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:
-    """Return a line for each code, with cause and remedy where they are known."""
+    """Return a line for each code, followed by lines on its cause and remedy where they are known."""
     known = {explained.code: explained for explained in details}
     unknown = Explained("", "", "")
     told = ((code, known.get(code, unknown)) for code in codes)
@@ -229,6 +229,7 @@ def _said(label: str, text: str | int | None, paint: Callable[[str], str]) -> li
 
 
 def _rate(name: str, group: RateReport, colour: Colour) -> str:
+    """Return a line on how a loop keeps its rate: its grade, lateness and counts of late runs."""
     paint = {"warning": colour.yellow, "error": colour.red}.get(group.grade, str)
     lateness = group.lateness_us
     return (
@@ -285,6 +286,7 @@ def _round_trip(known: RoundTripReport | None) -> str:
 
 
 def _quality(link: LinkReport) -> str:
+    """Say what share of frames was unanswered or damaged lately; "not known yet" where either is None."""
     if link.unanswered_share is None or link.damaged_share is None:
         return "not known yet"
     return (
@@ -294,6 +296,7 @@ def _quality(link: LinkReport) -> str:
 
 
 def _clock(known: ClockReport | None) -> str:
+    """Say how the device's clock fits the host's; for None, that a fit takes some seconds."""
     if known is None:
         return "not known yet: a fit takes some seconds"
     return (

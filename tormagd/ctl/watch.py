@@ -146,8 +146,8 @@ class Watch:
     def finish(self, sent: int) -> Fate:
         """Wait up to ARRIVAL_S until the daemon has taken all `sent` setpoints, and return what became of them.
 
-        Raises CommandError: REFUSED where under LEAST_TAKEN of them were taken, the force was held back after it had
-        come, or never came; FAULT where the device is in FAULT.
+        Raises CommandError (REFUSED) where under LEAST_TAKEN of them were taken, the force never came, or was held back
+        later. Raises CommandError (FAULT) where the device is in FAULT.
         """
         until_s = time.monotonic() + ARRIVAL_S
         while True:
