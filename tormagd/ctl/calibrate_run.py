@@ -185,7 +185,8 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
     """Home where needed, enable, and give a `Run`; at the end of the context disable, so that the gap opens.
 
     Disables after an error, too. Raises CommandError as `home` does, and `interrupted_run`; UnreachableError where no
-    ticks of an enabled device come within `wait_s`; ClientError where the daemon refuses to enable.
+    ticks of an enabled device come within `wait_s`. Raises ClientError where the daemon refuses to enable, MessageError
+    for ticks that cannot be read.
     """
     context = zmq.Context()
     try:
@@ -213,7 +214,10 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
 
 
 def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
-    """Receive ticks until a whole batch is ENABLED. Raises UnreachableError where none is within `wait_s`."""
+    """Receive ticks until a whole batch is ENABLED.
+
+    Raises UnreachableError where none is within `wait_s`, MessageError for a message that is no batch.
+    """
     # the newest tick from before `enable` took effect must not be read as a fall out of ENABLED
     until_s = time.monotonic() + wait_s
     while time.monotonic() < until_s and ticks.poll(round(wait_s * 1e3)):

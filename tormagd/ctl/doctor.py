@@ -265,7 +265,7 @@ def preemption(config: Config, machine: Machine) -> Finding:
 
 
 def governor(config: Config, machine: Machine) -> Finding:
-    """Judge whether processors slow down between ticks: every scaling governor has to be performance."""
+    """Judge whether processors slow down between ticks: WARN unless every scaling governor, if any, is performance."""
     files = machine.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governors = {text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))}
     return _finding(
@@ -319,7 +319,8 @@ def cores(config: Config, machine: Machine) -> Finding:
 
 
 def load(config: Config, machine: Machine) -> Finding:
-    """Judge whether other programs want the processors: the one-minute load average."""
+    """Judge whether other programs want the processors: WARN for a one-minute load over 0.8 a processor, or an unknown
+    one."""
     fields = (machine.text("/proc/loadavg") or "").split()
     if not fields:
         return Finding("load", Verdict.WARN, "not known", "mount /proc")

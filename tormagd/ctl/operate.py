@@ -107,7 +107,10 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
 
 
 def take(client: Client, source: str) -> Outcome:
-    """Give the brake to `source`, whoever holds it. Raises CommandError (REFUSED) where another holds it then."""
+    """Give the brake to `source`, whoever holds it.
+
+    Raises as `Client.request`, and CommandError (REFUSED) where the answer names another holder.
+    """
     result = client.request("take", source=source)
     if result.get("source") != source:
         raise _not_done(f"the daemon answers that {result.get('source')!r} holds the brake, not {source!r}")

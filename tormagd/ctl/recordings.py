@@ -26,8 +26,9 @@ def mark(client: Client, text: str) -> Outcome:
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
     """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy.
 
-    `path` None takes the configured folder to list or prune. The outcome is REFUSED where pruning was not enough, or a
-    copy's seals show a change. Raises CommandError (USAGE) where a path cannot be used.
+    `path` None takes the configured folder to list or prune. The outcome is REFUSED where pruning was not enough, or an
+    exported file was altered, or sealed without the configured key. Raises CommandError (USAGE) where a path cannot be
+    used.
     """
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):

@@ -26,8 +26,8 @@ def replay(
 ) -> Outcome:
     """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulator.
 
-    The outcome is REFUSED where the replay is not bit-exact, or the file was altered. Raises CommandError (USAGE) where
-    file or options cannot be used, or it takes over LONGEST_S.
+    The outcome is REFUSED where the replay is not bit-exact, or the file was altered, or sealed without the configured
+    key. Raises CommandError (USAGE) where file or options cannot be used, or it takes over LONGEST_S.
     """
     arguments = [
         f"--from={from_s!r}",

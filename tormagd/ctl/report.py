@@ -12,9 +12,10 @@ from tormagd.recording.seal import verified
 
 
 def report(config: Config, sources: list[Path], target: Path) -> Outcome:
-    """Write an HTML page on one or two recordings to `target`; the outcome is REFUSED where the seals show a change.
+    """Write an HTML page on one or two recordings to `target`.
 
-    Raises CommandError (USAGE): more than two, one that cannot be read, or a page that cannot be written.
+    The outcome is REFUSED where one was altered, or sealed without the configured key. Raises CommandError (USAGE):
+    more than two, one that cannot be read, or a page that cannot be written.
     """
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"

@@ -47,9 +47,9 @@ Served = tuple[Tried, Share]
 
 
 def _most_wanted(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
-    """Return the most exact way that takes at most `share`, or for None the cheapest within `tolerance_N`.
+    """Return the most exact of `ways` that takes at most `share`, or for None the cheapest within `tolerance_N`.
 
-    Raises CommandError (REFUSED) where no way does.
+    Raises CommandError (REFUSED) where no way does, ValueError where there is none at all.
     """
 
     def price(way: Served) -> float:

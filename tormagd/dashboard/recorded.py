@@ -192,7 +192,8 @@ def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
 
 
 def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
-    """Return the limits present from `from_s` to `at_s`, the largest share first."""
+    """Return the limits present from `from_s` to `at_s`, the largest share first; those in `now` are marked as
+    present."""
     held_s: defaultdict[str, float] = defaultdict(float)
     steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
     for place in shown.within(from_s, at_s):

@@ -225,8 +225,10 @@ class _Reading:
             self._compare(topic, sent)
 
     def _part(self, sent: Sent) -> None:
-        """Keep a part's entries, and derive the messages that must follow; note in `odd` a part that derives none.
-        Raises ValueError beyond a bound."""
+        """Keep a part's entries, and derive the messages that must follow; note in `odd` an entry that derives none.
+
+        Raises ValueError beyond a bound, or msgspec.MsgspecError for a part that does not decode.
+        """
         self._size, self._parts = self._size + len(sent.data), self._parts + 1
         if self._size > MAX_BYTES or self._parts > MAX_PARTS:
             raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")

@@ -184,7 +184,7 @@ def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults:
 
 
 def _name_spans(axes: Axes, name: str, spans: list[tuple[float, float]], row: int) -> None:
-    """Write the state's name into its longest span."""
+    """Write the state's name into its longest span, in the lane `row`; what does not fit is clipped."""
     start, end = max(spans, key=lambda span: span[1] - span[0])
     axes.annotate(
         name,

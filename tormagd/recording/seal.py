@@ -196,7 +196,10 @@ class _Check:
             self._summary_at = record.at + len(raw)
 
     def _begin(self, record: Record) -> None:
-        """Begin the hash with all bytes so far, where this metadata record says that the file is sealed."""
+        """Begin the hash with all bytes so far, where this metadata record says that the file is sealed.
+
+        Keeps by what, and what it follows; a kind of seal that tormagd does not write is noted.
+        """
         known = record.read(Metadata)
         if known.name == SEALED:
             self._by, self._follows = known.metadata.get("by", "?"), known.metadata.get("follows", "")

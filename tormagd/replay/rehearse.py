@@ -163,7 +163,10 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
 
 
 def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
-    """Give the script's commands and setpoints at their times; a refused command is given again for PATIENCE_S."""
+    """Give the script's commands and setpoints at their times, and return what was met.
+
+    A refused command is given again for PATIENCE_S. Limits count while ENABLED or PAUSED.
+    """
     happened = Happened({}, {}, [])
     setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))
     newest: TimedSetpoint | None = None

@@ -127,7 +127,7 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
     """Run `core` over the entries, up to the first difference, and return what came of it.
 
     Begins at the newest snapshot not after `from_s`, else at the first. Raises ReplayError: `from_s` outside the file,
-    no snapshot with a tick after it, or values that the core does not take.
+    a malformed tick, no snapshot with a tick after it, or values that the core does not take.
     """
     records = ticks_of(columns, entries)
     places = list(records)
