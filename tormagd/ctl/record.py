@@ -63,8 +63,10 @@ class Recorder:
             writer.rotate(path)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Write a snapshot; one with a new mark renames the segment (and maybe the one before) so that it is kept.
-        Raises OSError."""
+        """Write a snapshot. Raises OSError.
+
+        In a folder, a new mark renames the segment, and a recent one before, so that pruning keeps them.
+        """
         before = self.writer.mark
         self.writer.telemetry(message)
         new = None if self.writer.mark == before else self.writer.mark

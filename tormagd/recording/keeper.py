@@ -22,7 +22,7 @@ from tormagd.output import write_line
 
 KEPT_S = 30.0
 MOST_BYTES = 48_000_000
-"""The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB; at higher
+"""The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB. At higher
 rates or with previews the ring reaches less far back."""
 MOST_FILES = 20
 "The oldest file is deleted when there are more."
