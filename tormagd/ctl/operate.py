@@ -84,8 +84,8 @@ def operate(client: Client, command: str) -> Outcome:
 def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
     """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open.
 
-    Raises as `operate`. Raises CommandError: FAULT where the gap cannot open, or `disable` meets any fault; REFUSED
-    where the gap is not known to be open within `timeout_s`.
+    `stop` without a device gives an outcome of REFUSED at once. Raises as `operate`. Raises CommandError: FAULT where
+    the gap cannot open, or `disable` meets any fault; REFUSED where the gap is not known to be open within `timeout_s`.
     """
     begun = operate(client, command)
     if begun.exit_code is not Exit.DONE or not is_waiting:

@@ -73,7 +73,10 @@ def _most_wanted(ways: list[Served], share: float | None, tolerance_N: float) ->
 
 
 def _write(name: str, way: Way, out: Path) -> None:
-    """Write the scene with these rates and this search; paths in it stay valid. Raises CommandError (USAGE)."""
+    """Write the scene with these rates and this search to the new file `out`; relative paths in it are adapted.
+
+    Raises CommandError (USAGE) where `out` exists or cannot be made.
+    """
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
     tables = {key: value for key, value in tables.items() if value is not None}

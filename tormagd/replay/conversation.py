@@ -131,15 +131,19 @@ class Conversation:
             self._wire = wire
 
     def compare_memory(self, recorded: Any) -> Found | None:
-        """Return where the connection's memory differs from the recorded one; None where it does not, or none is
-        open."""
+        """Return where the connection's memory differs from the recorded one.
+
+        None where it does not differ, or no port was open.
+        """
         if self._wire is None:
             return None
         return differing("state.connection", recorded, self._wire.connection.memory(), self.frame)
 
     def compare(self, recorded: Measurement | None) -> Found | None:
-        """Return where the connection's measurement differs from the recorded step's; None where it does not, or none
-        is open."""
+        """Return where the connection's measurement differs from the one that the recorded step was given.
+
+        None where it does not differ, or no port was open.
+        """
         if self._wire is None:
             return None
         return differing("measurement", plain(recorded), plain(self._wire.connection.measurement), self.frame)
