@@ -135,12 +135,7 @@ class Run:
             batch = decode_ticks(data)
             state, *places = [batch.columns.index(name) for name in ("operating_state", *self._columns)]
         except (MessageError, ValueError) as error:
-            raise CommandError(
-                Exit.UNREACHABLE,
-                "unintelligible",
-                f"the ticks at {self._endpoints.recording} are not this version's: {error}",
-                "check the endpoint, and that tormagd and tormagctl are of the same version",
-            ) from error
+            raise _other_version(self._endpoints.recording, error) from error
         self._heard_s = time.monotonic()
         for row in batch.rows:
             self._require_enabled(row[state])
@@ -184,9 +179,9 @@ def reach(client: Client, scene_most_N: float) -> Range:
 def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: float) -> Iterator[Run]:
     """Home where needed, enable, and give a `Run`; at the end of the context disable, so that the gap opens.
 
-    Disables after an error, too. Raises CommandError as `home` does, and `interrupted_run`; UnreachableError where no
-    ticks of an enabled device come within `wait_s`. Raises ClientError where the daemon refuses to enable, MessageError
-    for ticks that cannot be read.
+    Disables after an error, too. Raises CommandError as `home` does, for ticks of another version, and
+    `interrupted_run`; UnreachableError where no ticks of an enabled device come within `wait_s`. Raises ClientError
+    where the daemon refuses to enable.
     """
     context = zmq.Context()
     try:
@@ -216,16 +211,29 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
 def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
     """Receive ticks until a whole batch is ENABLED.
 
-    Raises UnreachableError where none is within `wait_s`, MessageError for a message that is no batch.
+    Raises UnreachableError where none is within `wait_s`, CommandError for a message of another version.
     """
     # the newest tick from before `enable` took effect must not be read as a fall out of ENABLED
     until_s = time.monotonic() + wait_s
     while time.monotonic() < until_s and ticks.poll(round(wait_s * 1e3)):
-        batch = decode_ticks(ticks.recv_multipart()[-1])
+        try:
+            batch = decode_ticks(ticks.recv_multipart()[-1])
+        except MessageError as error:
+            raise _other_version(address, error) from error
         states = [dict(zip(batch.columns, row, strict=True)).get("operating_state") for row in batch.rows]
         if set(states) == {"ENABLED"}:
             return
     raise unreachable(address, f"no control ticks of an enabled device within {wait_s:g} s")
+
+
+def _other_version(address: str, error: ValueError) -> CommandError:
+    """Return the refusal of ticks that cannot be read."""
+    return CommandError(
+        Exit.UNREACHABLE,
+        "unintelligible",
+        f"the ticks at {address} are not this version's: {error}",
+        "check the endpoint, and that tormagd and tormagctl are of the same version",
+    )
 
 
 def _enable(client: Client) -> None:

@@ -73,7 +73,7 @@ class BlackBox:
     """
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int, key: str = "") -> None:
-        self._folder = folder
+        self._folder, self._key = folder, key
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: Beside | None = None
         if folder is None:
@@ -112,7 +112,7 @@ class BlackBox:
             return
         self.journal.take()
         self._packer.take()
-        self._send(Begin(str(self._folder), header))
+        self._send(Begin(str(self._folder), header, self._key))
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
