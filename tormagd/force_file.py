@@ -67,7 +67,11 @@ def read_table(path: Path, allowed: Allowed, optional: tuple[str, ...] = ()) -> 
 
 
 def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> list[str]:
-    """Return `columns`. Raises ForceFileError for one that is missing, unknown or there twice."""
+    """Return `columns`, the names in the first row of the file at `path`.
+
+    `known` names all allowed columns; those of them that are in `optional` may be missing. Raises ForceFileError for
+    another column that is missing, for an unknown one, and for one that is there twice.
+    """
     required = [name for name in known if name not in optional]
     also = f" and optionally {','.join(optional)}" if optional else ""
     allowed = f"allowed is {','.join(required)}{also}"
@@ -85,10 +89,11 @@ def _check_header(path: Path, columns: list[str], known: list[str], optional: tu
 def _check_row(
     path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]", allowed: Allowed
 ) -> list[float]:
-    """Return a row's numbers in the order of `columns`.
+    """Return the numbers of the row `cells` in the order of `columns`.
 
-    Raises ForceFileError for another number of cells, one that is not allowed, or a time not above `before_s`, which is
-    empty in the first row.
+    `line` is the row's number in the file, `allowed` bounds each column. `before_s` holds the time of the row before;
+    it is empty in the first row. Raises ForceFileError, naming `path` and `line`, for another number of cells, a cell
+    out of bounds, and a time that does not rise.
     """
     if len(cells) != len(columns):
         raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
@@ -102,8 +107,11 @@ def _check_row(
 
 
 def _number(path: Path, line: int, name: str, text: str, least: float, most: float, unit: str) -> float:
-    """Return `text` as a finite number from `least` to `most`. Raises ForceFileError, also for digits with
-    underscores."""
+    """Return `text` as a finite number from `least` to `most`.
+
+    Raises ForceFileError for any other text, also for digits with underscores. Its message names the file at `path`,
+    the row `line`, the column `name` and the `unit`.
+    """
     try:
         value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else
     except ValueError:
