@@ -355,17 +355,21 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
     """Return `state` after the device said whether it is homed: a device that is not homed ends `needs_homing`.
 
-    It has begun to home or was reset, so that its next HOMED is of a new origin.
+    Such a device has begun to home or was reset, so that its next HOMED is of a new origin.
     """
     return state if is_homed or not state.needs_homing else state.replaced(needs_homing=False)
 
 
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
-    """Return the state after an operator's command, with a request to the device where the table has one.
+    """Return the state after the operator's command `name` at the host's time `now_s`; `state` itself stays as it was.
 
-    `stop` latches the fault STOPPED. `clear-fault` drops all faults, and asks the device for CLEAR only if it has
-    latched one; the device may still report that fault for CLEARING_S. Raises RefusedError for an unknown command, for
-    a device that is not connected, for a command that the table refuses, and for the first guard that does not hold.
+    The new state may hold a new request to the device. `stop` latches the fault STOPPED, is never refused and needs no
+    device. `clear-fault` drops all faults, and asks for CLEAR only a device that has latched one. That device may go on
+    reporting its fault for CLEARING_S; `enable` ends this time.
+
+    Raises RefusedError for an unknown command, for one that the table refuses in this state, and for the first guard
+    that does not hold. Where the table refuses, a device that is not connected is told instead of the table's reason.
+    `use-scene` in DISABLED is taken without a device.
     """
     if name not in COMMANDS:
         raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
@@ -392,7 +396,10 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 
 
 def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
-    """Raise RefusedError where `guard` does not hold."""
+    """Raise RefusedError where `guard` does not hold in `state` under `conditions`; else do nothing.
+
+    For a device that is not connected, the remedy of `conditions`, if any, replaces the guard's.
+    """
     message = guard.refuses(state, conditions)
     if message:
         is_told_better = guard is CONNECTED and conditions.remedy
@@ -402,8 +409,8 @@ def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
     """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED.
 
-    `home` is among them where the device is not `is_homed`, or a latched fault took the positions away. The daemon
-    takes them once the causes of the faults have gone.
+    `home` is among them where the device is not `is_homed`, or a latched fault took the positions away. The commands
+    are taken only once the causes of the faults have gone.
     """
     if state.operating_state is ENABLED:
         return ()
@@ -432,9 +439,9 @@ def reason(name: str, source: OperatingState) -> str:
 
 
 def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -> SafetyState:
-    """Return `state` in the operating state `target`, with a new `request` unless it is NONE.
+    """Return `state` in the operating state `target`, with a new `request` to the device unless `request` is NONE.
 
-    Nothing else changes the operating state.
+    Every change of the operating state is made here.
     """
     after = state.replaced(operating_state=target)
     return after if request is DeviceRequest.NONE else after.ask(request)
