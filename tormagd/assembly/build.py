@@ -94,11 +94,11 @@ class Core(NamedTuple):
 
 
 def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
-    """Build the core for `config.scene`; reads the scene's file and its model's.
+    """Build the core for `config.scene` from the scene's file and the file of the scene's model.
 
-    `scene` replaces the scene in the file; None reads the file. `models` is the folder of the scene's model; None takes
-    the folder of the scene's file. With `models` given the scene's signal is not checked: it was before. Raises
-    ConfigError where scene, model and configuration do not fit each other, or a file is refused.
+    `scene` replaces the scene in the file; None reads the file. `models` is the folder of the scene's model. None takes
+    the folder of the scene's file, and also checks the scene's signal against the gap's speed. Raises ConfigError where
+    scene, model and configuration do not fit each other, or a file is refused.
     """
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
@@ -291,8 +291,8 @@ def _slowed(config: Config, scene: Scene) -> Config:
 def approaches_s(core: Core) -> list[tuple[float, float]]:
     """Return forces at which a brake may wait, N, each with the time of its gap to the middle of the scene's forces, s.
 
-    First the force at which the scene lets it wait; then a third, two thirds and all of STANDBY_N above the least.
-    Empty for a pad.
+    The first is the force at which the scene lets the brake wait. A third, two thirds and all of STANDBY_N above the
+    least follow. Empty for a pad.
     """
     if core.scene.element == "tactile":
         return []
@@ -333,10 +333,10 @@ def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
 
 
 def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
-    """Return what ideal carriages at the gap's speed miss of the scene's signal; None where it states no signal.
+    """Return what ideal carriages at the gap's speed miss of the scene's signal; None where the scene states no signal.
 
-    The signal's file is read from the folder `beside`. Raises ConfigError where the RMS error is over the scene's
-    `tolerance_rms_N`.
+    The signal's file is read from the folder `beside`. Raises ConfigError for a file that is refused, and where the RMS
+    error is over the scene's `tolerance_rms_N`.
     """
     if scene.signal is None:
         return None
@@ -362,8 +362,8 @@ def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path
 def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
     """Raise ConfigError where an opening gap could release the force faster than the scene allows.
 
-    Taken is the weakest believable device, the greatest force that the ceiling lets it make, and the faster of the
-    device's own opening and the gap's speed.
+    Three things are taken at their worst: the weakest believable device, the greatest force that the ceiling lets it
+    make, and the speed. The speed is that of the device's own opening or the gap's, whichever is greater.
     """
     # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
     # ceiling lets no gap make more than CEILING times the scene's greatest

@@ -10,9 +10,9 @@ from tormagd.safety.operating_state import Conditions, DeviceRequest
 
 
 def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool:
-    """Tell whether the carriages' positions are known: the device says so, and a step has taken them.
+    """Tell whether the carriages' positions are known: the device says that it is homed, and a step has taken them.
 
-    `measurement` and `measured` are None where there is none; then they are not known.
+    False without a `measurement` of the device (None), and before the first step `measured` one (None).
     """
     return measurement is not None and measured is not None and measured.is_homed
 
@@ -41,7 +41,12 @@ def conditions(
     *,
     sensor_doubted: bool,
 ) -> Conditions:
-    """Return the conditions at `now_s`. `output` is the newest step's, None before the first."""
+    """Return the conditions at `now_s` on which operators' commands are taken.
+
+    `output` is the newest step's, None before the first. `sensor_doubted` tells whether the plans doubt the force
+    sensor. Skew and the greatest values that a command may find are not among them: `Watch.command_conditions` adds
+    these.
+    """
     measurement = connection.measurement
     old = "" if measurement is None else _old(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
     return Conditions(
@@ -61,7 +66,7 @@ def conditions(
 def _old(now_s: float, measurement: Measurement, timeout_s: float) -> str:
     """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has.
 
-    State is late after `timeout_s`, Sense and Status after the times of their faults.
+    A State is late after `timeout_s`, a Sense and a Status after the times of their faults.
     """
     for name, came_s, longest_s in (
         ("State", measurement.received_s, timeout_s),

@@ -63,7 +63,11 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
-    """Return the profile that keeps `learned` of a device. `model` is the model's fingerprint."""
+    """Return the profile that keeps `learned` of the device `serial_number` with the insert `insert`.
+
+    `model` is the model's fingerprint, SHA-256 in hexadecimal. `saved_ns` is the time of saving, CLOCK_REALTIME. A
+    scale less certain than an unseen device's is kept as certain as that.
+    """
     return Profile(
         v=VERSION,
         serial_number=serial_number,
@@ -81,10 +85,11 @@ def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str,
 
 
 def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: DeviceBounds) -> Profile:
-    """Return the profile in a file's bytes.
+    """Return the profile in `data`, the bytes of a profile's file.
 
-    Raises ProfileError for data over MAX_BYTES, for data that are no profile, for a profile of another device, insert
-    or model, and for values beyond the `bounds` of a device.
+    `serial_number`, `insert` and `model` are those in use; `model` is the model's fingerprint, SHA-256 in hexadecimal.
+    Raises ProfileError for data over MAX_BYTES, for data that are no profile, and for a profile of another device,
+    insert or model. Values beyond the `bounds` of a device raise ProfileError, too.
     """
     if len(data) > MAX_BYTES:
         raise ProfileError(f"{len(data)} bytes: allowed is {MAX_BYTES}")
