@@ -30,7 +30,7 @@ class Contact:
         self.slides: Final = slides
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, that the force is planned for.
+        """Return the displacement, mm, and the rate, mm/s, that the force is planned for; each contact gives its own.
 
         `setpoint` is None without a publisher, `measured` before a measurement.
         """
@@ -56,11 +56,12 @@ class Sliding(Contact):
         super().__init__(MOBILISED_MM, ROLLER_RATE_MM_S, slides=True)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, that the force is planned for, as `Contact.planned`.
+        """Return the displacement, mm, and the rate, mm/s, that the force is planned for.
 
-        The displacement is the setpoint's, or MOBILISED_MM where it states none. Until friction is measured to be
-        mobilised (`is_known`), the rate is the one that the setpoint states, without its sign. Otherwise the rate is
-        the measured `sliding_mm_s`, or MOVING_MM_S before a measurement. A rate below CREEP_MM_S becomes CREEP_MM_S.
+        `setpoint` is None without a publisher, `measured` before a measurement. The displacement is the setpoint's, or
+        MOBILISED_MM where it states none. Until friction is measured to be mobilised (`is_known`), the rate is the one
+        that the setpoint states, without its sign. Otherwise the rate is the measured `sliding_mm_s`, or MOVING_MM_S
+        before a measurement. A rate below CREEP_MM_S becomes CREEP_MM_S.
         """
         displacement_mm = MOBILISED_MM
         rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
@@ -77,8 +78,10 @@ class Sliding(Contact):
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether friction is mobilised: the handle went MOBILISED_MM one way, and is at most GONE_BACK_MM from
-        its furthest place."""
+        """Tell whether friction is mobilised.
+
+        The handle then has gone MOBILISED_MM one way, and is at most GONE_BACK_MM from its furthest place.
+        """
         handle = measured.handle
         gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
         return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
@@ -92,10 +95,10 @@ class Pressing(Contact):
         super().__init__(depth_mm, 0.0, slides=False)
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the depth, mm, and the rate, mm/s, that the force is planned for, as `Contact.planned`.
+        """Return the depth, mm, and the rate, mm/s, that the force is planned for.
 
-        A depth or rate that the setpoint states is taken. The others are measured once the finger `is_known`. Before,
-        they are the scene's depth and 0.
+        `setpoint` is None without a publisher, `measured` before a measurement. A depth or rate that the setpoint
+        states is taken. The others are measured once the finger `is_known`. Before, they are the scene's depth and 0.
         """
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):

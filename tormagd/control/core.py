@@ -80,7 +80,10 @@ class Planner:
         return plan
 
     def _held_N(self, measured: Measured | None, device: DeviceFit) -> float:
-        """The force of the measured gap; of the open one where it is not known."""
+        """Return the force of `device`, N, at the gap where it is: `measured`, or open where that is None or not homed.
+
+        The portrait's gap for a force is corrected by as much as the newest plan's gap is beside it.
+        """
         portrait, planned = self._portrait, self.planned
         if measured is None or not measured.is_homed:
             return device.force_N(portrait.min_N)
@@ -222,7 +225,7 @@ class Stepper:
         """Latch the faults that show, and return `measured`.
 
         While the device is not driven, its homing and opening are watched too. A device that has lost its position
-        counts as not homed, until it begins to home or is reset.
+        counts as not homed in the record returned, until it begins to home or is reset.
         """
         measure = self.measure
         shown = self.watch.faults(

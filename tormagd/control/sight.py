@@ -47,7 +47,7 @@ class Sight:
     def is_waiting(self, now_s: float) -> bool:
         """Tell whether the answer to the first Drive after a stall may still be on its way.
 
-        The loop is then blind, and the stall ended less than twice its time to blindness ago.
+        This is so while the loop is blind, within twice its time to blindness after the stall's end.
         """
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 

@@ -169,7 +169,11 @@ class Aim:
         limits: tuple[Limit, ...],
         outside: tuple[Outside, ...],
     ) -> Plan:
-        """Return the record of the plan to `gap_mm`, with the gap's motion ahead."""
+        """Return the record of the plan to `gap_mm` at `now_s`, with the gap's motion ahead on the path of `ask`.
+
+        `setpoint` is the one behind `ask`, None without a publisher. `min_mm` is the least gap that is safe, `field_mT`
+        the field looked for, with the search's `confidence`.
+        """
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
@@ -202,8 +206,10 @@ class Aim:
         is_held: bool,
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
-        """Return what holds the force back, in the order in which it does. `is_held`: the ceiling holds the gap.
+        """Return what holds the force back, in the order in which it does.
 
+        The limits of `ask` and of the belief (`believed`) come first. MODEL_RANGE is added where a quantity is
+        `outside` the model, CEILING where `is_held`, and LOW_CONFIDENCE, F_MIN and F_MAX by the search's `solution`.
         F_MIN is told only while a publisher asks for a force.
         """
         limits = (*ask.limits, *believed)

@@ -77,10 +77,11 @@ class PortraitSearch:
         self._field: Final = field
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`, as `FieldSolver.solve` does; `last_field_mT` is checked, and has no effect.
+        """Return the field for `force_N`, as `FieldSolver.solve` does.
 
-        A force in reach has confidence 1. For one out of reach the field is that of the nearer end, with the confidence
-        that `curve` gives there. Raises DomainError for a number that is not finite.
+        `last_field_mT`, None without one, is only checked. A force in reach has confidence 1. For one out of reach the
+        field is that of the nearer end, with the confidence that `curve` gives there. Raises DomainError for a number
+        that is not finite.
         """
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait

@@ -129,9 +129,10 @@ class Forecast:
 
     @property
     def trust(self) -> float:
-        """How far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast.
+        """Return how far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast.
 
-        It is the skill score of LONG_S, times 1 less what the score of SHORT_S is below 0, each held within 0..1.
+        The trust is the skill score of LONG_S, times 1 less what the score of SHORT_S is below 0, each held within
+        0..1.
         """
         if not self.changes_N:
             return 0.0
@@ -162,9 +163,9 @@ class Forecast:
     def foresee(self, slope_N_s: float) -> bool:
         """Make a forecast from the newest point of the grid, and return whether one was due.
 
-        One is due after every EVERY points, once the history has MIN_HISTORY points. The forecast is empty where
-        nothing is like the newest stretch. Its guess, and that of the slope `slope_N_s`, are noted to be judged by what
-        comes.
+        A forecast is due after every EVERY points, once the history has MIN_HISTORY points. It is empty where the
+        history has no stretch like the newest. Its guess, and that of the slope `slope_N_s`, are noted; `update` judges
+        them by what comes.
         """
         if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
             return False

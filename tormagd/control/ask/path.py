@@ -65,7 +65,7 @@ class Path:
         force to send. The gap follows its carriages with the time constant SPEEDING_UP_S + `lag_s`, and the forces (7)
         are those of the gap. `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`.
 
-        Without `most_N` the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7)
+        With `most_N` None the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7)
         opens the path where it would give more than that. Then `wanted_N` has to be of so much later already.
         """
         portrait = self._portrait
@@ -119,9 +119,11 @@ def nearest_path_mm(
 
 
 def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
-    """Return for each point the gap (n) from which it and all later points are missed least.
+    """Return for each of n points the gap, mm, from which this point and all later ones are missed least.
 
-    The gap that the path comes from is not regarded.
+    What counts are the squares of the distances from `wanted_mm` (n), times `weights` (n) > 0. From point to point, at
+    the rising `times_s` (n), the gap moves at `speed_mm_s` at most. Where the gap was before the point is left out: the
+    caller limits the way from there. The arguments stay as they are.
     """
     best_mm = wanted_mm[:]
     # the least cost of what comes is convex in the gap, with a piecewise linear derivative: one point further back in

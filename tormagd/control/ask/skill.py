@@ -31,7 +31,7 @@ class Skill(Value):
 
     @property
     def score(self) -> float:
-        """The skill score: `gained` over `apart`.
+        """Return the skill score: `gained` over `apart`.
 
         The mixture with the share (1 + score) / 2 of the first guess would have had the least squared error.
         """

@@ -121,9 +121,11 @@ class Believe:
 
     @property
     def device(self) -> DeviceFit:
-        """The fit of the device's force to the model's without memory, at speed, with the element as relaxed as now.
+        """Return the fit of the device's force to the model's without memory, at speed, with the element as relaxed as
+        now.
 
-        In a dispute of device and sensor it is the explanation with more force: the fit, scaled up by `sensor.lead_N`.
+        In a dispute of device and sensor the fit is scaled up by `sensor.lead_N`: the explanation with more force
+        counts.
         """
         fit, lead_N = self.strength.fit, self.sensor.lead_N
         if lead_N > 0.0:
@@ -184,8 +186,9 @@ class Believe:
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan.
 
-        `foresight`, 0..1, is the plan's. Below MIN_FORESIGHT, or without a homed device, nothing is learned and the
-        expected gap starts again. Where nothing is to be learned, or without the term `motor`, nothing happens.
+        `foresight`, 0..1, is the plan's. Below MIN_FORESIGHT, or without a homed device (`measured` None: a silent
+        one), nothing is learned, and the expected gap starts again. While `learns` is False, or without the term
+        `motor`, nothing happens.
         """
         if not (self.learns and self._has_lag):
             return
@@ -214,9 +217,9 @@ class Believe:
     def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
         """Learn from the newest reading, with the model's force `model_N` at the measured gap.
 
-        It teaches as at speed where friction is mobilised and the handle moves, else as at a creep. The watch on a
-        brake's encoder takes every reading. An old force, and a reading within MIN_DT_S of the last, teach nothing
-        else.
+        Where friction is mobilised and the handle moves, the reading counts as one at speed, else as one at a creep.
+        The watch on a brake's encoder takes every reading. An old force, and a reading within MIN_DT_S of the last,
+        teach nothing else.
         """
         if self._nominal.contact.slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
@@ -237,8 +240,10 @@ class Believe:
             self._hear_at_creep(now_s, measured, model_N, dt_s, is_mobilised)
 
     def _is_stuck(self, measured: Measured, model_N: float) -> bool:
-        """Tell whether the handle has stopped with less than friction, as a hand that meets a wall does within 10
-        ms."""
+        """Tell whether the handle has stopped, with a force that is less than friction by more than STUCK_N.
+
+        A hand that meets a wall stops so, within 10 ms. `model_N` is the model's force now.
+        """
         handle = measured.handle
         if abs(handle.quick_mm_s) >= STOPPING_MM_S:
             return False
@@ -267,9 +272,10 @@ class Believe:
             self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
 
     def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
-        """Take one reading of a handle that slides at speed: zero, judgement of the sensor, fit, limits.
+        """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit.
 
-        In a dispute, or while the zero is unknown, the fit learns nothing.
+        A dispute of device and sensor may begin or end. In a dispute, or while the zero is unknown, the fit learns
+        nothing. Sets `limits`.
         """
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
@@ -313,10 +319,10 @@ class Believe:
         self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
 
     def _fit(self, measured: Measured, model_N: float, reading_N: float, dt_s: float) -> None:
-        """Learn the fit's scale and offset from one reading, unless it may be an old or a wrong one.
+        """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing.
 
-        A fit from another day that the first slide contradicts is forgotten first. Without learning the reading is only
-        compared with the fit.
+        `model_N` is the model's force. A fit from another day that the first slide contradicts is forgotten first.
+        Where the fit does not learn, the readings' mean is only compared with it: a dispute may begin.
         """
         if self._has_creep:
             self.slow.follow(model_N, measured.handle_mm)

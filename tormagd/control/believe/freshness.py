@@ -59,10 +59,11 @@ class Freshness:
 
     @property
     def is_frozen(self) -> bool:
-        """Whether the sensor should have shown another value by now, so that it is broken.
+        """Tell whether the sensor is broken: it should have shown another value by now.
 
-        It should not within FROZEN_S. Later it should once the force has changed by FROZEN_N and two steps. One of
-        resolved noise also should after FROZEN_RUNS mean runs.
+        Within FROZEN_S of the last new value it is not. Later it is once the device's force has changed by FROZEN_N and
+        two of the sensor's steps. A sensor whose noise is resolved also is after FROZEN_RUNS mean times between new
+        values.
         """
         if self.still_s <= FROZEN_S:
             return False

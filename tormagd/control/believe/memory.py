@@ -80,10 +80,10 @@ class ElementMemory:
         return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
 
     def update(self, now_s: float, measured: Measured) -> None:
-        """Follow lag and relaxation to `now_s`, along a straight change to the measured gap.
+        """Follow lag and relaxation to `now_s`, along a straight change to the `measured` gap.
 
-        Not homed, a brake only notes how far its gap has opened, and a pad's gap counts as open. Raises DomainError for
-        a gap outside the field law's range.
+        Where the device is not homed, a brake only notes how far its gap has opened, and a pad's gap counts as open.
+        Raises DomainError for a gap outside the field law's range.
         """
         slides = self._nominal.contact.slides
         is_empty = self.time_s == -math.inf

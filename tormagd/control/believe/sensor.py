@@ -149,9 +149,12 @@ class SensorTrust:
             self._forget(model_N, dt_s)
 
     def compare(self, fit: DeviceFit, model_N: float) -> None:
-        """Begin a dispute where the mean reading has left `fit`, while the fit does not learn.
+        """Begin a dispute where the mean of the last readings has left `fit`, unless the device has slid for under
+        LEARNS_S.
 
-        The model's force is `model_N`. Nothing happens before LEARNS_S of sliding.
+        Call it instead of `fit_moved` for a reading that teaches the fit nothing. `model_N` is the model's force. The
+        mean has left the fit's force when it is off by more than MOVED_N, `slack_N` and SURE standard deviations of the
+        fit together.
         """
         over_N = self.measured_N - fit.force_N(model_N)
         if self.has_slid and abs(over_N) > MOVED_N + self.slack_N + SURE * fit.deviation_N(model_N):
@@ -161,7 +164,7 @@ class SensorTrust:
         """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts the fit, N.
 
         In a dispute that began since the reversal the shift is `found_N` times the handle's `direction`, else 0. The
-        share of RELAXED that is used up returns to 0.
+        used part of RELAXED, `relaxed_N`, returns to 0.
         """
         self.relaxed_N = 0.0
         return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
@@ -169,8 +172,8 @@ class SensorTrust:
     def confirm(self, wrong: Disputed) -> None:
         """Take the operator's word in a dispute.
 
-        `device`: the dispute ends, and none begins before LEARNS_S of sliding. `sensor`: it is wrong until its readings
-        agree for TRUSTED_AGAIN_S.
+        `device`: the dispute ends, and none begins before LEARNS_S of sliding. `sensor`: the sensor counts as wrong
+        until its readings agree for TRUSTED_AGAIN_S.
         """
         if wrong == "device":
             self._settle()

@@ -123,8 +123,8 @@ class SensorZero:
     ) -> bool:
         """Take one reading, and return whether a reversal has told the zero just now.
 
-        A reversal tells it once the handle has slid for LEVEL_S both ways. The handle slides at `rate_mm_s` the way
-        `direction`, 1 or -1. `reading_N` is the force against this motion, the model's force `model_N`. The reading
+        A reversal tells the zero once the handle has slid for LEVEL_S both ways. The handle slides at `rate_mm_s` the
+        way `direction`, 1 or -1. `reading_N` is the force against this motion, the model's force `model_N`. The reading
         stands for `dt_s` > 0. `scale` is the device's force over the model's, known to within `scale_sd`. All arguments
         are finite.
         """
@@ -146,8 +146,8 @@ class SensorZero:
     ) -> bool:
         """Learn the zero from the levels before and after a reversal, and return whether they told it.
 
-        They do not where they lie `between_s` of more than LONGEST_TURN_S apart, or the zero found is beyond
-        MAX_ZERO_N.
+        They do not tell it where `between_s`, the time between them, is over LONGEST_TURN_S, or the zero found is
+        beyond MAX_ZERO_N. `scale` is the device's force over the model's, known to within `scale_sd`.
         """
         by_model_N = level.model_N - before.model_N
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - scale * by_model_N)

@@ -96,7 +96,7 @@ def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
 def believable(fit: DeviceFit, model_N: float, bounds: DeviceBounds) -> tuple[float, float]:
     """Return the least and the greatest k of a device with this `fit`, where the model's force is `model_N`.
 
-    The force of `fit` there must be above 0 N.
+    The force of `fit` at `model_N` must be above 0 N.
     """
     unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
     least, most = factor_bounds(bounds)

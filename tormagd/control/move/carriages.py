@@ -144,8 +144,9 @@ class Carriages(Actuator):
     ) -> tuple[Reference, bool]:
         """Return the reference `dt_s` later, and whether the limit of its acceleration held it back.
 
-        `plan` None: the reference stops. With a plan, `is_over` sends it open, and what holds the gap back is added to
-        `limits`. Counts in `acted`.
+        With `plan` None the reference stops. With a plan, `is_over` (a force over the ceiling) sends it open, and what
+        holds the gap back is added to `limits`. Counts one more tick in `acted.rate` where speed limits the reference,
+        and in `acted.slew` where acceleration does.
         """
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
@@ -165,8 +166,8 @@ class Carriages(Actuator):
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
         """Return the gap's speeds: at no load, and the greatest that the reference may open and close with.
 
-        Where the carriages fall behind, their measured speed takes the place of the motors'. It counts as at least half
-        of the motors', so that a carriage held still is found by its following error.
+        Where the carriages fall behind, their measured speed takes the place of the motors'. This speed counts as at
+        least half of the motors', so that a carriage held still is found by its following error.
         """
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
@@ -208,8 +209,9 @@ class Carriages(Actuator):
     def _drive(self, left: float, right: float, supply_V: float, limits: list[Limit]) -> Drive:
         """Return the duties at the device's real supply, held within the duty limit.
 
-        The same volts take less duty of a higher supply; one under half of the nominal counts as half. Counts duties
-        out of range in `acted`, and adds SATURATED to `limits` where a loop is saturated.
+        `left` and `right` are the loops' duties at the nominal supply; the same volts take less duty of a higher one. A
+        `supply_V` under half of the nominal counts as half. Counts a tick with a duty out of range in `acted.range`,
+        and adds SATURATED to `limits` where a loop is saturated.
         """
         is_saturated = self.left.is_saturated or self.right.is_saturated
         if is_saturated:

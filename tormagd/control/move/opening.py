@@ -93,10 +93,11 @@ class Opening:
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
-        """Take one look at a device that is not driven, and set `faults`: NOT_OPENING or none, told once.
+        """Take one look at a device that is not driven, and set `faults` to NOT_OPENING or to none.
 
-        With `is_placed` the carriages' places are known; with `is_blind` not at present. `safety` gives the newest
-        request. A device that homes is not judged, nor one that had a fault, before another request.
+        With `is_placed` the carriages' places are known, but with `is_blind` not at present. `safety` gives the newest
+        request. After a fault the next look clears `faults`, and the device is not judged before another request. A
+        device that homes is not judged either.
         """
         number = safety.request_number
         if self.faults:
@@ -138,10 +139,11 @@ class Opening:
             self.faults = (Fault.NOT_OPENING,)
 
     def _listen(self, measurement: Measurement, is_asked: bool, is_placed: bool) -> None:
-        """Judge the device by its word, while its places are unknown or the loop is blind.
+        """Judge the device by its word, while its places are unknown or the loop is blind; may set `faults` to
+        NOT_OPENING.
 
-        NOT_OPENING comes after a search's time while it says that it opens. It comes after LATE_S where it was asked to
-        open and does not. A device that shows both open switches, or a failure, is not late.
+        A device that says that it opens is late after a search's time. One that was asked to open (`is_asked`) and does
+        not is late after LATE_S. A device that shows both open switches, or a failure, is not late.
         """
         if not is_placed:
             self._place(measurement)

@@ -47,7 +47,7 @@ class Pid:
             self.integral = self.integral * self._integral_time_s / (self._integral_time_s + dt_s)
 
     def update(self, error_mm: float, error_mm_s: float, feed_forward: float, dt_s: float, is_blocked: bool) -> float:
-        """Return the duty, within the duty limit, `dt_s` > 0 after the last.
+        """Return the duty, within the duty limit, `dt_s` > 0 after the last; update `integral` and `is_saturated`.
 
         `error_mm` is the place error, `error_mm_s` the speed error, `feed_forward` a duty. Where `is_blocked`, opening
         moves nothing: no duty above 0 is given, the integral does not rise, and this is no saturation. Raises

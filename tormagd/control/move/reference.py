@@ -118,9 +118,9 @@ class Expected:
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """Follow `reference` for `dt_s`, with the time constant `lag_s`, and filter the speed as the measured ones are.
+        """Follow `reference` for `dt_s`, with the time constant `lag_s`.
 
-        `filter_s` is the time constant of the measured speeds' filter.
+        Also filters the speed with the time constant `filter_s`, as the measured speeds are.
         """
         self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
         self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)

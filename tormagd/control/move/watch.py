@@ -195,7 +195,7 @@ class Watch:
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
         """Return the faults that the device reports; none while a clearing of its faults may still be under way.
 
-        A timeout after a stall of this host counts as the host's.
+        A command timeout of the device after a stall of this host is the fault HOST_STALL.
         """
         shown: int = measurement.faults
         if not shown or now_s < safety.clearing_until_s:
@@ -261,7 +261,8 @@ class Watch:
         return is_left_still or is_right_still
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        """Count in `opposed_s` for how long a carriage that is driven well moves against its duty.
+        """Count in `opposed_s` for how long a carriage moves against its duty, where this is over
+        `limits.no_motion_duty`.
 
         The count stands while a driven carriage stands, and ends once one moves the right way or none is driven.
         """
