@@ -39,7 +39,8 @@ FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come.
 
-    Exits with 2 for usage or parts that cannot be used; returns 1 where stdout cannot be written.
+    `arguments` None: those of the process. Exits with 2 for usage or parts that cannot be used; returns 1 where stdout
+    cannot be written.
     """
     command = parser()
     options = command.parse_args(arguments)
@@ -141,7 +142,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _rate(least: int, most: int, text: str) -> int:
-    """Return `text` as a whole number. Raises ArgumentTypeError outside `least`..`most`, ValueError for no number."""
+    """Return the command-line word `text` as a whole number.
+
+    Raises ArgumentTypeError outside `least`..`most`, ValueError for no whole number.
+    """
     rate = int(text)
     if not least <= rate <= most:
         raise argparse.ArgumentTypeError(f"{rate}: allowed are {least} to {most}")

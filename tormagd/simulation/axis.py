@@ -74,10 +74,10 @@ class Axis:
         return self._coupling_Nm_A * self.speed_rad_s
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
-        """Advance by one time step, `dt_s`, with the mean voltage `voltage_V` at the motor and the magnets' pull
-        `attraction_N`.
+        """Advance the drive and its carriage by one time step, `dt_s`.
 
-        None for the voltage is an open bridge: no current flows.
+        `voltage_V` is the mean voltage at the motor; None is an open bridge, in which no current flows. `attraction_N`
+        is the magnets' pull.
         """
         # four times a simulated millisecond: hence local names, and `_lead_of` written out in the second half
         coupling_Nm_A = self._coupling_Nm_A

@@ -35,10 +35,11 @@ class BusDoor:
         return (self._fd,)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Take at most FRAMES_AT_ONCE frames from the bus if it is readable, and send what the device has sent by
+        """Take at most FRAMES_AT_ONCE frames from the bus if it is `readable`, and send what the device has sent by
         `now_s`.
 
-        Frames that are no classical data frames are ignored. Raises can.CanError when the bus goes away.
+        Ignored are frames that are no classical data frames of 11 bits, or carry a function that only the device sends.
+        Raises can.CanError when the bus goes away, or does not take a frame at once.
         """
         if readable:
             for _ in range(FRAMES_AT_ONCE):

@@ -81,7 +81,7 @@ class CanDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next: a frame ends or may start, or an event inside the device."""
+        """Return when something happens next, s: a frame ends or may start, or an event inside the device."""
         event_s = self.messages.next_event_s
         if self._flight is not None:
             return min(event_s, self._flight.end_s)

@@ -38,7 +38,11 @@ class CanDoor:
         return (self._listener.fileno(), *self._hosts)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Admit hosts and take their frames; hand every frame that has gone by to all hosts but its sender."""
+        """Admit hosts and take their frames; hand every frame that has gone by until `now_s` to all hosts but its
+        sender.
+
+        A host that has left, or sent what is no frame, is disconnected. One that does not read loses frames.
+        """
         for descriptor in readable:
             if descriptor in self._hosts:
                 self._take(now_s, descriptor)
@@ -70,8 +74,10 @@ class CanDoor:
         self._hosts.pop(descriptor).close()
 
     def _take(self, now_s: float, descriptor: int) -> None:
-        """Hand the device at most FRAMES_AT_ONCE of a host's frames; a host that left or sends no frame is
-        disconnected."""
+        """Hand the device at most FRAMES_AT_ONCE frames of the host at `descriptor`, with the time `now_s`.
+
+        A host that has left, or sent what is no frame, is disconnected.
+        """
         for _ in range(FRAMES_AT_ONCE):
             try:
                 packet = self._hosts[descriptor].recv(SOCKET_FRAME.size + 1)

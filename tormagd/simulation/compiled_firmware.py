@@ -78,8 +78,10 @@ class _View(ctypes.Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    """Load the library once and declare its functions' types. Raises BuildError: not built, or structures laid out
-    otherwise."""
+    """Load the library, once, and declare its functions' types.
+
+    Raises BuildError where the library cannot be built, or its structures are laid out otherwise than ctypes does it.
+    """
     library = load_library()
     pointer, time_s, payload = ctypes.c_void_p, ctypes.c_double, ctypes.c_char_p
     library.tormag_device_init.argtypes = [pointer, pointer]

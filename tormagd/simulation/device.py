@@ -187,7 +187,7 @@ class MessageDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next, at the latest the firmware's next tick."""
+        """Return when something happens next, s from power-on, at the latest the firmware's next tick."""
         event_s = self._tick_due_s
         if self._arrival_s < event_s:
             event_s = self._arrival_s
@@ -236,8 +236,11 @@ class MessageDevice:
             self._send(time_s, status)
 
     def _deliver(self, time_s: float, packet: Packet) -> None:
-        """Give the firmware a packet and queue its answer; faults may drop the packet, and one that is no message is
-        counted."""
+        """Give the firmware a `packet` that arrives at `time_s`, and queue its answer with the device's jitter.
+
+        Faults and a hanging firmware may drop the packet. One that is no message is dropped and counted in
+        `undecodable`.
+        """
         if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
         try:
@@ -260,7 +263,7 @@ class MessageDevice:
             self._answers.append((answer_s, answer))
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
-        """Send Identity, or State and Sense of this moment."""
+        """Send what `answer` stands for into `outbox`: Identity, or State and Sense as they are at `time_s`."""
         if answer is IDENTITY:
             known = self.firmware.identity()
             if "other_schema" in self._struck:
@@ -334,8 +337,10 @@ class MessageDevice:
         )
 
     def _count_on(self, stuck_left: int | None, left_count_sign: int) -> None:
-        """Let the left encoder go on from its present count: stuck at `stuck_left` unless None, else in the given
-        direction."""
+        """Let the left encoder go on from its present count, without a leap.
+
+        It stays at `stuck_left`, or with None counts on: with `left_count_sign` 1 the right way, with -1 backwards.
+        """
         (left_rad, _), (right_rad, _) = self.plant.shafts
         left_counts, _ = self._encoders(left_rad, right_rad)
         self._has_bad_encoders = True
@@ -366,7 +371,7 @@ class MessageDevice:
         self._switch()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
-        """Begin a fault. Raises ValueError for one whose effect is not defined here."""
+        """Begin `fault` at `time_s`. Raises ValueError for a name whose effect is not defined here."""
         if fault.name in STANDING:
             self._struck.add(fault.name)
         match fault.name:
@@ -530,7 +535,8 @@ class VirtualDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next: a frame ends on the line, or an event inside the device."""
+        """Return when something happens next, s from power-on: a frame ends on the line, or an event inside the
+        device."""
         event_s = self.messages.next_event_s
         if self._line:
             start_s, data = self._line[0]

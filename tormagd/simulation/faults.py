@@ -53,7 +53,10 @@ class Fault(NamedTuple):
 
 
 def parse_fault(spec: str) -> Fault:
-    """Read `NAME[=PERCENT%][@SECONDS]`. Raises FaultError that says what is allowed."""
+    """Read the fault that the command-line word `spec` stands for: `NAME[=PERCENT%][@SECONDS]`.
+
+    Raises FaultError that says what is allowed.
+    """
     match = _FORM.fullmatch(spec)
     name = match["name"] if match else spec
     if match is None or name not in KNOWN:

@@ -148,10 +148,10 @@ class Firmware:
     # -- messages ------------------------------------------------------------------------------------------------
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host and return what to answer; messages of a device are ignored.
+        """Act on one message of the host at `time_s` and return what to answer; a message of a device is ignored.
 
         A Hello with another schema or protocol version latches SCHEMA_MISMATCH, which opens the gap. A command with the
-        nonce accepted last is ignored.
+        nonce accepted last is ignored. NONE is no answer.
         """
         if isinstance(message, Drive):
             return self._drive(time_s, message, sensors)
@@ -192,10 +192,10 @@ class Firmware:
         return MEASUREMENT
 
     def _obey(self, time_s: float, command: Retract | Home | Clear, sensors: Sensors) -> bool:
-        """Carry out the command unless the mode forbids it, and return whether it was accepted.
+        """Carry out `command` unless the mode forbids it, and return whether it was accepted.
 
-        Only an accepted command is acknowledged in Status. Retract is refused in LATCHED, Home outside IDLE. Clear is
-        refused while motors are on, a cause is still there or the schema does not match.
+        Status acknowledges only an accepted command. Retract is refused in LATCHED, Home outside IDLE. Clear is refused
+        while motors are on, a lasting cause is still there, or the schema does not match.
         """
         if isinstance(command, Retract):
             if self.mode is LATCHED:
@@ -228,8 +228,10 @@ class Firmware:
     # -- time ----------------------------------------------------------------------------------------------------
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick, motions and watches, which may latch faults. Returns a Status every twentieth time, None
-        otherwise."""
+        """Run one 1 kHz tick: the motion under way and the watches, which may latch faults.
+
+        Returns a Status every twentieth time, None otherwise.
+        """
         if self.mode is RUN:
             self._tick_run(time_s, sensors)
         elif self._motors_on:
@@ -289,7 +291,7 @@ class Firmware:
         self._rest(time_s, LATCHED if self.faults else IDLE)
 
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
-        """Watch the resting device; motion by itself opens the gap, and other new causes are latched."""
+        """Watch the resting device: motion by itself opens the gap, and other causes not yet latched are latched."""
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)
             return
@@ -299,7 +301,7 @@ class Firmware:
 
     @staticmethod
     def _bounded(output: Output, sensors: Sensors) -> Output:
-        """Return the output without an opening duty for a carriage at its open switch: it must not run on into the
+        """Return `output` without an opening duty for a carriage at its open switch, which must not run on into the
         stop."""
         if not sensors.switches:
             return output
@@ -380,9 +382,10 @@ class Firmware:
         self._right_calm_s = time_s
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
-        """Return how far a carriage has moved from where it rested; while opening, inward from its most open place.
+        """Return how far a carriage, the further of the two, has moved from where it rested, mm.
 
-        0 within COASTING_S of the last transition. Updates the place that it measures from.
+        While opening only the way back from its most open place counts. 0 within COASTING_S of the last transition.
+        Updates the place that this way is measured from.
         """
         if time_s - self._watch_since_s < COASTING_S:
             return 0.0
@@ -396,6 +399,7 @@ class Firmware:
         return max(abs(left - left_then), abs(right - right_then)) * self._mm_per_count
 
     def _positions_mm(self, sensors: Sensors) -> tuple[float, float]:
+        """Return the left and the right carriage's place, mm, from the zero of its encoder; opening is positive."""
         mm_per_count = self._mm_per_count
         return (
             sensors.left_counts * mm_per_count - self._left_zero_mm,
@@ -403,6 +407,7 @@ class Firmware:
         )
 
     def _carriages(self, sensors: Sensors) -> tuple[Carriage, Carriage]:
+        """Return what the firmware knows of the left and the right carriage: place, open switch, current."""
         left_mm, right_mm = self._positions_mm(sensors)
         return (
             Carriage(left_mm, Switches.LEFT_OPEN in sensors.switches, sensors.left_current_A),

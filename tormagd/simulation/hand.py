@@ -46,6 +46,7 @@ class SteadyHand(Value):
         self.rpm: Final = rpm
 
     def position_mm(self, time_s: float) -> float:
+        """Return the travel of the roller's surface since time 0, mm, at `time_s`."""
         return time_s * self.rpm / 60.0 * math.tau * ROLLER_RADIUS_MM
 
 
@@ -58,6 +59,7 @@ class ReversingHand(Value):
         self.period_s: Final = period_s
 
     def position_mm(self, time_s: float) -> float:
+        """Return the place of the roller's surface at `time_s`, 0 to REVERSING_TRAVEL_MM, mm."""
         phase = math.fmod(time_s, self.period_s) / self.period_s
         half, back = (phase, False) if phase < 0.5 else (phase - 0.5, True)
         share = min(half / 0.35, 1.0)
@@ -76,6 +78,7 @@ class PressingHand(Value):
         self.depth_mm: Final = depth_mm
 
     def position_mm(self, time_s: float) -> float:
+        """Return the finger's depth in the pad at `time_s`, mm."""
         return min(max(PRESSING_MM_S * (time_s - PRESSES_AT_S), 0.0), self.depth_mm)
 
 
@@ -88,6 +91,7 @@ class RecordedHand(Value):
         self.positions_mm: Final = positions_mm
 
     def position_mm(self, time_s: float) -> float:
+        """Return the recorded place at `time_s`, mm, linear between the points; the first or the last beyond them."""
         after = bisect.bisect_right(self.times_s, time_s)
         if after == 0:
             return self.positions_mm[0]
@@ -109,6 +113,7 @@ class StrokingHand(Value):
         self.rest_s: Final = rest_s
 
     def position_mm(self, time_s: float) -> float:
+        """Return the intended place at `time_s`, 0 to `reach_mm`, mm."""
         half_s = self.reach_mm / self.push_mm_s + self.rest_s
         phase_s = math.fmod(max(time_s - PRESSES_AT_S, 0.0), 2.0 * half_s)
         pushed_mm, withdrawn_mm = self.push_mm_s * phase_s, max(self.push_mm_s * (phase_s - half_s), 0.0)
@@ -150,13 +155,13 @@ class FeltHand:
         "Mean force of spring and damper on the mass in the last step."
 
     def position_mm(self, time_s: float) -> float:
-        """Return the intended place at `time_s`; `moved_mm` gives the real one."""
+        """Return the intended place at `time_s`, mm; `moved_mm` gives the real one."""
         return self._intended.position_mm(time_s)
 
     def moved_mm(self, time_s: float, resisting_N: Callable[[float], float]) -> float:
-        """Advance the hand to `time_s` and return its place then, mm; `resisting_N` gives the friction at a mean speed
-        in the step.
+        """Advance the hand to `time_s` and return its place then, mm.
 
+        `resisting_N` gives the friction, N, at a mean speed in the step, mm/s. Updates `speed_mm_s` and `force_N`.
         Raises ValueError for a time not after the last one: a hand that feels has a state, and moves one plant.
         """
         dt_s, speed_mm_s, impedance = time_s - self._time_s, self.speed_mm_s, self._impedance
@@ -251,9 +256,10 @@ _FELT: dict[str, tuple[float, float, float]] = {
 
 
 def parse_hand(spec: str) -> Hand:
-    """Return the hand that a command-line word stands for, reading a recording where the word names one.
+    """Return the hand that the command-line word `spec`, one of KNOWN, stands for.
 
-    Raises HandError that lists what is allowed.
+    A word that ends with .csv names a recording, which is read. Raises HandError for an unknown word or a size out of
+    range, with what is allowed; for a recording, as `read_recording`.
     """
     name, _, value = spec.partition("=")
     if name in _SIZED:
@@ -267,7 +273,10 @@ def parse_hand(spec: str) -> Hand:
 
 
 def _felt(spec: str, text: str) -> FeltHand:
-    """Return the hand of `felt=KEY=VALUE,...`, with usual sizes where none is given. Raises HandError."""
+    """Return the hand of the word `spec`, felt=KEY=VALUE,..., whose part behind `felt=` is `text`.
+
+    A size that is not given takes its default. Raises HandError for an unknown key or a size out of range.
+    """
     sizes = {key: usual for key, (usual, _, _) in _FELT.items()}
     for word in filter(None, text.split(",")):
         key, _, value = word.partition("=")
@@ -280,7 +289,10 @@ def _felt(spec: str, text: str) -> FeltHand:
 
 
 def _number(spec: str, text: str, low: float, high: float) -> float:
-    """Return `text` as a number from `low` to `high`. Raises HandError, also for no number."""
+    """Return `text`, a part of the word `spec`, as a number from `low` to `high`.
+
+    Raises HandError, naming `spec` and the range, for another number or for no number.
+    """
     try:
         number = float(text)
     except ValueError:
@@ -291,7 +303,11 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
 
 
 def read_recording(path: Path) -> RecordedHand:
-    """Read a CSV with the columns t_s and position_mm, within +-1e6 mm. Raises HandError naming file and row."""
+    """Read a hand's motion from the CSV file at `path`: columns t_s, s, and position_mm, mm, within +-1e6.
+
+    The times have to rise from row to row, in two rows at least. Raises HandError for a file that cannot be read, is no
+    such table or is over 16 MB. The message names the file, and the row where one is wrong.
+    """
     try:
         table = read_table(path, RECORDED)
     except ForceFileError as error:

@@ -86,7 +86,12 @@ class Opening:
         self.outcome = Outcome.MOVING
 
     def step(self, time_s: float, dt_s: float, carriage: Carriage, speed_mm_s: float) -> None:
-        """Advance by one tick towards the open end at `speed_mm_s` at most: set `duty` and `outcome`."""
+        """Advance by one tick, `dt_s` long and ending at `time_s`, and set `duty` and `outcome`.
+
+        The carriage is driven towards its open switch at `speed_mm_s` at most. MOVING: it is not there, or has not yet
+        been braked there for SETTLE_S. DONE: it has been, with a duty of 0. FAILED, for good and with a duty of 0: it
+        has come no further for PATIENCE_S, at the current of a stall or at none.
+        """
         if self.outcome is Outcome.FAILED:
             return
         if carriage.at_open_end:
@@ -154,9 +159,11 @@ class Retraction:
         return True in [opening.went_back(each) for opening, each in zip(self._openings, carriages, strict=True)]
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Advance both carriages by one tick and return the outcome.
+        """Advance both carriages by one tick, `dt_s` long and ending at `time_s`, and return the outcome; updates
+        `duties`.
 
-        FAILED when a carriage did not reach its switch and neither moves any more, or when the time limit is over.
+        MOVING while a carriage is on its way, within TIME_LIMIT_S. After that, or when none is on its way: DONE where
+        both are braked at their open switches, else FAILED.
         """
         for opening, carriage in zip(self._openings, carriages, strict=True):
             opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))
@@ -166,8 +173,11 @@ class Retraction:
         return Outcome.DONE if outcomes == [Outcome.DONE, Outcome.DONE] else Outcome.FAILED
 
     def _bounded_mm_s(self, carriage: Carriage) -> float:
-        """Return the speed for this carriage now: lower towards the open end, and beyond it a search, as the zero is
-        wrong there."""
+        """Return the speed, mm/s, at which this carriage is to open now.
+
+        With `tapered` it falls towards the open end. Beyond the open end the zero is wrong: the carriage then searches
+        its switch at a share of the speed.
+        """
         if not self._tapered:
             return self._speed_mm_s
         # beyond where its switch should have been the zero is wrong, as after an encoder's leap: it searches there
@@ -209,10 +219,10 @@ class Homing:
         return left_mm or 0.0, right_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Advance by one tick and return the outcome; set `duties`.
+        """Advance by one tick, `dt_s` long and ending at `time_s`; set `duties` and return the outcome.
 
         FAILED after the time limit, a failed search or a back-off that takes too long. REVERSED once a carriage that
-        went back towards closed has been braked.
+        went back towards closed has been braked. DONE once both switches have been found twice; else MOVING.
         """
         if time_s >= self._deadline_s:
             return Outcome.FAILED
@@ -242,7 +252,12 @@ class Homing:
         self._ramps = [Ramp(carriage.position_mm, self._lead_mm_rev) for carriage in carriages]
 
     def _back_off(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Drive both carriages off their switches; begin the creeping search once both are clear."""
+        """Drive both carriages off their open switches for one tick, `dt_s` long and ending at `time_s`, and set
+        `duties`.
+
+        Once both are BACK_OFF_MM in and off their switches, begins the search that creeps back to them. Returns MOVING,
+        or FAILED once the back-off has lasted over BACK_OFF_LIMIT_S, with the duties as they were.
+        """
         if time_s - self._back_off_since_s > BACK_OFF_LIMIT_S:
             return Outcome.FAILED
         sides = zip(carriages, self._ramps, self._starts_mm, strict=True)
@@ -259,6 +274,7 @@ class Homing:
         return 0.0 if clear else ramp.duty(carriage.position_mm, -self._speed_mm_s, dt_s)
 
     def _outward(self, time_s: float, carriages: tuple[Carriage, Carriage], speed_mm_s: float) -> Retraction:
+        """Return a search for both open switches that begins at `time_s`, at `speed_mm_s` throughout."""
         return Retraction(
             time_s,
             carriages,

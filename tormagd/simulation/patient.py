@@ -99,7 +99,7 @@ class Patient:
 
 
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
-    """Return a setpoint's fields that say `felt` in `mode`, one of MODES.
+    """Return the fields of a setpoint that says what the tip feels, `felt`, in the way of `mode`, one of MODES.
 
     Mode `law` names the wall only once the tip has met it.
     """
@@ -146,7 +146,7 @@ class Delay(Generic[T]):
         self._under_way: list[tuple[float, int, float, T]] = []
 
     def send(self, time_s: float, value: T) -> None:
-        """Send `value` at `time_s`; it may be lost."""
+        """Send `value` at `time_s`; by chance, or in the outage, it is lost."""
         chance, arrives_s = self._draw.random(), time_s + self._delay_s + self._jitter_s * self._draw.random()
         self._is_losing = chance < (self._goes_on if self._is_losing else self._begins)
         self._sent += 1
@@ -172,10 +172,11 @@ def run(
     clock_s: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Run the patient until `is_over`: every PERIOD_S send the handle's motions there and setpoints back.
+    """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints in `mode` `back`.
 
-    Returns the number of published setpoints. A setpoint that arrives after a later one is dropped; its stamp is the
-    time when it was sent. `is_over` is asked with seconds of `clock_s`.
+    Returns the number of setpoints that `client` published. A setpoint that arrives after a later one is dropped; its
+    stamp is the time when it was sent. `is_over` is asked with seconds of `clock_s`; `wait` sleeps for seconds. Raises
+    what `client` raises.
     """
     began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
     newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0
@@ -214,7 +215,8 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the simulated patient from the command line and return the exit code.
 
-    0: setpoints were published; 1: none were, or the daemon was not reached; 2: usage.
+    `arguments` None: those of the process. 0: setpoints were published; 1: none were, or the daemon was not reached; 2:
+    usage.
     """
     command = parser()
     options = command.parse_args(arguments)

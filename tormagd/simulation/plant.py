@@ -129,7 +129,7 @@ class Plant:
 
     @property
     def shafts(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """(angle_rad, current_A) of the left and the right screw now, which may be within a substep."""
+        """Return angle, rad, and current, A, of the left and the right screw now, which may be within a substep."""
         left, right, left_V, right_V = self.left, self.right, self._left_V, self._right_V
         age_s = self._target_s - self._substeps * self._substep_s
         if age_s < _ROUNDING * self._substep_s:
@@ -142,7 +142,7 @@ class Plant:
 
     @property
     def truth(self) -> Truth:
-        """State at `time_s`; force and handle are those of the last whole millisecond."""
+        """Return the true state at `time_s`; force and handle are those of the last whole millisecond."""
         left, right, element = self.left, self.right, self.element
         return Truth(
             self._substeps * self._substep_s,

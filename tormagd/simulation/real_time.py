@@ -63,9 +63,12 @@ class Punctuality(NamedTuple):
 
 
 def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: TextIO | None = None) -> Punctuality:
-    """Run the device in real time until `stopped()`, asked at each of its events; return how well time was kept.
+    """Run `device` behind `door` in real time until `stopped()`, and return how well real time was kept.
 
-    `truth`, if given, gets a CSV header and one row a millisecond. Freezes the garbage collector's present objects.
+    `stopped` is asked before each wait, which ends with the device's next event or with something from a host. A
+    wake-up late by more than SLIP_S makes the device's time stand still for as long. `truth`, unless None, gets
+    TRUTH_HEADER and a row each TRUTH_PERIOD_S. Freezes the garbage collector's present objects. Raises what `door` and
+    `truth` raise.
     """
     # nothing made so far will die: keep the collector from walking it while the device runs
     gc.freeze()

@@ -33,7 +33,8 @@ class SlcanAdapter:
     def feed(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
         """Take the host's characters; return the characters to answer, and the frames that the host sends.
 
-        An incomplete command waits for the next call. Without an open channel a frame is refused.
+        An incomplete command waits for the next call. A frame is answered as sent where the channel is open, and
+        refused where it is not, as is any unknown command.
         """
         *commands, rest = (self._pending + data).split(END)
         # too long a command is refused when its end comes: no more of it is kept than shows its length
@@ -53,7 +54,11 @@ class SlcanAdapter:
         return b"t%03X%d%s\r" % (frame.identifier, len(frame.data), frame.data.hex().upper().encode())
 
     def _answer(self, command: bytes) -> bytes:
-        """Carry out a command that is no frame, and return its answer; `O` and `C` open and close the channel."""
+        """Carry out a command that is no frame, and return its answer.
+
+        `O` opens the channel, `C` closes it. Bit rates are accepted while it is closed, without effect. An unknown
+        command is refused.
+        """
         match command[:1]:
             case b"":  # hosts send empty lines to end whatever was there before
                 return OK
@@ -77,7 +82,10 @@ class SlcanDoor(Pty):
         self._adapter = SlcanAdapter()
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device the host's frames, and the host answers and frames; a closed channel hears no frames."""
+        """Hand the device the host's frames, and the host the adapter's answers and the device's frames until `now_s`.
+
+        While the host's channel is closed its frames are refused, and it gets none.
+        """
         out = b""
         if readable:
             out, frames = self._adapter.feed(self.read())
