@@ -17,7 +17,10 @@ ResultT = TypeVar("ResultT")
 
 
 def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> None:
-    """Add `--workers` and `--dask` to `parser`; `needed` says what a cluster's workers must have installed."""
+    """Add `--workers`, by default `workers`, and `--dask` to `parser`.
+
+    `needed` says what a cluster's workers must have installed.
+    """
     parser.add_argument("--workers", type=WORKERS, default=workers, help="processes on this machine (%(default)s)")
     parser.add_argument(
         "--dask", metavar="ADDRESS", help=f"scheduler of a Dask cluster instead; its workers need {needed}"
@@ -26,9 +29,9 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 
 @contextmanager
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
-    """Give the executor that the options ask for, and shut it down at the end.
+    """Give the executor that `options` ask for, and shut it down at the end: processes here, or a Dask cluster.
 
-    Raises OSError where no scheduler answers at the address, LabError for one that is no address.
+    Raises OSError where no scheduler answers at the address `options.dask`, and LabError for one that is no address.
     """
     if options.dask is None:
         # a fork of this process would inherit the locks of libraries' threads, but not the threads

@@ -55,11 +55,10 @@ class IdealCarriages(Actuator):
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """Put the gap where the plan wants it now, as far as the top speed reaches, and return no duty; see
-        `Actuator.update`.
+        """Put the gap of the simulated device where `plan` wants it at `now_s`, and return duties of 0.
 
-        RATE is limited where the top speed falls short. Without a plan the gap stays within its ends; with one it opens
-        once `is_over`.
+        It goes no further than the top speed reaches in `dt_s`; where that falls short, the result has the limit RATE.
+        `plan` None holds the gap within its ends. With a plan the gap opens once `is_over`, a force over the ceiling.
         """
         before_mm = self._plant.gap_mm
         wanted_mm = min(max(before_mm, self._closed_mm), self._open_mm)

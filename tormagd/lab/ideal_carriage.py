@@ -85,15 +85,16 @@ class Drive(NamedTuple):
         return self._sped_up(self.pull_mm_s2_N * self.pull_N.at(gap_mm), speed_mm_s, dt_s)
 
     def lowest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Return the smallest speed `dt_s` after this gap and speed, mm/s.
-
-        It is the mirror image of the largest, in which the pull drives instead of loading.
-        """
+        """Return the smallest speed `dt_s` after this gap and speed, mm/s: of closing at full voltage, with the
+        magnets' pull."""
         return -self._sped_up(-self.pull_mm_s2_N * self.pull_N.at(gap_mm), -speed_mm_s, dt_s)
 
     def _sped_up(self, load_mm_s2: float, speed_mm_s: float, dt_s: float) -> float:
-        """Return the largest speed after `dt_s` under this load, turning round or standing on the way where friction
-        says so."""
+        """Return the largest speed, mm/s, `dt_s` after `speed_mm_s`, at full voltage to open against the pull
+        `load_mm_s2`.
+
+        A gap that closes may turn round within the step, or stand where friction is more than what is left over.
+        """
         if speed_mm_s < 0.0:
             braking = self._acceleration(load_mm_s2, speed_mm_s, -1.0)
             if speed_mm_s + braking * dt_s <= 0.0:
@@ -105,6 +106,10 @@ class Drive(NamedTuple):
         return max(speed_mm_s + self._acceleration(load_mm_s2, speed_mm_s, 1.0) * dt_s, 0.0)
 
     def _acceleration(self, load_mm_s2: float, speed_mm_s: float, direction: float) -> float:
+        """Return the gap's acceleration, mm/s^2, at the full voltage that opens, against the pull `load_mm_s2`.
+
+        The friction acts against `direction`, 1 (opening) or -1, the way in which the gap moves or would move.
+        """
         driving = min(self.stall_mm_s2 - self.per_s * speed_mm_s, self.most_mm_s2)
         nut = load_mm_s2 + direction * self.drag_mm_s2
         friction = self.gear_mm_s2 + self.screw_friction * abs(nut)
@@ -160,8 +165,11 @@ class Brake(NamedTuple):
         return np.array(found)
 
     def moment_for_Tm(self, strength_Tm: float, moment_Tm: float, lag_Tm: float) -> float:
-        """Return the moment that makes `strength_Tm`, coming from this moment and lag; Newton's method along the
-        branch."""
+        """Return the moment, T m, that together with its lag makes `strength_Tm`, coming from `moment_Tm` with the lag
+        `lag_Tm`.
+
+        Found by Newton's method along the branch of the hysteresis, in NEWTON_STEPS steps.
+        """
         wanted_Tm = moment_Tm
         for _ in range(NEWTON_STEPS):
             change_Tm = wanted_Tm - moment_Tm
@@ -260,7 +268,10 @@ class Asked(NamedTuple):
     offset_N: float
 
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
-        """Return the rendered force for gaps in the same steps; before the first the gap was open."""
+        """Return the rendered force (n), N, for the gaps `gap_mm` (n) in the steps of this force.
+
+        Before the first step the gap was open.
+        """
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)
         return self.scale * (fresh_N - self.relaxed_N) + self.offset_N
@@ -313,8 +324,12 @@ def bound(
 
 
 def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, step_s: float) -> Asked:
-    """Return the force clipped to the device's range and `most_N`, with the relaxation while exactly that is
-    rendered."""
+    """Return the force (n) clipped to the device's range and `most_N`, with the relaxation while exactly that is
+    rendered.
+
+    The steps are `step_s` long, and the handle moves at `hand_mm_s`. Before the first step the insert rested at
+    `brake.rested_mm`.
+    """
     offset_N = brake.sliding_N(0.0, hand_mm_s)
     scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
     # a gap that has been opened brakes a little more than one that was never closed
@@ -338,8 +353,10 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
 
 
 def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """Return the gap at each step of carriages that follow a force without delay or foresight; they begin on the force
-    at rest."""
+    """Return the gap at each step, mm, of carriages that follow `asked` without delay or foresight.
+
+    They begin at rest at the gap of the first force.
+    """
     gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
     moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.branch_Tm
 
@@ -430,9 +447,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the figures of the bound for a file of forces.
+    """Return how closely ideal carriages can render the forces in the file `options.force`, on the plant
+    `options.plant`.
 
-    Raises DomainError, ForceFileError, PlantError, and LabError where no optimum was found.
+    The figures are the standard deviation of the force asked for, and the RMS errors without delay and with foresight,
+    N. Raises DomainError, ForceFileError and PlantError for what is refused, and LabError where no optimum was found.
     """
     table = read_forces(options.force)
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
@@ -445,7 +464,11 @@ def run(options: argparse.Namespace) -> Found:
 def _reached(
     limit_mm_s: Callable[[float, float, float], float], gap_mm: Array, speeds_mm_s: Array, step_s: float
 ) -> tuple[Array, Array]:
-    """Return the speed limit after every step but the first, and its slope over the speed before (secant)."""
+    """Return the speed limit at the end of each step but the first, mm/s, and its slope over the speed before.
+
+    `limit_mm_s` gives the limit, as `Drive.highest_mm_s` does, for gap, speed and time. The slope is that of a secant,
+    SECANT_MM_S to either side.
+    """
     found = []
     for gap, speed in zip(gap_mm[1:-1].tolist(), speeds_mm_s[:-1].tolist(), strict=True):
         more, less = limit_mm_s(gap, speed + SECANT_MM_S, step_s), limit_mm_s(gap, speed - SECANT_MM_S, step_s)
@@ -455,8 +478,12 @@ def _reached(
 
 
 def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tuple[sparse.spmatrix, sparse.spmatrix]:
-    """Return two matrices, for the changes of gaps and of lags: their products with the changes sum to 0 (linearised
-    lag)."""
+    """Return the lag's law, linearised, as two matrices: one for the changes of gaps, one for those of lags.
+
+    The products of the matrices with these changes sum to 0 in every step. `moment_Tm` and `lag_Tm` (n each), T m, are
+    those linearised about. `turned` (n) is the moment's slope over the gap, T m/mm, over the unit of a lag's change, T
+    m. The first lag has no change.
+    """
     steps = len(moment_Tm)
     change_Tm = np.diff(moment_Tm)
     kept = np.exp(-np.abs(change_Tm) / brake.turn_Tm)

@@ -53,7 +53,11 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that the first argument names and return its exit code; 2 for usage and input that is refused."""
+    """Run the command that the first argument names and return its exit code.
+
+    None takes the arguments of the process. Without a command the commands are listed. The code is 2 for usage and
+    refused input, 1 where the result could not be written, else the command's own.
+    """
     write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)
     name = given[0] if given else "--help"
@@ -68,9 +72,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
-    """Run one command, print what it found and return its exit code.
+    """Run the command `name` of COMMANDS, print what it found and return its exit code.
 
-    Refused input, an OSError and a missing package become one sentence on stderr and exit code 2.
+    Refused input, an OSError and a missing package become one sentence on stderr and exit code 2; so does usage, by
+    SystemExit.
     """
     try:
         module = import_module(f"tormagd.lab.{COMMANDS[name][0]}")

@@ -26,12 +26,12 @@ def read_columns(
     allowed: Mapping[str, tuple[float, float]] | None = None,
     is_exact: bool = False,
 ) -> dict[str, Array]:
-    """Return the columns `names` of a CSV file and its `optional` ones, in this order; `allowed` bounds some.
+    """Return the columns `names` of a CSV file and its `optional` ones, in this order.
 
-    The header is the first row with all `names`, in any order. Rows before it (many testing machines write a preamble),
-    other columns and empty rows are skipped; with `is_exact` they are refused. Raises `LabError` for an unreadable
-    file, a missing header, no rows or over MAX_ROWS. So does a cell that is no finite number within its bounds, with
-    its row.
+    `allowed` gives least and most of some columns; None: any number. The header is the first row with all `names`, in
+    any order. Rows before it (many testing machines write a preamble), other columns and empty rows are skipped; with
+    `is_exact` they are refused. Raises `LabError` for an unreadable file, a missing header, no rows, over MAX_ROWS, and
+    a cell that is no finite number within its bounds. The message names the file, and the row where one is wrong.
     """
     try:
         require_regular(path, MOST_TABLE_BYTES)
@@ -56,7 +56,10 @@ def _columns(
     allowed: Mapping[str, tuple[float, float]],
     is_exact: bool,
 ) -> dict[str, Array]:
-    """Find the header and read the columns below it. Raises `LabError` as `read_columns`."""
+    """Find the header in `rows`, pairs of line number and cells, and return the columns below it by name.
+
+    `rows` is used up. Raises `LabError` as `read_columns`.
+    """
     header: list[str] = []
     for _, header in rows:
         if is_exact or set(names) <= set(header):
@@ -85,8 +88,10 @@ def _columns(
 
 
 def _number(where: str, text: str, bounds: tuple[float, float] | None) -> float:
-    """Return `text` as a finite number within `bounds` (None: any). Raises LabError, also for digits with
-    underscores."""
+    """Return `text` as a finite number within `bounds`; None: any.
+
+    Raises LabError, which begins with `where`, for all else, also for digits with underscores.
+    """
     try:
         # digits grouped as 1_000 are Python's idea, not CSV's
         number = math.nan if "_" in text else float(text)

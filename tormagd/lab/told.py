@@ -5,7 +5,10 @@ from typing import Any
 
 
 def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
-    """Yield what `--json` prints as lines of text; `path` names what holds these figures."""
+    """Yield the lines of text that tell a person what `--json` prints of `result`.
+
+    `path` names what holds these figures; empty for the whole result. A list of records becomes a table.
+    """
     for key, value in result.items():
         name = f"{path} {key}".strip()
         if isinstance(value, Mapping) and any(isinstance(inner, Mapping | list) for inner in value.values()):
@@ -18,8 +21,11 @@ def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield a table's lines, one for the names and one for each row. Nested figures get both names; lists are left
-    out."""
+    """Yield the lines of a table: one with the names of all columns, then one for each of `rows`.
+
+    Columns are aligned to the right, two spaces apart. Their names are those of all rows together; a row without one
+    has an empty cell. A figure of a nested record is named by both names, as `outer inner`. Lists are left out.
+    """
     flat = [dict(_figures(row)) for row in rows]
     names = list(dict.fromkeys(name for row in flat for name in row))
     cells = [names, *([shown(row.get(name, "")) for name in names] for row in flat)]
@@ -29,6 +35,7 @@ def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of each figure in `row`, also of nested records; lists are left out."""
     for key, value in row.items():
         if isinstance(value, Mapping):
             yield from ((f"{key} {name}", inner) for name, inner in _figures(value))
@@ -37,7 +44,8 @@ def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def shown(value: Any) -> str:
-    """Return a figure to four digits; several with their names."""
+    """Return a figure as text: a float to four digits, a list's elements as they are, a record's figures with their
+    names."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {shown(inner)}" for name, inner in value.items())
     if isinstance(value, float):

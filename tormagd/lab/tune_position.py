@@ -81,7 +81,10 @@ def corner_margins(config: Config) -> dict[str, float]:
 
 
 def search(config: Config) -> list[Tuning]:
-    """Return the largest robust proportional gain for every point of the grid that has one."""
+    """Return the largest robust proportional gain for every point of the grid that has one, with its margins.
+
+    The gain is rounded down to a tenth. The motor is that of `config`, which stays as it is; the loop runs at 1 kHz.
+    """
     grid = list(itertools.product(DERIVATIVE_TIMES_S, FILTER_TIMES_S, INTEGRAL_TIMES_S))
     found = []
     for derivative_s, filter_s, integral_s in tqdm(grid, desc="gains", disable=None):

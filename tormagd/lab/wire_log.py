@@ -65,7 +65,12 @@ class WireLog:
         self._log.stop()
 
     def add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
-        """Log the frames that `data` completes: from the device if `is_rx`, else from the host."""
+        """Log the frames that `data` completes, with the time `time_s`: of the device if `is_rx`, else of the host.
+
+        An incomplete frame waits for the next call of its direction. `time_s` is in seconds, from whatever start the
+        caller has. Counts the logged frames in `frames`, all else in `damaged`. Raises OSError where the file cannot be
+        written.
+        """
         for frame in self._decoders[is_rx].feed(data):
             if not 1 <= frame.function <= 0x7F:
                 self._nameless += 1
@@ -94,9 +99,10 @@ class WireLog:
 
 
 def virtual_session(seconds: float, log: WireLog) -> None:
-    """Connect, home, enable and follow a swinging force for `seconds` of virtual time, logging the connection's frames.
+    """Run a session of the virtual device for `seconds` of virtual time, and log its frames in `log`.
 
-    Raises RuntimeError if the device does not arm.
+    The host connects, homes, enables and follows a swinging force; the seconds count from then on. Raises RuntimeError
+    if the device does not arm.
     """
     config = load_config(None)
     core = build_core(config)
@@ -114,9 +120,10 @@ def virtual_session(seconds: float, log: WireLog) -> None:
 
 
 def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
-    """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames.
+    """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames in `log`.
 
-    `announce` is called with the pseudo-terminal's path. Raises OSError when the port goes away.
+    `announce` is called with the pseudo-terminal's path. Frames are stamped with seconds since 1970. Bytes that the
+    device does not fetch are lost. Raises OSError when the port goes away.
     """
     with contextlib.closing(Pty()) as line:
         announce(line.address)
@@ -161,7 +168,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Log until the session or a signal ends it, or return the viewer's formats.
+    """Log until the session or a signal ends it, or with the way `viewer` return the formats for python-can's viewer.
 
     Raises LabError for a file type that is not known, OSError for a file or port that cannot be used.
     """

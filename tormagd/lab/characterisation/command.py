@@ -62,7 +62,10 @@ def compression(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def tension(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the moduli from the part of a tension test between two strains."""
+    """Return the moduli, as `moduli`, from the part of a tension test between `from_strain` and `to_strain`.
+
+    The options name the file and its columns. Raises LabError and DomainError as `read_columns` and the fits.
+    """
     names = (options.strain, options.stress_mpa)
     columns = read_columns(options.file, names, delimiter=options.delimiter)
     strain, stress_MPa = (columns[name] for name in names)
@@ -71,7 +74,11 @@ def tension(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
-    """Return the shear moduli of three laws, kPa, and how well each fits."""
+    """Return the shear moduli of three laws, kPa, and how well each fits, as R2.
+
+    The laws are neo-Hookean, Ogden's with up to `terms` terms, and Eq. 3 of the thesis as printed. Raises LabError and
+    DomainError as the fits.
+    """
     neo_hookean, ogden = fit_neo_hookean(*curve), fit_ogden(*curve, terms=terms)
     thesis = fit_thesis_ogden(*curve)
     return {
@@ -94,7 +101,10 @@ def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
 
 
 def relaxation(options: argparse.Namespace) -> dict[str, Any]:
-    """Return fractions, time constants and quality of the fit of a relaxation record."""
+    """Return fractions, time constants and quality of the fit of a relaxation record, with up to `options.branches`.
+
+    Raises LabError and DomainError as `read_columns` and `fit_relaxation`.
+    """
     record = RelaxationRecord(**read_columns(options.file, RelaxationRecord._fields))
     fit = fit_relaxation(record, options.branches)
     return {

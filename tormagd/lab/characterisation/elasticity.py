@@ -96,7 +96,11 @@ def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit:
 
 
 def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit:
-    """Return the best fit over the exponents, searched from the best few points of a grid."""
+    """Return the best fit of `shape` with up to `terms` terms, searched from the best few points of a grid of
+    exponents.
+
+    Raises LabError and DomainError as `fit_ogden`.
+    """
     _check(stretch, stress_Pa, 2 * terms + 1)
 
     def norm(exponents: tuple[float, ...]) -> float:

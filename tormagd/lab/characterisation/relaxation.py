@@ -53,8 +53,8 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
     together. Time constants are sought from a third of the shortest time step to three times the record. A slower one
     cannot be told from the equilibrium. Branches that the record does not show are dropped.
 
-    Raises `LabError` for a record that is too short, not in order, or without driving force. So it does where no force
-    is left at equilibrium: the record is too short. Raises `DomainError` for values out of range.
+    Raises `LabError` for a record of too few rows, not in order, or without a change of force. A record that leaves no
+    force at equilibrium is too short and raises `LabError`, too. Raises `DomainError` for values out of range.
     """
     _check(record, branches)
     span = float(record.time_s[-1] - record.time_s[0])

@@ -49,7 +49,10 @@ def write_parquet(summaries: dict[str, Summary], url: str) -> None:
 
 
 def _cells(console: Console) -> tuple[str, ...]:
-    """Return a console's cells under HEADINGS, for a person."""
+    """Return a console's texts for a person, one under each of HEADINGS.
+
+    `unknown` stands for what no recording says; limits under LEAST_SHARE of the time are left out.
+    """
     errors_N = (console.tracking_rms_N, console.worst_rms_N)
     held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= LEAST_SHARE][:MOST_LIMITS]
     faults = [f"{code} in {count}" for code, count in console.faults.items()]
@@ -84,10 +87,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the consoles of all recordings; exit code 1 where a file was left out, 2 where --out failed.
+    """Return the consoles of all recordings in `options.recordings`, a folder or a URL, for a person as a table.
 
-    Says on stderr what was left out and why. Raises LabError where there are no recordings, OSError where they cannot
-    be reached.
+    `options.out`, if given, gets one row for each recording, as Parquet. The exit code is 1 where a file was left out,
+    and 2 where `out` could not be written. Both are told on stderr. Raises LabError where there are no recordings, for
+    an unknown kind of URL, and where its package is missing; OSError where the place cannot be reached.
     """
     try:
         urls = files(options.recordings)

@@ -25,7 +25,7 @@ def files(url: str) -> dict[str, str]:
 
 
 def read(url: str) -> Summary | str:
-    """Read one recording and return its summary, or the reason why there is none."""
+    """Read the recording at `url` and return its summary, or the reason, in words, why there is none."""
     name = url.rpartition("/")[2]
     try:
         system, path = fsspec.core.url_to_fs(url)
@@ -38,9 +38,10 @@ def read(url: str) -> Summary | str:
 
 
 def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summary], dict[str, str]]:
-    """Read all recordings by `executor`; return summaries by name, and reasons by name for files without one.
+    """Read all recordings of `urls`, addresses by name, by `executor`: return summaries by name, and reasons by name.
 
-    The order is that of `urls`. A failed worker makes a reason, not an error.
+    A reason says why a file has no summary. Both have the order of `urls`. A failed worker makes a reason, not an
+    error.
     """
     found: dict[str, Summary | str] = {}
     for url, future in finished(executor, read, urls.values(), "recording"):

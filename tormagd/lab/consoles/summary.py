@@ -57,8 +57,11 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(file: BinaryIO, name: str) -> Summary:
-    """Of the recording in `file`, which errors call `name`. Raises RecordingError, OSError, and ValueError for a
-    recording without messages."""
+    """Return the summary of the recording in `file`, which errors call `name`.
+
+    A figure of which the recording says nothing is None. Raises RecordingError and OSError where it cannot be read, and
+    ValueError for one without messages.
+    """
     builder, enabled = OverviewBuilder(), {name: array("d") for name in FIGURES}
 
     def take(seen: Seen) -> None:

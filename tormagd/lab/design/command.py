@@ -48,7 +48,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the optima of all starts, best first. Raises DomainError, OSError."""
+    """Find the best design from each start that `options` ask for, and return all, best first.
+
+    Raises DomainError where a solver finds no design; of the executor OSError and LabError.
+    """
     with executors.chosen(options) as executor:
         outcomes = sweep(_runs(options), executor)
     by_cost = options.measure == "corners"

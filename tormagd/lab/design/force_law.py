@@ -24,7 +24,10 @@ def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Ge
 
 
 def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the slope of the force over the radial moment, N / (T m), >= 0."""
+    """Return the slope of the force over the radial moment, N / (T m), >= 0.
+
+    Raises `DomainError` unless 0 <= radial_moment_Tm <= `max_radial_moment_Tm`.
+    """
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     load = law.load(radial_moment_Tm)

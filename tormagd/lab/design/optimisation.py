@@ -120,10 +120,10 @@ class Run(msgspec.Struct, frozen=True):
 
 
 def coverage(problem: Problem, design: Design) -> float:
-    """Return the share of the problem's region that the design covers, 0..1: by the true boundary or else the
-    trapezoid.
+    """Return the share of the problem's region that the design covers, 0..1.
 
-    `problem.measure` says which. Raises `DomainError` for an impossible design.
+    Counted is what the true boundary covers where `problem.measure` is "true", else what the trapezoid covers. Raises
+    `DomainError` for an impossible design.
     """
     portrait = problem.portrait(design)
     if problem.measure == "true":
@@ -132,9 +132,10 @@ def coverage(problem: Problem, design: Design) -> float:
 
 
 def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
-    """Return the least coverage where each dimension may be off by `share`, down, not at all, or up.
+    """Return the least coverage of the design, 0..1, where each dimension may be off by `share`, down, not at all, or
+    up.
 
-    0 where one of these designs does not bear its field.
+    All combinations are tried. The result is 0 where the elastomer of one of them does not bear the field.
     """
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
     made = [
@@ -215,7 +216,10 @@ class _Search:
     def global_minimum(
         self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
     ) -> Array:
-        """Return the minimum by differential evolution from `start`, refined; `also` are further constraints."""
+        """Return the point of least `cost` by differential evolution from `start`, refined by COBYQA.
+
+        Points are coordinates from 0 to 1. `also` are constraints besides that of the elastomer's load.
+        """
         limits = [*also, self._margin]
         result = differential_evolution(
             cost,

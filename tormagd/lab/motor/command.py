@@ -37,9 +37,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Identify the motor and return its parameters; write the configuration and the plot where asked.
+    """Identify the motor from the log `options.log` and return its parameters; write the configuration and the plot
+    asked for.
 
-    Raises LabError and ConfigError where the log or the configuration cannot be used.
+    Raises LabError where the log cannot be used, or the new configuration not written; ConfigError where the present
+    one is refused.
     """
     log = read_log(options.log)
     result = identify(log, options.gain if options.gain is not None else log.gain_N_V)
@@ -84,7 +86,10 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
 
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
-    """Draw measured against predicted voltage on the half of the log that was not fitted, as a picture at `path`."""
+    """Draw measured and predicted voltage on the half of the log that is not fitted, as a picture at `path`.
+
+    Fits the other half anew. `result` is that of `identify`. Raises LabError as `fit_volts`, and OSError.
+    """
     half = len(log.t_s) // 2
     fitted = fit_volts(log.part(slice(None, half)))
     time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))

@@ -202,7 +202,10 @@ def _voltage(log: Log, seen: Motion, delay_s: float) -> tuple[Array, Array]:
 
 
 def fit_volts(log: Log) -> Volts:
-    """Fit mass, friction, offset and delay in volts from voltage and position alone. Raises LabError."""
+    """Fit mass, friction, offset and delay in volts, from the log's voltage and position alone.
+
+    Raises LabError where the log moves too little, or the voltage fits best with a delay over LONGEST_DELAY_S.
+    """
     seen = motion(log)
     kept = moving(seen, MOSTLY)
     blocks = block_numbers(seen, log.period_s)[kept]
@@ -226,10 +229,11 @@ def fit_volts(log: Log) -> Volts:
 
 
 def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array) -> tuple[Fit, float]:
-    """Fit `rows` to the delayed voltage, and return the fit and the delay, which Gauss-Newton steps find.
+    """Fit `rows` to the delayed voltage, and return the fit and the delay, s, which Gauss-Newton steps find.
 
-    The voltage's slope is the last column of the fit, so that the others' intervals include the delay's. Raises
-    LabError for a delay over LONGEST_DELAY_S.
+    `kept` is the mask of the thinned rows that count, `blocks` their blocks. The voltage's slope is the last column of
+    the fit, so that the others' intervals include the delay's. Raises LabError for a delay over LONGEST_DELAY_S, and as
+    `linear`.
     """
     delay_s = 0.0
     for _ in range(DELAY_TURNS):
@@ -262,8 +266,10 @@ OTHER_WAYS = (
 
 
 def _estimates(fit_in: Callable[[Way], tuple[Array, Array]]) -> list[Estimate]:
-    """Return the values of the plain way, with intervals that cover the other ways; `fit_in` gives values and half
-    widths."""
+    """Return the values of the plain way to fit, with intervals that cover what the other ways make of them.
+
+    `fit_in` fits in one way, and gives values and half widths (n each).
+    """
     values, widths = fit_in(Way())
     widths = widths.copy()
     for group in OTHER_WAYS:
@@ -283,7 +289,7 @@ class Windings(NamedTuple):
 def fit_windings(log: Log) -> Windings:
     """Fit resistance, inductance, back-EMF and delay from voltage, current and position.
 
-    Raises LabError, also for a log without a current.
+    Raises LabError where the log moves too little, has no current, or fits best with a delay over LONGEST_DELAY_S.
     """
 
     def fit_in(way: Way) -> tuple[Array, Array]:
@@ -315,7 +321,10 @@ class Gearbox(NamedTuple):
 
 
 def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
-    """Fit inertia, friction and gear losses from current and position. Raises LabError, also without a current."""
+    """Fit inertia, friction and gear losses from current and position; `force_N_A` is the motor's force per current.
+
+    Raises LabError where the log moves too little, or has no current.
+    """
 
     def fit_in(way: Way) -> tuple[Array, Array]:
         seen = motion(log, way.thinned_Hz)
@@ -353,7 +362,11 @@ def _current(log: Log, way: Way) -> Array:
 
 
 def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
-    """Return the motor's force that moves the carriage slowly in `direction`, 1 or -1, at positions `x`."""
+    """Return the force, N, with which the motor moves the carriage slowly in `direction`, 1 or -1, at positions `x`
+    (n).
+
+    `values` are those of the fit in `fit_gearbox`. `idle_N` is the force that the gears take idling.
+    """
     lost = float(values[2])
     idling = float(values[8]) if len(values) > 8 else 0.0
     load: Array = values[3] + values[4] * x + values[5] * x**2 + direction * (values[6] + values[7] * x)

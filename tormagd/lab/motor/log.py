@@ -62,7 +62,7 @@ def read_log(path: Path) -> Log:
 
 
 def _read_mat(path: Path) -> Log:
-    """Read an EMPS .mat file, with its gain. Raises LabError."""
+    """Read an EMPS .mat file, with its gain. Raises LabError for one that is unreadable or no such file."""
     try:
         require_regular(path, MOST_TABLE_BYTES)
         data = loadmat(path)

@@ -31,8 +31,8 @@ MODELS = {"pad": ("tactile_mre_c", "tactile", (0.0, 365.0)), "brake": ("torque_m
 def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float | None) -> list[tuple[float, float]]:
     """Draw CONTACTS contacts from the model's box: displacement, mm, and rate, mm/s.
 
-    With `shallow_mm` displacements end there, and only contacts at which the force falls with the field somewhere are
-    kept. Raises LabError where MOST_DRAWS do not give as many.
+    `shallow_mm` None: all count. With `shallow_mm` displacements end there, and only contacts at which the force falls
+    somewhere in the fields `range_mT` are kept. Raises LabError where MOST_DRAWS do not give as many.
     """
     draw, fields = np.random.default_rng(SEED), np.linspace(*range_mT, 366)
     (low_mm, high_mm), rates, _, (cip_percent, _) = model.feature_ranges
@@ -50,9 +50,9 @@ def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float
 def followed(
     search: NearestFieldSearch, model: ForceModel, at: list[tuple[float, float]], path_mT: list[float]
 ) -> dict[str, Any]:
-    """Let a search follow the field path at every contact, each answer from the last.
+    """Let `search` follow the fields `path_mT` at every contact in `at`, each answer from the last; return how it went.
 
-    Returns the share of jumps, the travel over the path's own, the worst force error, N, and all answers, mT.
+    The figures are the share of jumps, the travel over the path's own, the worst force error, N, and all answers, mT.
     """
     cip_percent = model.feature_ranges[3][0]
     travels_mT, worst_N, answers = [], 0.0, []

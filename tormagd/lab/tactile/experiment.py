@@ -54,8 +54,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the figures, for a person as the page; `--out` also writes it. Raises LabError where `--out` is no
-    directory."""
+    """Return the experiment's figures, for a person as the page; with `options.out` also write the page there.
+
+    With `options.branches` return instead what the number of neighbours decides on shipped models. Raises LabError
+    where `out` is no directory, ModuleNotFoundError where heartpy is not installed.
+    """
     if options.branches:
         return Found(branches.measured())
     if options.out is not None and not options.out.is_dir():

@@ -61,8 +61,12 @@ Moment = tuple[float, float, Plan, str]
 
 
 def hold(case: Case) -> dict[str, Any]:
-    """The greatest, the mean and the last error of the true force, as shares of the force asked, the share of time that
-    each limit was there, and the fault that ended it, if any."""
+    """Hold a force on the pad of `case` and return how well it was held, as plain data beside the case's own fields.
+
+    Errors are shares of the force asked for: the greatest, the mean and the last. `limits` has the share of the time
+    that each limit was there, `held_s` the seconds. `fault` names the fault that ended the hold; it is empty where none
+    did. Raises PlantError for a plant that cannot be loaded or has no pad.
+    """
     shares, limits, last_mm, fault = [], Counter[str](), math.nan, ""
     for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
         if fault:
@@ -101,6 +105,11 @@ class _Prepared:
 
 
 def _whole(case: Case) -> Iterator[Moment]:
+    """Yield the moments of a hold by the daemon's loop with the whole device, once a second from the end of learning
+    on.
+
+    A moment with a fault may be followed by others: the caller ends the hold.
+    """
     made = _Prepared(case)
     planner, device = made.core.planner(), VirtualDevice(made.plant, made.hand, seed=1)
     loop = ClosedLoop(made.config, made.core.stepper(), planner, device)
@@ -120,6 +129,10 @@ def _whole(case: Case) -> Iterator[Moment]:
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
+    """Yield the moments of a hold by the plans alone, each COARSE_S, with the gap where the last plan leads.
+
+    They come once a second from the end of learning on. The only fault they can have is SENSOR.
+    """
     made = _Prepared(case)
     planner = made.core.planner()
     element = PressedPad(made.plant, planner.planned.gap_mm, COARSE_S)
@@ -144,7 +157,7 @@ def _coarse(case: Case) -> Iterator[Moment]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `tormag-lab tactile-hold`."""
+    """Add the options of `tormag-lab tactile-hold`."""
     seconds = within(1.0, 1e6, "s")
     parser.add_argument("--seconds", type=seconds, default=3600.0, help="of each hold, virtual (default: 3600)")
     parser.add_argument("--plant", nargs="+", default=PLANTS, metavar="PLANT", help="default: pad_1 pad_2 pad_3")
@@ -153,7 +166,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Every hold, with relaxation and without, learning and frozen."""
+    """Hold a force on every plant of `options`, with relaxation and without, learning and frozen, and return all holds.
+
+    Raises PlantError for a plant that cannot be loaded or has no pad.
+    """
     cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
     with ProcessPoolExecutor(options.workers) as pool:
         holds = list(tqdm(pool.map(hold, cases), total=len(cases), desc="holds", disable=None))

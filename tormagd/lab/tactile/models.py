@@ -60,7 +60,7 @@ class Trained:
 
 
 def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
-    """Train both models on the training part of the random split."""
+    """Train both models on the training part of the random split of made cycles with sensor noise `noise_N`, N."""
     cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
     data = cycles.data
     known = ~random_split(len(data), SPLIT_SEED)
@@ -121,7 +121,10 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
 
 
 def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) -> dict[str, Any]:
-    """Fit a network without each fold and judge it on the fold; return errors over all folds, and each fold's own."""
+    """Train a network without the rows of each fold, judge it on them, and return the errors, N.
+
+    A fold is a label and the mask (n) of its rows. The errors are those over all folds together, and each fold's own.
+    """
     predicted = np.empty(len(data))
     judged = np.zeros(len(data), dtype=np.bool_)
     each = []

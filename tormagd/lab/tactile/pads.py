@@ -102,10 +102,11 @@ def cyclic_records(
     samples_per_cycle: int = SAMPLES_PER_CYCLE,
     pads: Iterable[PadParameters] = tuple(PADS.values()),
 ) -> PadRecord:
-    """Return the data of figure 4.3: three pads, eleven fields, twelve cycles of 175 samples, 69,300 rows. No holds, as
-    there.
+    """Return the data of figure 4.3: three pads, eleven fields, twelve cycles of 175 samples, 69,300 rows without
+    holds.
 
-    Each field is a record of its own after a rest, preceded by three unrecorded passes of the same cycles.
+    Each field is a record of its own after a rest, preceded by three unrecorded passes of the same cycles. `noise_N` is
+    the standard deviation of the sensor's noise, drawn by `seed`.
     """
     time_s, displacement_mm, rate_mm_s, cycle = cycling_program(samples_per_cycle)
     passes: list[Pass] = []
@@ -143,7 +144,10 @@ def holding_records(
 
 
 def _recorded(passes: list[Pass], cycle: NDArray[np.int64], noise_N: float, seed: int) -> PadRecord:
-    """Return the passes one after the other as a record with sensor noise; each pass has its own cycle numbers."""
+    """Return the passes one after the other as a record, with the sensor's noise `noise_N`, N, drawn by `seed`.
+
+    `cycle` numbers the cycles of one pass. In the record each pass has numbers of its own.
+    """
     features = np.concatenate([program.features(pad.cip_percent) for pad, program, _ in passes])
     true_N = np.concatenate([force_N for *_, force_N in passes])
     noisy_N = true_N + np.random.default_rng(seed).normal(0.0, noise_N, len(true_N))

@@ -43,7 +43,7 @@ def pulse_shape(duration_s: float, rate_hz: int) -> Array:
 def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
     """Return measured arterial pulses between 0 and 1 by file name, repeated to `duration_s` at `rate_hz`.
 
-    None unless TORMAG_DATA names a folder with `aac_nibp_pulse`.
+    Empty unless TORMAG_DATA names a folder with `aac_nibp_pulse`.
     """
     shapes = {}
     for path in recorded("aac_nibp_pulse"):
@@ -75,9 +75,10 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 def solve_all(
     solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
 ) -> list[FieldSolution]:
-    """Solve each row in turn, from the last answer on; return the answers.
+    """Find the field for each of `force_N` (n) in turn, from the last answer on; return the answers.
 
-    With `memory` each force is freed of the pad's relaxation first, and the memory advances with the fields found.
+    `features` (n x 4) are the network's, their field unused. With `memory` each force is freed of the pad's relaxation
+    first, and `memory` advances with the fields found; None: forces are taken as they are.
     """
     answers: list[FieldSolution] = []
     for row, wanted_N in zip(features.tolist(), force_N.tolist(), strict=True):
@@ -113,8 +114,10 @@ class Course(NamedTuple):
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 
     def scores(self, fields_mT: Array) -> dict[str, float]:
-        """Return the field error over the scored rows, and over the others the force that the wrong field would
-        cost."""
+        """Return by name how far `fields_mT` are off: the field over the scored rows, mT, over the others the force, N.
+
+        The force is what the wrong field would cost on the pad itself.
+        """
         absolute = np.abs(fields_mT - self.features[:, 2])[self.scored]
         pad, places = worked_pad(self.pad), self.features[~self.scored, :3].copy()
         right_N = plant_force_N(pad, places)
@@ -128,7 +131,8 @@ class Course(NamedTuple):
 
 
 def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
-    """Do the experiment on one pad; every `every`-th sample is kept to be solved."""
+    """Run the experiment on one pad with the pulse `shape`, and return every `every`-th of its samples, to be
+    solved."""
     done = program(shape)
     force_N = worked_pad(pad).run(*done)
     features = done.features(pad.cip_percent)[::every]
@@ -150,7 +154,11 @@ def aware_fields(trained: Trained, along: Course, noise_N: float = 0.0) -> Array
 
 
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return the scores of each way from force to field, and the traces."""
+    """Return the scores of each way from force to field by name, and the traces over time by name (n each).
+
+    The ways are the network, the network with the thesis's search, and the relaxation-aware model without and with
+    noise.
+    """
     linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
         "mlp": fields_of(solve_all(nearest(), trained.model, along.features, along.force_N, None)),
@@ -167,9 +175,10 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 
 
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return the pulse experiment's figures and the traces of its first training.
+    """Run the pulse experiment with each of `trainings`, and return its figures and the traces of the first training.
 
     The first training's scores stand on top, each training's by its sensor noise, with other pads and pulses beside.
+    Raises ModuleNotFoundError where heartpy is not installed.
     """
     shape = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every

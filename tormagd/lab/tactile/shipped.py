@@ -71,7 +71,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Train the model, write it to `--out` and return its metrics."""
+    """Train the model of the pad of `options.plant`, write it to `options.out` and return its metrics.
+
+    Raises PlantError for a plant that cannot be loaded or has no pad, OSError where the model cannot be written.
+    """
     torch.set_num_threads(1)
     model = trained(options.plant, FULL, options.created or datetime.date.today())
     save_model(options.out, model)

@@ -18,7 +18,8 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
-    """Draw every picture of the page by the name of its file."""
+    """Draw every picture of the page, from the `result` of `reproduction.run`, and return figures by the names of
+    files."""
     return {
         "table_2_4": _table_2_4(result["table_2_4"]),
         "figure_2_5": _figure_2_5(result["figure_2_5"]),
@@ -29,7 +30,7 @@ def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
 
 
 def _table_2_4(table: Json) -> Figure:
-    """Draw the force ranges of all inserts: measured, the thesis's and ours."""
+    """Draw the force ranges of all inserts, measured, the thesis's and ours; `table` is of `reproduction.table_2_4`."""
     figure, axes = subplots((9.5, 4.2))
     rows = table["rows"]
     place = np.arange(len(rows))
@@ -50,7 +51,7 @@ def _table_2_4(table: Json) -> Figure:
 
 
 def _figure_2_5(data: Json) -> Figure:
-    """Draw the least and greatest force over shear modulus and permeability."""
+    """Draw the least and greatest force over shear modulus and permeability; `data` is of `reproduction.figure_2_5`."""
     figure = Figure(figsize=(7.5, 5.4), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
     moduli, permeabilities = np.meshgrid(data["shear_modulus_kPa"], data["relative_permeability"])
@@ -66,7 +67,7 @@ def _figure_2_5(data: Json) -> Figure:
 
 
 def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
-    """Draw the step tests beside the force law, and the force ranges."""
+    """Draw the step tests beside the force law, and the force ranges; `data` is of `reproduction.figure_2_7`."""
     figure, (axes, ranges) = subplots((12.0, 4.2), 1, 2)
     for test, row, colour in zip(tests, data["rows"], (OURS, FREE, THESIS), strict=True):
         axes.plot(test.time_s, test.force_N, color=colour, linewidth=0.9, label=f"{test.insert}, simulated device")
@@ -101,7 +102,7 @@ def _force_ranges(axes: Axes, rows: list[Json]) -> None:
 
 
 def _figure_3_2(table: Json) -> Figure:
-    """Draw the portrait of the device as built over both use cases."""
+    """Draw the portrait of the device as built over both use cases; `table` is of `reproduction.table_3_2`."""
     figure, axes = subplots((9.5, 4.0), 1, 2)
     speeds = (table["gap_speed_mm_s"]["true_thesis_speed"], table["gap_speed_mm_s"]["true"])
     for axis, (number, case) in zip(axes, USE_CASES.items(), strict=True):
@@ -113,7 +114,10 @@ def _figure_3_2(table: Json) -> Figure:
 
 
 def _figure_3_4(table: Json) -> Figure:
-    """Draw our best and the thesis's best portrait over both use cases, at two gap speeds."""
+    """Draw our best and the thesis's best portrait over both use cases, at two gap speeds.
+
+    `table` is of `reproduction.table_3_2`.
+    """
     figure, axes = subplots((9.5, 7.6), 2, 2)
     for row, (number, case) in zip(axes, USE_CASES.items(), strict=True):
         for axis, objective in zip(row, ("true_thesis_speed", "true"), strict=True):
@@ -136,7 +140,7 @@ def _region(axis: Axes, region: Region) -> None:
 
 
 def _portrait(axis: Axes, problem: Problem, design: Design, colour: str, label: str) -> None:
-    """Draw a design's true boundary solid, and its trapezoid's edges dotted."""
+    """Draw on `axis` a design's true boundary solid, labelled `label`, and its trapezoid's edges dotted."""
     portrait = problem.portrait(design)
     force, rate = portrait.outline()
     axis.plot([*force, *force[::-1], force[0]], [*rate, *-rate[::-1], rate[0]], color=colour, label=label)

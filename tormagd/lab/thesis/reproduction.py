@@ -58,8 +58,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return all tables and figures, for a person as the page; `--out` also writes it. `--table-2-5` returns that
-    alone."""
+    """Return all tables and figures of the reproduction, for a person as the page.
+
+    `options.out`, if given, gets the page and its pictures. With `options.table_2_5` only that table is made. Raises
+    ModuleNotFoundError where a package is missing, OSError where `out` cannot be written, RuntimeError where a
+    simulated device faults.
+    """
     if options.table_2_5:
         found = table_2_5()
         return Found(found, table(dict(zip(COLUMNS, row, strict=True)) for row in readings(found)))
@@ -135,7 +139,10 @@ def table_2_4() -> Json:
 
 
 def _range_fit(law: FieldLaw) -> Json:
-    """Return the fits with a fixed and a free exponent under one field law, with left-out errors."""
+    """Return the fits of friction under one field law, with a fixed and a free exponent, and their relative errors.
+
+    Beside them are the errors for inserts that were left out of the fit.
+    """
     known = list(INSERTS.values())
     fixed, free = fit_friction(known, law), fit_exponent(known, law)
     left_out = leave_one_out(known, law, free_exponent=False)
@@ -155,9 +162,9 @@ def _range_fit(law: FieldLaw) -> Json:
 
 
 def _registry_errors() -> Json:
-    """Return the errors with the registry's friction, which inserts and simulated device have.
+    """Return the errors of range with the registry's friction, the one that inserts and simulated device have.
 
-    It is the least-squares fit of the relative errors.
+    This friction is the least-squares fit of the relative errors.
     """
     known = list(INSERTS.values())
     friction = {item.shore_hardness: item.elastomer.friction_coefficient for item in known}
@@ -257,8 +264,10 @@ def figure_2_7(tests: list[StepTest]) -> Json:
 
 
 def phase_portrait(*gap_speeds_mm_s: float) -> Json:
-    """Return the coverage of both use cases by the device as built at these gap speeds, and of a measured pulse's
-    points."""
+    """Return how much of both use cases, and of a measured pulse's points, the device as built covers.
+
+    There is a row for each use case and gap speed. Raises ModuleNotFoundError where heartpy is not installed.
+    """
     rows = []
     for number, case in USE_CASES.items():
         for speed in gap_speeds_mm_s:
@@ -320,8 +329,10 @@ RunKey = tuple[int, int, str, str]
 
 
 def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
-    """Return the runs of table 3.2: every start of both use cases (or the first `starts`), by every measure and
-    solver."""
+    """Return the runs of table 3.2 by use case, start, objective and solver.
+
+    `starts` is the number of starts of each use case; None: all. `gap_speed_mm_s` is the controller's.
+    """
     runs = {}
     for number, case in USE_CASES.items():
         for objective, problem in _problems(number, gap_speed_mm_s).items():
@@ -332,7 +343,10 @@ def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = Non
 
 
 def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
-    """Return the problem of each objective for a use case; `gap_speed_mm_s` is the controller's."""
+    """Return the problems of a use case by objective: trapezoid, true, true_thesis_speed and corners.
+
+    `gap_speed_mm_s` is the controller's, with which `true` is judged; the others are with the thesis's gap speed.
+    """
     region = USE_CASES[use_case].region
     return {
         "trapezoid": Problem(region, "trapezoid", GAP_SPEED_MM_S),
@@ -343,8 +357,10 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
 
 
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
-    """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's
-    designs."""
+    """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's designs.
+
+    `outcomes` holds the outcome of each of `runs`. `gap_speed_mm_s` is the controller's.
+    """
     starts: list[Json] = []
     local: list[Json] = []
     corners: list[Json] = []

@@ -102,9 +102,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int) -> Dataset:
-    """Record a hold of the last insert and SWEEPS sweeps of each, by processes, and return their rows.
+    """Record a hold of the last insert and SWEEPS sweeps of each, in processes, and return the rows of all.
 
-    `cycle` is the number of the record, `time_s` counts from its rest. Without `inserts` the scene's is swept.
+    `cycle` is the number of the record, `time_s` counts from its start. `inserts` None or empty: the scene's own.
+    Raises PlantError, ConfigError and DomainError for what cannot be used, RuntimeError where the device faults.
     """
     scene = load_scene(scene_name)
     names = inserts or [scene.insert.name]
@@ -119,7 +120,10 @@ def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int
 
 
 def sweep_course(scene: Scene, name: str, seed: int) -> Course:
-    """Return the course of a sweep down and up again, with steps at gaps drawn by the seed; both ends are reached."""
+    """Return the course of a sweep of the insert `name`, from the open gap down and up again, in steps of GAP_STEP_MM.
+
+    `seed` draws where the steps lie. Both ends, BEYOND_MM beyond the scene's gaps, are reached.
+    """
     closed_mm, open_mm = scene.insert.gap_closed_mm - BEYOND_MM, scene.insert.gap_open_mm + BEYOND_MM
     offset_mm = np.random.default_rng(seed).uniform(0.0, GAP_STEP_MM)
     between = np.arange(open_mm - offset_mm, closed_mm, -GAP_STEP_MM)
@@ -153,7 +157,12 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
 
 
 def rows_of(ticks: Array, scene: Scene) -> Array:
-    """Return the rows that are kept (n x 6) of all ticks (m x 4): time_s, handle_mm, gap_mm, and the signed force."""
+    """Return the training rows (n x 6) that are kept of all ticks (m x 4), in order of time.
+
+    A tick is time_s, handle_mm, gap_mm and the force, N, with the sign of the handle's way. A row is time_s, the four
+    features, and the force along the motion. Of the ticks of steady sliding one in EVERY is kept, of those due before
+    mobilisation one in LOADED_EVERY.
+    """
     _, handle_mm, gap_mm, signed_N = ticks.T
     sliding_mm_s, slides = sliding(handle_mm, gap_mm)
     loading_mm_s, loading_mm = loading(handle_mm, gap_mm, signed_N)
@@ -170,10 +179,10 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
 
 
 def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Array]:
-    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick.
+    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick (n).
 
-    The way is NaN but where a row is due: after a turn, at one speed, at a resting gap, every LOADED_STEP_MM to
-    LOADED_MM.
+    The way is NaN where no row is due. Rows are due after a turn, at one speed and a resting gap, every LOADED_STEP_MM
+    up to LOADED_MM.
     """
     gap_mm_s, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     is_resting &= np.abs(gap_mm_s) <= RESTING_GAP_MM_S
@@ -201,8 +210,10 @@ def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Ar
 
 
 def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
-    """Return the handle's rate, mm/s, at each tick, and a mask: it has slid steadily, at a steady gap, for long
-    enough."""
+    """Return the handle's rate, mm/s, at each tick (n), and a mask (n) of steady sliding at a steady gap.
+
+    Sliding counts after SETTLED_MM since rate or gap last changed, and MOBILISED_AFTER_MM since the handle turned.
+    """
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     slides = np.zeros(len(handle_mm), dtype=np.bool_)
@@ -221,8 +232,10 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
 
 
 def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
-    """Return the rate over a window around each tick, mm/s, and whether both halves of the window agree to
-    `changes_mm_s`."""
+    """Return the rate at each tick over a window around it, mm/s (n), and a mask (n) of where it is even.
+
+    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE.
+    """
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)
     before, after = np.concatenate((edge, gone)), np.concatenate((gone, edge))
@@ -231,8 +244,11 @@ def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array,
 
 
 def bench_scene(scene: Scene, name: str) -> Scene:
-    """Return the scene with another insert, the gaps that the bench's switches allow, and no force limit to fault
-    on."""
+    """Return `scene` for the bench: with the insert called `name`, wider gaps and a greater force allowed.
+
+    Only the name of the insert changes; a name that does not exist is not refused here. The closed gap is BEYOND_MM
+    less, the open one STOPS_MM more. The greatest force is BENCH_MOST_N, which no gap gives, so that none is a fault.
+    """
     stroke = msgspec.structs.replace(
         scene.insert,
         name=name,
@@ -246,7 +262,10 @@ def bench_scene(scene: Scene, name: str) -> Scene:
 
 
 def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
-    """Return the device on the bench: switches further apart, and carriages that start at the open gap."""
+    """Return `plant` on the bench of `scene`, which `bench_scene` made: with its switches at that scene's gaps.
+
+    The inner switches stand a little further in. Both carriages start just short of the open gap.
+    """
     home_mm = scene.insert.gap_open_mm / 2.0
     stops = msgspec.structs.replace(
         plant.assumed,

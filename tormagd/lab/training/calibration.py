@@ -111,9 +111,10 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
 
 
 def displacement(handle_mm: Array) -> Array:
-    """Return the displacement since the last turn at each position (n, mm, in order of time).
+    """Return the displacement since the handle's last turn at each of its positions `handle_mm` (n, in order of time),
+    mm.
 
-    NaN until a turn, or until so much travel that an earlier turn no longer matters.
+    NaN until the first turn, or until so much travel that an earlier turn no longer matters.
     """
     found = np.full_like(handle_mm, np.nan)
     start_mm = float(handle_mm[0])
@@ -129,7 +130,10 @@ def displacement(handle_mm: Array) -> Array:
 
 
 def require_usable(data: Dataset) -> None:
-    """Refuse data that no fit can make a model of. Raises CalibrationError: few_sweeps, field_range, force_dead."""
+    """Raise CalibrationError for data of `training_rows` that no fit can make a model of; else do nothing.
+
+    Its codes are few_sweeps, field_range (too small a range) and force_dead (a force that hardly rises with the field).
+    """
     assert data.cycle is not None  # training_rows sets it
     sweeps = len(np.unique(data.cycle))
     if sweeps < LEAST_SWEEPS:
@@ -160,7 +164,7 @@ def require_usable(data: Dataset) -> None:
 def noise_sd_N(data: Dataset) -> float:
     """Return the standard deviation of the force sensor's noise, N, from third differences of neighbouring rows.
 
-    These hold hardly anything but noise; 0 where no rows are neighbours.
+    Third differences hold hardly anything but noise. 0 where no rows are neighbours.
     """
     assert data.time_s is not None  # training_rows sets it
     steps = np.diff(data.time_s)
@@ -173,7 +177,8 @@ def noise_sd_N(data: Dataset) -> float:
 def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int = 50, epochs: int = 200) -> ForceModel:
     """Train a model on all sweeps but the judging ones, and return it with the judgement in its metrics.
 
-    Raises CalibrationError (poor_fit, not_rising) where it is not good enough to be used.
+    Raises CalibrationError where the judging sweeps fit too badly (poor_fit), or the force falls with the field
+    (not_rising). Raises LabError and DomainError as `Dataset.split` and `fit_model`.
     """
     from tormagd.lab.training.fitting import (
         fit_model,  # with torch, two seconds: whatever is refused is told without it
@@ -220,7 +225,7 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
 def require_rising(model: ForceModel, points: int = 64) -> None:
     """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1% of its span.
 
-    There a force has no one field.
+    Where the force falls, more than one field gives it. `points` is the number of fields that are tried.
     """
     ranges = dict(zip(FEATURES, model.feature_ranges, strict=True))
     rate_mm_s = sum(ranges["rate_mm_s"]) / 2.0
@@ -244,9 +249,10 @@ def require_rising(model: ForceModel, points: int = 64) -> None:
 def calibrate(
     sweep: Path, insert_name: str, inner_radius_mm: float, out: Path, training_csv: Path | None, created: datetime.date
 ) -> dict[str, Any]:
-    """Make a model file from a sweep file, and the training CSV if asked; return what was saved.
+    """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file).
 
-    Raises CalibrationError, LabError, DomainError, OSError. No model is written then.
+    Returns what was saved. Raises CalibrationError, LabError, DomainError and OSError. No model is written then, but
+    the training data may be.
     """
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     if training_csv is not None:
@@ -271,7 +277,11 @@ def read_sweep(path: Path) -> Array:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Calibrate, or check an insert, print the JSON object and return 0, or 1 where there is no model."""
+    """Run the calibration from the command line, print one JSON object and return the exit code.
+
+    `arguments` None: those of the process. 0: the model was written, or without a sweep the insert is known and the
+    needed packages are there. 1: there is no model, and the object holds `error`. Usage exits with 2.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(
         "sweep", type=Path, nargs="?", metavar="SWEEP.csv", help=f"columns {','.join(COLUMNS)}; none: check the insert"

@@ -70,7 +70,7 @@ class Dataset:
         return digest.hexdigest()
 
     def subset(self, rows: NDArray[np.integer] | Mask) -> "Dataset":
-        """Return the chosen rows (indices or a mask)."""
+        """Return the chosen `rows`, indices or a mask, as data of their own."""
         cycle = None if self.cycle is None else self.cycle[rows]
         time_s = None if self.time_s is None else self.time_s[rows]
         return Dataset(self.features[rows], self.force_N[rows], cycle, time_s)
@@ -113,7 +113,10 @@ def read_csv(path: Path) -> Dataset:
 
 
 def write_csv(path: Path | str, dataset: Dataset) -> None:
-    """Write `dataset` so that `read_csv` gives back the same numbers to the last bit."""
+    """Write `dataset` to `path`, replacing a file, so that `read_csv` gives back the same numbers to the last bit.
+
+    `cycle` and `time_s` are written where the data have them. Raises OSError.
+    """
     columns = dataset.columns()
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

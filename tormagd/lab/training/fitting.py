@@ -41,10 +41,10 @@ def fit_model(
     """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went.
 
     The data are of the `inserts`, told apart by their iron. `memory` is what was taken out of the data before. The
-    network is scaled by the ranges of `scaled_by`, of `training` by default, and begins with the weights of `start`, if
-    given. With `rising` its force rises with the field everywhere. Deterministic for given data and seed. Raises
-    `DomainError` for a name or count that a model file may not have, an insert without rows, or a force that does not
-    vary.
+    network is scaled by the ranges of `scaled_by` (None: of `training`), and begins with the weights of `start` (None:
+    random ones by `seed`). With `rising` its force rises with the field everywhere. Deterministic for given data and
+    seed. Raises `DomainError` for a name or count that a model file may not have, an insert without rows, or a force
+    that does not vary.
     """
     ranging = scaled_by or training
     scaling = scaling_of(ranging)
@@ -80,10 +80,10 @@ def fit_model(
 def fit_network(
     data: Dataset, known: Mask, hidden: int = 50, epochs: int = 162, start: ForceModel | None = None
 ) -> tuple[ForceModel, Training]:
-    """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` (n) in `known` (n,
-    mask).
+    """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` in the mask `known` (n).
 
-    A tenth of the rows, chosen at random, decides when it stops. Returns and raises as `fit_model`.
+    A tenth of these rows, chosen at random, decides when the training stops. `start` gives the first weights; None:
+    random ones. Returns and raises as `fit_model`.
     """
     rows = data.subset(known)
     stop = random_split(len(rows), 0, VALIDATION_SHARE)
@@ -111,7 +111,7 @@ def _box(data: Dataset, name: str) -> Ranges:
 
 @torch.no_grad()
 def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> None:
-    """Give the network the weights of `start`, folded into this scaling."""
+    """Give `network`, in place, the weights of `start`, folded from its scaling into `scaling`."""
     weight, bias, output, constant = start.physical
     gain = np.array(scaling.input_gain)
     network.hidden_weight.copy_(torch.tensor(np.divide(weight, gain, out=np.zeros_like(weight), where=gain != 0)))

@@ -49,8 +49,10 @@ class GreyBoxMemory:
         self._state, self._field_state = grey.series.relaxed(0.0), grey.field_series.relaxed(0.0)
 
     def elastic_N(self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float) -> float:
-        """Return the network's force, N, with which the pad gives `force_N` at the end of the next step; the state
-        stays."""
+        """Return the network's force, N, with which the pad gives `force_N` at the end of the next step.
+
+        The step comes to `displacement_mm` and `rate_mm_s`, on a pad with `cip_percent` of iron. The state stays.
+        """
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         rest_N, _ = self._step.advance(self._state, free_N)
         # the force is affine in the driving one: its value at 0 and its slope
@@ -60,7 +62,8 @@ class GreyBoxMemory:
         return free_N + (force_N - rest_N - past_N) / gain
 
     def advance(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Take the step at this field; return the force, N, that the model expects at its end."""
+        """Take one step, which ends at this motion and field, and return the force, N, that the model expects at its
+        end."""
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         whole_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
         rest_N, self._state = self._step.advance(self._state, free_N)
@@ -69,7 +72,7 @@ class GreyBoxMemory:
 
 
 def elastic_parts_N(model: ForceModel, data: Dataset) -> tuple[Array, Array]:
-    """Return two forces without memory (n), N: without field, and what the field adds."""
+    """Return the two parts (n each), N, of the force without memory in `data`: without field, and what a field adds."""
     fieldless = data.features.copy()
     fieldless[:, FIELD] = 0.0
     free_N = model.predict(fieldless)
@@ -81,12 +84,12 @@ def _with_memory(series: tuple[PronySeries, PronySeries], parts: tuple[Array, Ar
 
 
 def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries, PronySeries]:
-    """Fit the two series that best make the forces of `holds` from the elastic `parts` (n each), each record scaled to
-    fit.
+    """Fit the relaxation of two parts of the force to `holds`, and return a series for each part, with the same times.
 
-    The scales are free because a network that has never seen a hold is off by some percent there, which must not pass
-    for relaxation. For this reason only rows at rest count; the others make the state that they begin in. Raises
-    `DomainError` without `time_s`.
+    `parts` are the forces (n each), N, that the rows of `holds` would have without memory. The first is that without
+    field, the second what the field adds. Each record is scaled to fit. The scales are free because a network that has
+    never seen a hold is off by some percent there, which must not pass for relaxation. For this reason only rows at
+    rest count; the others make the state that they begin in. Raises `DomainError` without `time_s`.
     """
     at_rest = holds.features[:, RATE] == 0.0
     still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(holds)]

@@ -135,7 +135,11 @@ def train(
 
 
 def _made_rising(network: ForceNetwork) -> Tensor:
-    """Turn each unit so that it rises with the field, and return a mask of the parameters that must stay positive."""
+    """Turn each unit of `network`, in place, so that it rises with the field; return which parameters must stay
+    positive.
+
+    The result is a mask in the order of `network.parameters()`. The constant output is set to the middle of the forces.
+    """
     weight, output = network.hidden_weight, network.output_weight
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
     weight.mul_(side[:, None])
@@ -159,7 +163,10 @@ def _mean_square(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> floa
 
 
 def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return J'J / n (p x p) and J'r / n (p), summed over batches of rows, r = output - target."""
+    """Return J'J / n (p x p) and J'r / n (p) of the scaled force over p parameters, with r = output - target.
+
+    The n rows of `inputs` and `targets` are scaled, and taken in batches.
+    """
     size = sum(parameter.numel() for parameter in network.parameters())
     normal = torch.zeros(size, size, dtype=inputs.dtype)
     gradient = torch.zeros(size, dtype=inputs.dtype)

@@ -45,7 +45,10 @@ def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
 
 
 def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
-    """Return the force (n x r) of r records with the same times (n), from the force without memory (n x r)."""
+    """Return the force with memory (n x r), N, of r records with the same times `time_s` (n).
+
+    `driving_N` (n x r) is the force without memory.
+    """
     first_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 and time_s[0] > 0 else 0.0
     # rounded, so that steps that are equal but for the rounding of the time share one update
     steps_s = np.round(np.diff(time_s, prepend=time_s[0] - first_s), 9).tolist()

@@ -28,8 +28,10 @@ def leave_one_out(dataset: Dataset, feature: str) -> Iterator[tuple[float, Mask]
 
 
 def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[int, Mask]]:
-    """Yield each fold's number and the mask of its rows: whole cycles, every cycle in one fold; the data have
-    cycles."""
+    """Yield the number of each of `folds` folds, and the mask (n) of its rows.
+
+    A fold has whole cycles, and every cycle is in one fold. The data must have cycles.
+    """
     assert dataset.cycle is not None
     parts = np.array_split(np.random.default_rng(seed).permutation(np.unique(dataset.cycle)), folds)
     for fold, part in enumerate(parts):
@@ -64,8 +66,8 @@ def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str
 def not_rising_share(model: ForceModel, points: int = 17) -> float:
     """Return the share of a grid over the training box (`points` per feature that varies) where dF/dB <= 0.
 
-    There the field for a force is not unique, or the force does not depend on the field. For several inserts it is the
-    greatest share of one.
+    In these places no single field gives a force, or the force does not depend on the field. A model of several inserts
+    gets the greatest share of one.
     """
     if model.metadata.boxes:
         return max(not_rising_share(model.of(name), points) for name in model.metadata.boxes)

@@ -45,7 +45,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Train a model, write it to `--out` and return its metrics. Raises LabError, DomainError, OSError."""
+    """Train a model on the CSV `options.data`, write it to `options.out` and return its metrics.
+
+    Raises LabError for data or an option that is refused, DomainError as `fit`, OSError where the model cannot be
+    written.
+    """
     if not options.out.parent.is_dir():
         raise LabError(f"cannot write {options.out}: {options.out.parent} is not a directory")
     model, training = fit(options, read_csv(options.data))
@@ -55,7 +59,11 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
-    """Train on `data` and return the model with its metrics, and how it went. Raises DomainError."""
+    """Train on `data` as `options` say, and return the model with its metrics, and how the training went.
+
+    With `options.without_memory` the memory is taken out of the data first, told on stderr, and kept in the model.
+    Raises DomainError as `fit_model`, and LabError for a share that leaves too few rows on a side.
+    """
     data_sha256, memory = data.sha256(), NO_MEMORY
     if options.without_memory:
         memory, data = identify(data)

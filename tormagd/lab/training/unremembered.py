@@ -38,8 +38,7 @@ ROBUST_N = 0.05
 
 
 def identify(data: Dataset) -> tuple[Memory, Dataset]:
-    """Identify the memory in the records of `data`; return it, and the same rows with the forces of a device without
-    memory.
+    """Identify the memory in the records of `data`; return it, and the rows with the forces of a device without memory.
 
     Every record begins after a long rest. Deterministic. Raises `DomainError` without `time_s`.
     """
@@ -108,8 +107,12 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
 
 
 def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
-    """Return how far the field lags at each row: rate-independent, towards the side that each change of the field leads
-    to."""
+    """Return by how much the element's field lags behind `field_mT` (n) at each row, mT (n).
+
+    The element's field is `field_mT` less the lag. While the field rises, the lag goes to `memory.lag_mT`, while it
+    falls, to the negative of that. Most of the way takes a change by `memory.turn_mT`; time has no effect. Each record
+    of `rows` begins without a lag.
+    """
     lag_mT = np.zeros_like(field_mT)
     for record in records(rows):
         now, found = 0.0, []
@@ -123,7 +126,10 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
 
 
 def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:
-    """Return how much of `driving_N` (n) the elastomer has relaxed since the rest before each record."""
+    """Return how much of the force `driving_N` (n) has relaxed away at each row, N (n).
+
+    Each record of `rows` begins as after a long rest under its first force.
+    """
     times, away_N = times_of(rows), np.zeros_like(driving_N)
     fractions = np.array(memory.fractions)
     for record in records(rows):
