@@ -99,8 +99,8 @@ def _transitions() -> str:
         asked = "-" if row.request is DeviceRequest.NONE else str(row.request)
         rows.append((f"*{event}*" if event is Event.FAULT else f"`{event}`", *leads, guards, asked))
     return (
-        "## Events\n\nWhere an event leads, or what it is refused with. Without a device every command but `stop` is "
-        "refused with `not_connected`.\n\n"
+        "## Events\n\nWhere an event leads, or what it is refused with. Without a device every command is refused "
+        "with `not_connected`, but `stop`, and `use-scene` while DISABLED.\n\n"
         + table(("event", *OperatingState, "guards, in their order", "device is asked"), rows)
         + "\n"
     )
