@@ -103,7 +103,9 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     # a name that is taken, or a folder that is none, says so
     process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {}))
     assert "exists" in process.heard().refusal
+    process.say(Write("20300102T000000.000Z-DUE.mcap", "DUE", 3_600.0, {}))
     process.say(Begin(str(folder / "20300101T000000.000Z-SKEW.mcap"), HEADER))
+    assert process.heard() == Written("20300102T000000.000Z-DUE.mcap")
     process.say(Write("x.mcap", "SKEW", 0.0, {}))
     assert "x.mcap" in process.heard().refusal
     # no word, no daemon: it was killed. Each beginning is of another scene, and keeps nothing of the one before

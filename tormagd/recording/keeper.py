@@ -81,10 +81,15 @@ class Keeper:
                 # in a thread of its own: what the daemon says meanwhile is kept
                 self._writing = threading.Thread(target=self._write, args=(due[1], self._begun, self._ring.parts()))
                 self._writing.start()
+        self._write_due()
+
+    def _write_due(self) -> None:
+        """Write all black boxes that are still due, without waiting for what should have come into them."""
         if self._writing is not None:
             self._writing.join()
         for _, write in self._due:
             self._write(write, self._begun, self._ring.parts())
+        self._due.clear()
 
     def _hear(self) -> bool:
         """Wait for one packet from the daemon and take it; False once the daemon has ended.
@@ -108,11 +113,12 @@ class Keeper:
         return not isinstance(said, End)
 
     def _take(self, said: Said) -> None:
-        """Take a part, begin anew with an empty ring, or queue a file; one over MOST_DUE is refused with an answer."""
+        """Take a part, begin anew once all that is due is written, or queue a file; refuse one over MOST_DUE."""
         match said:
             case Part():
                 self._ring.put(said)
             case Begin():
+                self._write_due()  # they are of the scene that ends
                 self._begun, self._ring = said, Ring()
             case Write() if len(self._due) < MOST_DUE:
                 self._due.append((time.monotonic() + said.after_s, said))
