@@ -228,7 +228,7 @@ def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
     path.write_text("Machine;X\ntime_s, displacement_mm ,force_N,note\n0,0,0,a\n1,0.5,20,b\n\n2,1,45\n")
     assert read_compression(path).force_N.tolist() == [0.0, 20.0, 45.0]
     for text, said in (
-        ("a,b\n1,2\n", "header is .*needed is 'time_s,displacement_mm,force_N'"),
+        ("a,b\n1,2\n", "header: 'time_s' is missing.*needed is time_s,displacement_mm,force_N"),
         ("time_s,displacement_mm,force_N\n", "0 rows"),
         (
             "time_s,displacement_mm,force_N\n0,0,0\n1,nan,0\n",

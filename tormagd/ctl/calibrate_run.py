@@ -39,7 +39,10 @@ HANDLE_PATIENCE_S = 30.0
 
 
 def interrupted_run() -> CommandError:
-    """Return the error (REFUSED) for a run that the person ended; nothing of it is kept."""
+    """Return the error (REFUSED) for a run that the person ended: no model and no log is saved.
+
+    The daemon may keep what it learned of the device, and a file of training data may have been written.
+    """
     return CommandError(
         Exit.REFUSED,
         "interrupted",

@@ -131,8 +131,8 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     `config` None means the defaults. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more
     than its budget; USAGE for a faulty scene.
     """
-    derived = _derived(name, config)
     scene = _loaded(name)
+    derived = _derived(name, config)
     file = measured()
     share = file.share(way_of(derived)) if not derived["terms_out"] else None
     if share is not None and share.daemon > scene.budget.core_share:
@@ -197,9 +197,9 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
 
     Raises CommandError: REFUSED where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
     """
-    derived = _derived(name, config)
     file = measured()
     found = measured_as(_loaded(name), file)
+    derived = _derived(name, config)
     tolerance_N = found.tolerance_N
     runs = way_of(derived)
     lines = [

@@ -258,10 +258,20 @@ class Scene(Strict, frozen=True):
     def fingerprint(self) -> str:
         """The hash, 16 hex digits, of what the scene asks for.
 
-        The scene's name, description and budget, and how it is served (terms, rates, search), do not count.
+        The scene's name, description and budget, how it is served (terms, rates, search), and the folders of its files
+        do not count.
         """
+        signal, insert = self.signal, self.insert
         task = msgspec.structs.replace(
-            self, name="", description="", terms=EVERY_TERM, bandwidth=Bandwidth(), solver=Solver(), budget=Budget()
+            self,
+            name="",
+            description="",
+            signal=None if signal is None else msgspec.structs.replace(signal, file=Path(signal.file).name),
+            insert=msgspec.structs.replace(insert, model=Path(insert.model).name),
+            terms=EVERY_TERM,
+            bandwidth=Bandwidth(),
+            solver=Solver(),
+            budget=Budget(),
         )
         return hashlib.sha256(msgspec.json.encode(task)).hexdigest()[:16]
 

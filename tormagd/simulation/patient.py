@@ -215,8 +215,8 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the simulated patient from the command line and return the exit code.
 
-    `arguments` None: those of the process. 0: setpoints were published; 1: none were, or the daemon was not reached; 2:
-    usage.
+    `arguments` None: those of the process. 0: setpoints were published; 1: none were, or the daemon was not reached.
+    Usage exits with 2.
     """
     command = parser()
     options = command.parse_args(arguments)

@@ -89,7 +89,7 @@ def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: 
 def _friction(ratios: list[float]) -> float:
     """Return the friction coefficient with the least mean relative error of range.
 
-    `ratios` are the inserts' ranges without friction, over the measured ones.
+    `ratios`, all over 0: each insert's range at a friction coefficient of 1, over its measured range.
     """
     # the minimum of sum |mu r - 1| = sum r |mu - 1/r| is the median of 1/r, weighted by r
     ordered = sorted(ratios, reverse=True)
