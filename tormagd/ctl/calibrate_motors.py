@@ -96,10 +96,10 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 def motor_log(ticks: Columns, side: Side) -> Columns:
     """Return the motor log's columns from control ticks, evenly spaced on the device's clock, with time from 0.
 
-    A row's voltage is the one sent in answer to the row's position: duty times supply. Positions are from the
-    centre plane, positive as the gap opens; `force_N` is the force at the roller and says nothing about the motor. Ticks
-    without news from the device are left out. Between measurements voltages are held, other values interpolated. Raises
-    CommandError (REFUSED) where the device was silent for more than LONGEST_HOLE_S, or throughout.
+    A row's voltage is the one sent in answer to the row's position: duty times supply. Positions are from the centre
+    plane, positive as the gap opens; `force_N` is the force at the roller and says nothing about the motor. Ticks
+    without news from the device are left out. Between measurements voltages are held, other values interpolated.
+    Raises CommandError (REFUSED) where the device was silent for more than LONGEST_HOLE_S, or throughout.
     """
     known = np.isfinite(np.column_stack([ticks[name] for name in COLUMNS])).all(axis=1)
     time_s = ticks["device_time_s"][known]
