@@ -34,6 +34,7 @@ class Rig:
         self.config.write_text(
             'scene = "coronary"\n[realtime]\nfifo_priority = 50\n'  # only a warning where it is refused
             f'[device]\nport = "{self.port}"\nprofiles = "{folder}/profiles"\nmeasurement_timeout_ms = 50.0\n'
+            "[rates]\ncontrol_hz = 1000\n"  # a motor log wants that
             f'[black_box]\nfolder = "{folder}/boxes"\n[endpoints]\n'
             + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
         )
