@@ -55,7 +55,7 @@ class Console:
 
     def is_ready(self) -> bool:
         """Whether its device is identified, and nothing else has happened."""
-        return self.stands("active", "DISABLED", "next: tormagctl home")
+        return self.stands("active", "DISABLED", "next: tormagctl arm")
 
     def restarts(self) -> int:
         """How often systemd has started it again."""
@@ -114,7 +114,7 @@ def it_is_up_with_a_device_only(console) -> None:
     machine.until(lambda: console.stands("activating", "waiting for the device (BACK_OFF): /dev/tormag"), "it waits")
     machine.run("systemctl", "start", "simulator@tormag")
     machine.until(console.is_ready, "the device is identified")
-    assert "ready: the device is identified; next: home" in console.log()
+    assert "ready: the device is identified; next: tormagctl arm" in console.log()
     assert machine.shows("tormagd", "NRestarts", "WatchdogUSec") == ["0", "2s"]
 
 
