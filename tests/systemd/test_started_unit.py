@@ -138,10 +138,10 @@ def what_can_change_does_and_what_cannot_is_named(console) -> None:
     machine = console.machine
     put(machine, "/tmp/change.sh", "cd /etc/tormag; echo '[sources]\npriority = [\"robot\"]' >> tormagd.toml")
     machine.run("sh", "/tmp/change.sh")
-    machine.run("sed", "-i", "s/^command_timeout_ms = 50.0/command_timeout_ms = 40.0/", "/etc/tormag/tormagd.toml")
+    machine.run("sed", "-i", "s/^keep_awake = true/keep_awake = false/", "/etc/tormag/tormagd.toml")
     machine.run("systemctl", "reload", "tormagd")
     machine.until(lambda: "now in force: sources.priority" in console.log(), "reloaded")
-    assert "not before a restart (systemctl restart tormagd): device.command_timeout_ms" in console.log()
+    assert "not before a restart (systemctl restart tormagd): realtime.keep_awake" in console.log()
     assert "no list of keys" in console.log()
 
 
