@@ -40,7 +40,7 @@ def page() -> str:
         "*RMS* is of the true force for the scene's own signal, mN, on the worst of samples 1 to 3 while the device is "
         "learned; **bold** where the scene is not met. *Share* is processor time of all processes of the daemon over "
         f"wall time, the median of {file.pairs} runs on the simulated device, beside a `machine_us` of "
-        f"{file.machine_us:g}. *Usual* is {told(file.scenes[0].usual.way)}.",
+        f"{file.machine_us:g}. *Usual* is {file.scenes[0].usual.way}.",
         f"![error over the daemon's share](<{TRADE.as_posix()}>)",
         "A point is a scene served in one way: its error as a share of its tolerance, over what the daemon takes. The "
         "thesis's own loop searches row by row, in a process beside the daemon.",
@@ -96,15 +96,10 @@ def _row(name: str, found: MeasuredScene, file: Measured) -> list[str]:
         f"{force.least_N:g} to {force.most_N:g} N",
         f"{1e3 * force.tolerance_rms_N:g} mN",
         f"{low_N:.2f} to {high_N:.2f} N ({share:.0%})",
-        told(found.chosen),
+        str(found.chosen),
         rms_mN if found.is_met else f"**{rms_mN}**",
         f"{taken(file, found.usual.way)} / {taken(file, found.chosen)}",
     ]
-
-
-def told(way: Way) -> str:
-    """Rates and search, for a person."""
-    return f"{way.control_hz} / {way.inference_hz} Hz, {way.search}"
 
 
 def taken(file: Measured, way: Way) -> str:
@@ -115,7 +110,7 @@ def taken(file: Measured, way: Way) -> str:
 
 def _ways(file: Measured) -> str:
     rows = [
-        [told(share.way), f"{100.0 * share.daemon:.1f}", f"{share.tick_us:.0f}", f"{share.plan_us:.0f}"]
+        [str(share.way), f"{100.0 * share.daemon:.1f}", f"{share.tick_us:.0f}", f"{share.plan_us:.0f}"]
         for share in file.shares
     ]
     every = [share.way for share in file.shares]
@@ -125,7 +120,7 @@ def _ways(file: Measured) -> str:
         "come as often as plans are made. 83 Hz is the thesis's own rate.\n\n"
         + table(["control / plans, search", "daemon, %", "tick, us", "plan, us"], rows)
         + "\n\nRMS on the worst of samples 1 to 3, mN:\n\n"
-        + table(["scene", *map(told, every)], errors)
+        + table(["scene", *map(str, every)], errors)
     )
 
 
@@ -171,7 +166,7 @@ def draw_trade(path: Path, file: Measured) -> None:
             if tried.way == share.way and scene.is_met
         ]
         if ratios:
-            axes.plot([100.0 * share.daemon] * len(ratios), ratios, "o", alpha=0.5, label=told(share.way))
+            axes.plot([100.0 * share.daemon] * len(ratios), ratios, "o", alpha=0.5, label=str(share.way))
             middles.append((100.0 * share.daemon, float(np.median(ratios))))
     front = [point for place, point in enumerate(middles) if all(point[1] < other[1] for other in middles[:place])]
     axes.plot(*np.array(front).T, "k--", label="no other is cheaper and as exact (medians)")

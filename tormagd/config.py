@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import checked as checked, convert, read_toml, table_in as table_in
+from tormagd.toml_file import checked as checked, convert_as, table_in as table_in
 from tormagd_client.endpoints import Endpoints, Strict, require_usable
 from tormagd_client.printable import require
 
@@ -282,8 +282,14 @@ def load_config(path: Path | None) -> Config:
     Where neither rates.control_hz, rates.inference_hz nor rates.of_scene is stated, `rates.of_scene` becomes true: the
     daemon then runs at its scene's rates.
     """
-    config = Config() if path is None else convert(path, Config)
-    stated = {} if path is None else read_toml(path).get("rates", {})
-    if stated.keys() & {"control_hz", "inference_hz", "of_scene"}:
+    stated: set[str] = set()
+
+    def kind_of(tables: dict[str, Any]) -> type[Config]:
+        rates = tables.get("rates")
+        stated.update(rates if isinstance(rates, dict) else ())
+        return Config
+
+    config = Config() if path is None else convert_as(path, kind_of)
+    if stated & {"control_hz", "inference_hz", "of_scene"}:
         return config
     return msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, of_scene=True))

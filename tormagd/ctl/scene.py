@@ -164,7 +164,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
             else []
         ),
         *_waiting(force, derived["approaches_s"]),
-        f"served     {told(way_of(derived))}",
+        f"served     {way_of(derived)}",
         "cost       not measured of these rates, search and terms"
         if share is None
         else f"cost       {share.daemon:.1%} of a processor for the daemon, {scene.budget.core_share:.0%} are allowed",
@@ -227,17 +227,12 @@ def _tried(tried: Tried, share: Share | None, chosen: Way, runs: Way) -> str:
     marks = [word for way, word in ((chosen, "chosen"), (runs, "runs here")) if way == tried.way]
     errors = " ".join(f"{1e3 * error_N:6.1f}" for error_N in tried.rms_N)
     taken = "not measured" if share is None else f"{share.daemon:.1%}"
-    return f"{told(tried.way):28} {errors:>22} {taken:>15}  {', '.join(marks)}".rstrip()
+    return f"{tried.way!s:28} {errors:>22} {taken:>15}  {', '.join(marks)}".rstrip()
 
 
 def way_of(derived: dict[str, Any]) -> Way:
     """Return the way (rates and search) by which the daemon's own check would serve the scene."""
     return Way(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
-
-
-def told(way: Way) -> str:
-    """Say a way's rates and search, for a person."""
-    return f"{way.control_hz} / {way.inference_hz} Hz, {way.search}"
 
 
 def measured_as(scene: Scene, file: Measured) -> MeasuredScene:

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
-from tormagd.ctl.scene import as_toml, measured_as, told
+from tormagd.ctl.scene import as_toml, measured_as
 from tormagd.scenes.measured import Share, Tried, Way, measured
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd_client.endpoints import ConfigError
@@ -33,7 +33,7 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
     ]
     tried, taken = _most_wanted(ways, share, tolerance_N or 0.0)
     text = (
-        f"{scene.name}: {told(tried.way)}: {1e3 * tried.worst_N:.1f} mN RMS at worst on samples 1 to 3, "
+        f"{scene.name}: {tried.way}: {1e3 * tried.worst_N:.1f} mN RMS at worst on samples 1 to 3, "
         f"the daemon takes {taken.daemon:.1%} of a processor"
     )
     if out is not None:

@@ -114,6 +114,7 @@ class TelemetryLoop:
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
         """Publish and report on `core` from now on, with its configuration and profiles; reports are made anew."""
         self.config, self._core, self.topics.core, self._profiles = config, core, core, profiles
+        self._following = Following(1.0 / config.rates.telemetry_hz, core.scene.force.tolerance_rms_N)
         self._status, self._reported_s = None, -math.inf
 
     def record(self, _beat: Beat) -> None:

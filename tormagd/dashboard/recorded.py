@@ -82,8 +82,7 @@ class Recorded:
     def __init__(self, file: RecordingFile) -> None:
         """Raise ValueError where the recording has no message."""
         overview = file.overview
-        if not overview.ticks and not overview.snapshots:
-            raise ValueError("the recording has no messages: was the daemon running?")
+        overview.require_messages()
         self._file, self._overview, self._start_ns = file, overview, overview.start_ns
         self.duration_s = overview.duration_s
         self._read: tuple[int, int, Moments, Moments] | None = None

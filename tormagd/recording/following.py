@@ -20,7 +20,7 @@ STEP_NS = 10_000_000
 DELAYS = 31
 
 
-class FollowingReport(msgspec.Struct, frozen=True):
+class Followed(msgspec.Struct, frozen=True):
     """How a force was followed: RMS of measured minus asked, for how long, and the RMS at the delay where it is least.
 
     `aligned_rms_N` compares the force with what was asked `delay_ms` earlier. None where nothing was followed, or too
@@ -73,7 +73,7 @@ class Following:
                     self._sums[i] += (measured_N - earlier_N) ** 2
                     self._counts[i] += 1
 
-    def made(self) -> FollowingReport | None:
+    def made(self) -> Followed | None:
         """Report the error so far; None where nothing was followed.
 
         `aligned_rms_N` and `delay_ms` are None where messages came too far apart to tell a delay.
@@ -83,9 +83,9 @@ class Following:
         rms_N = math.sqrt(self._sum / self._count)
         means = [total / count for total, count in zip(self._sums, self._counts, strict=True) if count]
         if not means:
-            return FollowingReport(rms_N, self._lasted_ns * 1e-9)
+            return Followed(rms_N, self._lasted_ns * 1e-9)
         best = min(range(len(means)), key=means.__getitem__)
-        return FollowingReport(rms_N, self._lasted_ns * 1e-9, math.sqrt(means[best]), best * STEP_NS * 1e-6)
+        return Followed(rms_N, self._lasted_ns * 1e-9, math.sqrt(means[best]), best * STEP_NS * 1e-6)
 
 
 def is_asked(message: Mapping[str, Any]) -> bool:

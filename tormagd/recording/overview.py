@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from tormagd.recording.following import Following, FollowingReport
+from tormagd.recording.following import Followed, Following
 from tormagd_client.messages import Mark
 
 Floats = NDArray[np.float64]
@@ -112,7 +112,7 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     of_snapshots: Curves
     codes: dict[str, dict[str, Codes]]
     "By kind, then by code in the order of their first appearance."
-    following: FollowingReport
+    following: Followed
     late_counts: list[int]
     marks: list[Mark]
 
@@ -120,6 +120,11 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     def duration_s(self) -> float:
         """Return the time from the first message to the latest, s."""
         return (self.end_ns - self.start_ns) * 1e-9
+
+    def require_messages(self) -> None:
+        """Raise ValueError where the recording has neither ticks nor snapshots."""
+        if not self.ticks and not self.snapshots:
+            raise ValueError("the recording has no messages: was the daemon running?")
 
     def series(self, name: str) -> Series | None:
         """Return the quantity `name`, from the ticks or else from the snapshots; None where neither has a known
@@ -217,7 +222,7 @@ class OverviewBuilder:
             of_ticks=self._stretches[True].made(),
             of_snapshots=self._stretches[False].made(),
             codes={kind: ticks[kind] or snapshots[kind] for kind in KINDS},
-            following=self._following[True].made() or self._following[False].made() or FollowingReport(),
+            following=self._following[True].made() or self._following[False].made() or Followed(),
             late_counts=self._late,
             marks=self._marks,
         )

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tormagd.bounded_file import in_place_of
-from tormagd.recording.following import FollowingReport
+from tormagd.recording.following import Followed
 from tormagd.recording.overview import BREAK_S, Overview, Series
 
 FORMATS = (".png", ".svg", ".pdf")
@@ -47,8 +47,7 @@ def figure(overview: Overview, title: str, is_complete: bool = True) -> Figure:
 
     `is_complete` False adds "recording cut short" to the title. Raises ValueError for a recording without messages.
     """
-    if not overview.ticks and not overview.snapshots:
-        raise ValueError("the recording has no messages: was the daemon running?")
+    overview.require_messages()
     states, limits, faults = (overview.spans_s(kind) for kind in ("operating_state", "limits", "faults"))
     lanes = bool(states) + len(limits) + max(1, len(faults))
     fig = Figure(figsize=(12.0, 7.6 + 0.25 * lanes), layout="constrained")
@@ -102,7 +101,7 @@ def save_plot(drawn: Figure, path: Path) -> None:
         unfinished.write_bytes(data)
 
 
-def followed(known: FollowingReport) -> str:
+def followed(known: Followed) -> str:
     """Say in words how well the force was followed; empty where nothing was."""
     if known.rms_N is None:
         return ""

@@ -13,6 +13,10 @@ class Way(Struct, frozen=True):
     inference_hz: int
     search: str
 
+    def __str__(self) -> str:
+        """Say rates and search, for a person."""
+        return f"{self.control_hz} / {self.inference_hz} Hz, {self.search}"
+
 
 class Share(Struct, frozen=True):
     """The processor time of a daemon that serves a scene in one way, live on the simulated device.
