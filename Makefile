@@ -58,7 +58,7 @@ compiled: $(VENV)/.dev
 
 # the core's tests on the other build
 interpreted: $(VENV)/.dev
-	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' $(CORE_TESTS)
+	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not long' $(CORE_TESTS)
 
 # which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
 # part are asked again, interpreted. pyproject.toml has the least share

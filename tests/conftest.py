@@ -74,13 +74,13 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
         try:
             pyfuncitem.obj(**call)
             return True
-        except (Exception, pytest.fail.Exception):
+        except (Exception, pytest.fail.Exception) as error:
             del pyfuncitem.config.stash[WATCHED]
             watched.end()
             host = watched.between(start_s, time.monotonic())
             if attempt == ATTEMPTS or not host.took_much:
                 raise
-            warnings.warn(f"{pyfuncitem.nodeid} is started again: {host}", HostWarning, stacklevel=2)
+            warnings.warn(f"{pyfuncitem.nodeid} is started again: {host}; {error}", HostWarning, stacklevel=2)
         folder = tmp_path_factory(pyfuncitem).mktemp("again")
         if "tmp_path" in call:
             call["tmp_path"] = folder

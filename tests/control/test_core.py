@@ -233,6 +233,7 @@ elapsed = st.sampled_from([0.0, 1e-3, 1e-3, 1e-5, 0.1, 5.0, 3_600.0, -1e-3, -10.
 commands = st.none() | st.sampled_from(["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"])
 
 
+@pytest.mark.long
 @settings(max_examples=200, deadline=None)
 @given(
     history=st.lists(st.tuples(elapsed, measurements, plans, commands), min_size=1, max_size=25),
@@ -374,6 +375,7 @@ def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_
     assert running.opened_for == (fault,)
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
 def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:

@@ -136,6 +136,20 @@ def request(command: str) -> bytes:
 # -- who is let in -------------------------------------------------------------------------------------------------
 
 
+@over_tcp
+def test_who_crowds_one_endpoint_keeps_nobody_from_another(rig: Rig) -> None:
+    with contextlib.ExitStack() as strangers:
+        for _ in range(100):
+            strangers.enter_context(rig.dial())
+        rig.peer(zmq.SUB, "recording", rig.pair("viewer"))
+        time.sleep(0.2)  # libzmq tells of them in its own time
+        rig.endpoint.arrivals.look()
+        for _ in range(8):
+            rig.endpoint.admission.update()
+        assert rig.endpoint.admission.connections()["recording"] == 1
+        assert rig.endpoint.admission.connections()["setpoint"] < 100
+
+
 def test_an_operator_commands_and_an_observer_only_looks(rig: Rig) -> None:
     replies = {}
     for name, commands in (("console", ("enable", "stop", "status")), ("viewer", ("stop", "enable", "status"))):

@@ -165,6 +165,7 @@ def test_a_frame_that_comes_late_is_not_lost(start: int, late: int) -> None:
     assert (decoder.statistics.lost, decoder.statistics.repeated) == (0, 0)
 
 
+@pytest.mark.long
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 10_000), lossy=st.booleans())
 def test_a_line_that_reorders_loses_what_it_lost(seed: int, lossy: bool) -> None:

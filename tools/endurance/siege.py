@@ -22,7 +22,7 @@ import msgpack
 import zmq
 from tqdm import tqdm
 
-from endurance.stand import Figures, Stand
+from endurance.stand import LOOK_S, Figures, Stand
 from tormagd.daemon.endpoint import SETPOINTS_PER_S
 from tormagd.safety.operating_state import DeviceRequest
 from tormagd_client.endpoints import Endpoints
@@ -228,6 +228,9 @@ def _stop(stand: Stand, draw: random.Random) -> float:
     time.sleep(draw.uniform(*HELD_S))
     stand.see_faults(since_s)
     with stand.ticks() as read:
+        until_s = time.monotonic() + PATIENCE_S
+        while not read() and time.monotonic() < until_s:  # the daemon takes its time for who subscribes
+            time.sleep(LOOK_S)
         sent_s = time.monotonic()
         stand.client.request("stop")
         told: list[float] = []

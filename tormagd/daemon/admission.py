@@ -12,6 +12,7 @@ import socket
 import struct
 import time
 from collections import Counter, deque
+from functools import partial
 from typing import Any
 
 import zmq
@@ -41,7 +42,7 @@ GUARDED = {
     zmq.TCP_KEEPALIVE_CNT: 4,
 }
 "Options of a guarded socket; times are in ms and s."
-AT_ONCE = 4
+AT_ONCE = 8
 "Events taken in one slice at most."
 WATCHED = (
     zmq.EVENT_ACCEPTED
@@ -147,6 +148,7 @@ class Admission:
         self._zap = context.socket(zmq.ROUTER)
         self._zap.linger = 0
         self._zap.bind("inproc://zeromq.zap.01")
+        self._parts = deque([(self._zap, self._admit)])
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
@@ -165,19 +167,21 @@ class Admission:
             for option, value in (GUARDED | keyed).items():
                 endpoint.setsockopt(option, value)
         known = self._endpoints[name] = _Connections(name, endpoint, is_guarded)
+        self._parts.append((known.monitor, partial(self._watch, known)))
         self._arrivals.watch(known.monitor)
 
     def update(self) -> bool:
-        """Handle up to AT_ONCE waiting events of one socket; return False where none waits.
+        """Handle up to AT_ONCE waiting events of one socket, the next in turn that has any; return False where none
+        has.
 
         Answers libzmq's questions about keys, counts refusals, and cuts off connections beyond the allowed number.
         """
-        if self._arrivals.has(self._zap):
-            self._admit()
-            return True
-        for known in self._endpoints.values():
-            if self._arrivals.has(known.monitor):
-                self._watch(known)
+        # in turn: who knocks at one endpoint without pause must not keep everybody from the others
+        for _ in range(len(self._parts)):
+            self._parts.rotate()
+            events, handle = self._parts[0]
+            if self._arrivals.has(events):
+                handle()
                 return True
         return False
 

@@ -211,6 +211,7 @@ def swing(core, moving):
     return swung
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.017), (0.0, 0.002), (-0.01, 0.0), (0.06, MAX_LAG_S)])
 def test_a_lag_is_learned_where_what_comes_is_known(swing, late_s: float, learned_s: float) -> None:
     """And half a plan's period besides: by so much the governor's gap goes before what is previewed."""
@@ -218,6 +219,7 @@ def test_a_lag_is_learned_where_what_comes_is_known(swing, late_s: float, learne
     assert swing(late_s, is_known=True, seconds=1.0, learns=False).believe.carriages.lag_s == 0.0
 
 
+@pytest.mark.long
 def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(swing) -> None:
     early = swing(0.015, is_known=False, seconds=1.0)
     assert (early.planned.foresight, early.believe.carriages.lag_s) == (0.0, 0.0)
@@ -235,6 +237,7 @@ def test_what_is_taught_is_known_until_it_begins_afresh(planner) -> None:
     assert (planner.planned.number, planner.planned.gap_mm, planner.planned.time_s) == (1, 95.0, 3.0)
 
 
+@pytest.mark.long
 def test_a_replay_and_what_is_read_back_plan_the_same(core, swing, planned, moving) -> None:
     first, again = (swing(0.015, is_known=False, seconds=3.0) for _ in range(2))
     assert first.planned.foresight > 0.0

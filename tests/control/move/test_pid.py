@@ -121,6 +121,7 @@ def test_both_directions_are_alike(error: float, speed: float, integral: float) 
     assert (updated(mirrored, -error, -speed), mirrored.integral) == (-updated(stage, error, speed), -stage.integral)
 
 
+@pytest.mark.long
 @settings(max_examples=5, deadline=None)
 @given(position=positions, error=st.floats(0.5, 50.0), dt_s=st.sampled_from([0.01, 0.05, 0.1]))
 def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float, dt_s: float) -> None:

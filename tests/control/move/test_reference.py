@@ -25,6 +25,7 @@ fastest = st.builds(Speeds, st.floats(40.0, 60.0), st.floats(5.0, 60.0), st.floa
 periods = st.floats(1e-5, 0.1)
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(
     position=limits,
@@ -55,6 +56,7 @@ def test_speed_and_acceleration_limits_hold_for_any_target(
         )
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(position=limits, speeds=fastest, start=gaps, target=gaps)
 @example(position=LIMITS, speeds=SPEEDS, start=70.0, target=69.0)
