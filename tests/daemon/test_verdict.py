@@ -57,7 +57,8 @@ def test_it_arrives_when_the_gap_has_gone_there_and_the_carriages_have_come(core
     judgement = found(core, plan(1.5), 1.0)
     assert judgement == (ARRIVES, pytest.approx(1e3 * (way_mm / 40.0 + 0.01), abs=0.051), ())
     assert found(core, plan(1.0), 1.5).arrives_ms == judgement.arrives_ms
-    on_its_way = plan(1.5, (Limit.TAKEOVER,)).replaced(governed_N=0.5)
+    # the ramp begins where the gap is open
+    on_its_way = plan(1.5, (Limit.TAKEOVER, Limit.F_MIN)).replaced(governed_N=0.5)
     assert found(core, on_its_way, 0.5).arrives_ms == pytest.approx(1e3 * (1.0 / 2.0 + 0.01))
 
 

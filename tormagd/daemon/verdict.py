@@ -75,10 +75,13 @@ def judged(
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
     """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there.
 
-    The ceiling does where the aim is beyond it, the model's range where it bounds the field, and all in HOLDING do.
+    The ceiling does where the aim is beyond it, the model's range where it bounds the field, F_MIN where the ramp does
+    not lead up from it, and the others in HOLDING always.
     """
     if limit is Limit.CEILING:
         return aim_mm < plan.min_gap_mm
+    if limit is Limit.F_MIN:
+        return (plan.setpoint_N or 0.0) <= plan.governed_N
     if limit is Limit.MODEL_RANGE:
         return any(each.quantity == FIELD for each in plan.outside)
     return limit in HOLDING
