@@ -61,8 +61,8 @@ class NearestFieldSearch:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """Return the field for `force_N`; of several the one nearest `last_field_mT`, or the least where that is None.
 
-        A force out of reach gets the field that comes nearest; `reach` says so. Raises `DomainError` for numbers that
-        are not finite.
+        A force out of reach gets the field that comes nearest; `reach` says so. `iterations` is 2. Raises `DomainError`
+        for numbers that are not finite or too large.
         """
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
         forces_N = curve.forces_N(self._fields_mT) if self._batch is None else self._batch(curve)
@@ -74,6 +74,7 @@ class NearestFieldSearch:
         """Return the fields that fit equally well, mT, and whether the force asked is in reach.
 
         `excess_N` is the predicted less the asked force at each grid point. Forces nearer than `same_N` are equal.
+        Roots between grid points are among the fields; the grid point nearest `near_mT` is, where it fits as well.
         """
         fields = self._fields_mT
         below = excess_N < 0

@@ -39,8 +39,8 @@ class RisingSearch:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """Return the field for `force_N`. The search begins at `last_field_mT`, or at the least field where it is None.
 
-        A force out of reach gets the nearer end of the range; `reach` says so. Raises `DomainError` for numbers that
-        are not finite.
+        A last field out of range counts as the end that it lies beyond. A force out of reach gets the nearer end of the
+        range; `reach` says so. Raises `DomainError` for numbers that are not finite or too large.
         """
         low, high = self._low_mT, self._high_mT
         span = high - low

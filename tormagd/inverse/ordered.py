@@ -67,8 +67,9 @@ class RowByRow:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest.
 
-        `reach` is INSIDE where a row is within epsilon, or rows lie on both sides. `last_field_mT` may be None; it is
-        checked and not used. Raises `DomainError` for numbers that are not finite.
+        `reach` is INSIDE where a row is within epsilon, or rows lie on both sides. It is BELOW where all rows give more
+        than `force_N`, ABOVE where none does. `last_field_mT` may be None; it is checked and not used. Raises
+        `DomainError` for numbers that are not finite or too large.
         """
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0

@@ -52,7 +52,10 @@ def functions(value: Any) -> SimpleNamespace | ModuleType:
 
 
 class BrakeCurve(NamedTuple):
-    """The brake curve of one wall ratio and body-force weight. Arguments and results are dimensionless, unchecked."""
+    """The brake curve of one wall ratio and body-force weight: w (`wall`), A (`a`) and B (`b`) of Eq. 29 to 34.
+
+    Arguments and results are dimensionless and unchecked: a float gives a float, an array one of its shape and type.
+    """
 
     wall: float
     a: float
@@ -78,7 +81,7 @@ class BrakeCurve(NamedTuple):
         return load
 
     def force(self, compression: Real, load: Real) -> Real:
-        """Return the force phi at a load and the compression that it gives (Eq. 33, 34)."""
+        """Return the force phi (Eq. 33, 34) from a load and the compression that this load gives."""
         fn = functions(load)
         stretch = 1.0 - compression
         elastic: Real = fn.expm1(-4.0 * fn.log1p(-compression))

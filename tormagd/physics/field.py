@@ -32,7 +32,8 @@ class ThesisFieldLaw:
     The printed equation carries no unit; mT mm gives the measured field ("up to 800 mT"). It must not be stretched
     beyond 95 mm: a larger s_max in Eq. 7 raises the field at *every* gap.
 
-    At 95 mm the slope is zero, so the inverse loses half of its digits there.
+    At 95 mm the slope is zero, so the inverse loses half of its digits there. Its methods raise `DomainError` for a gap
+    outside 45..95 mm, or a moment that none of these gaps gives.
     """
 
     gap_range_mm: ClassVar[tuple[float, float]] = (_EQ7_MIN_MM, _EQ7_MAX_MM)
@@ -60,8 +61,8 @@ class ThesisFieldLaw:
 class PowerFieldLaw:
     """The power law of the thesis's appendix: a = coefficient * gap^exponent, T m with the gap in mm. A `FieldLaw`.
 
-    It agrees with Eq. 7 within about 10% on 45..95 mm, and serves beyond. Gaps are accepted from 1 mm, under which the
-    pole at zero takes over, to 10 m.
+    It agrees with Eq. 7 within about 10% on 45..95 mm, and serves beyond. Its methods take gaps from 1 mm, under which
+    the pole at zero takes over, to 10 m. They raise `DomainError` for others, and for moments that none of them gives.
     Raises `DomainError` unless 1e-6 <= coefficient <= 1e3 and -6 <= exponent <= -0.1.
     """
 

@@ -88,7 +88,8 @@ def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geomet
 class Reduced(NamedTuple):
     """The force law of one elastomer in one geometry: the dimensionless curve and the two scales that give it units.
 
-    Nothing is checked here.
+    `load_root_per_Tm` times a radial moment, squared, is the load. `force_scale_N` is the force where the curve gives
+    1. `max_moment_Tm` compresses to lambda1 = 0.05. Nothing is checked here.
     """
 
     curve: BrakeCurve

@@ -82,9 +82,10 @@ class PronySeries(Value):
         self.times_s: Final = times_s
 
     def relaxed(self, driving_N: float) -> PronyState:
-        """Return the state after an endless rest at a driving force; at 0 N, of an element that was never loaded.
+        """Return the state after an endless rest at a driving force: that force, and 0 N in every branch.
 
-        Raises `DomainError` if `driving_N` is not finite or beyond MAX_FORCE_N.
+        At 0 N it is that of an element that was never loaded. Raises `DomainError` if `driving_N` is not finite or
+        beyond MAX_FORCE_N.
         """
         require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         return (driving_N, *[0.0 for _ in self.fractions])

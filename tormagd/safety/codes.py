@@ -588,7 +588,7 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
-    """Return the faults for the firmware's fault bits.
+    """Return the faults for the firmware's fault bits, in the order of the bits; empty for none.
 
     With `is_host_stall` the device's command timeout is the fault HOST_STALL: the daemon itself had sent no Drive.
     """

@@ -56,7 +56,7 @@ class DeviceRequest(StrEnum):
 
 
 class RefusedError(Exception):
-    """A command that the present state does not allow. `code` names the reason, `hint` says what to do."""
+    """A command that is refused; nothing has changed. `code` names the reason, `message` says it, `hint` what to do."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(message)
@@ -72,10 +72,9 @@ class Conditions(Value):
     homed             the positions of its carriages are known
     busy              it homes or opens, or was asked to
     device_latched    it holds a fault of its own
-    requested_N       the force of the newest setpoint; None where none is valid
-    neutral_N         the greatest setpoint at which `enable` is taken
     sensor_doubted    the force sensor is not believed
-    remedy            what to do about `cause`
+    remedy            what to do about `cause`; empty where there is no advice
+    round_trip_s      the usual time from a Drive to its State
     clock_drift       by which share the device's clock runs fast
     apart_mm          how far the carriages are apart
     most_*            the bounds above which `enable` is refused
@@ -334,8 +333,8 @@ _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
     """Return `state` in FAULT with `faults` latched and the device asked to open; `state` itself where none is new.
 
-    Faults that show together are latched in the order of `Fault`: causes before their consequences. Faults of
-    LOST_POSITION set `needs_homing`.
+    New faults stand behind those latched before, and among themselves in the order of `Fault`: causes before their
+    consequences. Faults of LOST_POSITION set `needs_homing`.
     """
     if not faults:  # as nearly always, a thousand times a second
         return state
@@ -448,7 +447,7 @@ def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -
 
 
 def _refused(row: Refusal, state: SafetyState) -> str:
-    """Return the message of a refusal; in FAULT it names the latched faults."""
+    """Return the message of a refusal: in FAULT the latched faults, for `enable` "already" and the state."""
     if row.source is FAULTED:
         return f"cannot {row.event} in {row.source}: {', '.join(state.faults)}"
     already = f"already {row.source}"

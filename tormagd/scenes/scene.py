@@ -238,7 +238,11 @@ class Scene(Strict, frozen=True):
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
 
     def _require_no_brake(self) -> None:
-        """Raise ValueError where a tactile scene states what only a brake has."""
+        """Raise ValueError where a tactile scene states what only a brake has.
+
+        That is a radius or thickness other than the default, a `force.standby_N`, or a `[handle]` other than the
+        default.
+        """
         usual = Insert(self.insert.name, self.insert.model)
         for key in ("inner_radius_mm", "outer_radius_mm", "thickness_mm", "roller_radius_mm"):
             value = getattr(self.insert, key)

@@ -30,11 +30,14 @@ def recorded(path: Path) -> tuple[Array, Array]:
 def asked(
     signal: Signal, beside: Path, range_N: tuple[float, float], longest_s: float, rate_hz: int
 ) -> tuple[Array, Array]:
-    """Return times, s, and forces, N (n each), that `signal` asks for, `rate_hz` of them a second.
+    """Return times, s from 0 on, and forces, N (n each), that `signal` asks for.
 
-    They end with the recording, or with the range gone once up and down, after `longest_s` at the latest. Forces are
-    held within `range_N`, least and greatest: a brake has a least force, and reports it with the limit F_MIN. A file is
-    relative to the folder `beside`. Raises ConfigError for a file that is not as allowed.
+    There are `rate_hz` of them a second, and at least two.
+
+    A recording, `signal.file` in the folder `beside`, is interpolated by a smooth curve to its end, and held within
+    `range_N`, least and greatest. Without a file the force goes through the range up and down once, in steps of
+    `step_N`. Each step is half a cosine, and is held for `hold_s`. Both end after `longest_s` at the latest. Raises
+    ConfigError for a file that is not as allowed.
     """
     low_N, high_N = range_N
     if signal.file:
@@ -58,7 +61,8 @@ def asked(
 def _through(time_s: Array, known_s: Array, known_N: Array) -> Array:
     """Return the forces (n) at `time_s` on cubic Hermite curves through the rows `known_s`, `known_N`.
 
-    Slopes are from a row's neighbours: a corner at every row would shake the carriages.
+    Slopes are from a row's neighbours: a corner at every row would shake the carriages. `time_s` must lie within the
+    rows.
     """
     slope = np.gradient(known_N, known_s)
     after = np.clip(np.searchsorted(known_s, time_s, side="right"), 1, len(known_s) - 1)
