@@ -105,10 +105,11 @@ class CanBackend:
         return messages
 
     def send(self, message: Message) -> None:
-        """Hand one frame to the bus. If the bus does not take the frame at once, drop and count it.
+        """Hand one frame to the bus, and keep it in `stream.sent`.
 
-        The next tick has a newer one. Raises BackendError when the bus is off or gone, or has taken none of over
-        UNSENT_FRAMES frames in a row; EncodeError for a value that does not fit the wire.
+        A frame that the bus does not take at once is dropped, and counted as unsent. The next tick has a newer one.
+        Raises BackendError when the bus is off or gone, or has taken none of over UNSENT_FRAMES frames in a row. Raises
+        EncodeError for a value that does not fit the wire.
         """
         identifier, data = self.stream.pack(message)
         frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
@@ -276,7 +277,10 @@ def _hold(path: str) -> int:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """Return the errno of the system's error behind one of python-can's; None where there is none."""
+    """Return the errno of the system's error behind one of python-can's; None where there is none.
+
+    It is the first above 0, from `error` on along its causes.
+    """
     while error is not None:
         number = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
         if number is not None and number > 0:  # a resolver's errors have numbers of their own, under 0

@@ -53,6 +53,7 @@ class Connection:
     """The connection to one device, over as many openings of its port as it takes.
 
     Its state changes only in calls, `receive` and `exchange` once a control period each; it has no clock and no timers.
+    Whenever a running device is lost, it counts the loss, logs a warning and calls `on_loss`; `close` does not.
     """
 
     def __init__(self, device: Device, open_backend: Callable[[], Backend], on_loss: Callable[[], None]) -> None:
@@ -152,7 +153,8 @@ class Connection:
 
         Opens the port first when it is time to, and closes a port that fails or whose device is lost. A `request` is
         taken once, when `number` changes; unless it is RETRACT, it is dropped where the device does not run. Duties are
-        -1..1. Call it after `receive`, so that what has come by then does not count as silence.
+        -1..1, positive opens. The link's quality is renewed when that is due. Call it after `receive`, so that what has
+        come by then does not count as silence. Raises EncodeError for a value that does not fit the wire.
         """
         if self._link is None and self._is_wanted and now_s >= self._reopen_s:
             self._open(now_s)
@@ -199,9 +201,11 @@ class Connection:
         return {"requested": self._requested, "link": plain(self._link), "stream": plain(self._stream)}
 
     def remember(self, memory: Any, known: Kinds) -> None:
-        """Continue the conversation that `memory` describes on this connection's open port.
+        """Continue a conversation from `memory`, which `memory()` returned, on this connection's open port.
 
-        `known` are the types that `memory` may contain. Raises InexactError for data that fit no known type.
+        `known` are the types that `memory` may contain. Raises InexactError for data that fit no known type, and
+        LookupError or TypeError for `memory` of another form, such as None. The state is then set in part: drop the
+        connection.
         """
         self._requested = memory["requested"]
         restore(self._link, memory["link"], known)
@@ -243,7 +247,7 @@ class Connection:
         )
 
     def _open(self, now_s: float) -> None:
-        """Open the port and begin a conversation, in which an unfinished RETRACT is sent again.
+        """Open the port, begin a conversation, in which an unfinished RETRACT is sent again, and tell `traffic` so.
 
         Where the port does not open, log why and wait in BACK_OFF.
         """
@@ -302,9 +306,10 @@ class Connection:
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
 
     def _notice(self) -> None:
-        """Act on a change of state since the last call, if there was one, and log it.
+        """Act on a change of state since the last call, if there was one.
 
         When RUNNING begins, the back-off begins anew. When RUNNING has ended, the loss is counted and `on_loss` called.
+        Both are logged, and so are REFUSED and UNANSWERED.
         """
         before, state = self._seen, self.state
         if state is before:

@@ -217,8 +217,8 @@ class DeviceLink:
     def request(self, now_s: float, request: DeviceRequest) -> None:
         """Ask the device for a routine: `due` repeats the command until a Status acknowledges it.
 
-        Replaces an unacknowledged request. HOME and CLEAR are given up after GIVE_UP_S, RETRACT when the device has
-        latched a fault.
+        Replaces an unacknowledged request; NONE only ends it. HOME and CLEAR are given up after GIVE_UP_S, RETRACT when
+        the device has latched a fault.
         """
         self._nonce = _next_nonce(self._nonce)
         self._request = request
@@ -367,7 +367,7 @@ class DeviceLink:
         self._right_mm = state.right_position_mm
 
     def _measured(self) -> Measurement:
-        """Return a Measurement of the newest State, Sense and Status."""
+        """Return a Measurement of the newest State and Sense, and of the newest Status that counts for this State."""
         sense, status = self._sense, self._told
         assert sense is not None, "measuring begins with a Sense"
         assert status is not None, "measuring begins with a Status"

@@ -92,6 +92,7 @@ class LinkWatch:
         """Return the quality over the last LOOKS looks, from the counters now; the next look is due after LOOKED_S.
 
         `round_trip_s` is the usual one now; the quality has the lesser of this and the last look's, 0 at the first.
+        Shares are 0 at the first look, and where nothing was sent or received. `clock_drift` is handed on.
         """
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)

@@ -105,6 +105,7 @@ class RoundTrip:
         """Take the counter of the last Drive that the device accepted: count the round trips since the last Status.
 
         Where the counter contradicts them, or is the first, drop the recent round trips and count this Drive's alone.
+        Before the first State nothing happens.
         """
         state, lead = self._state, self._lead
         if state is None:
@@ -140,7 +141,10 @@ class RoundTrip:
         return min(self._recent, default=0.0)
 
     def report(self) -> dict[str, float] | None:
-        """Return the least, the median and the 99th percentile of recent round trips, us; None while none is known."""
+        """Return `least`, `p50` (median) and `p99` of the recent round trips, us; None while none is known.
+
+        At most ROUND_TRIPS count.
+        """
         ordered_s = sorted(self._recent)
         if not ordered_s:
             return None
@@ -229,7 +233,11 @@ class DeviceClock:
 
 
 def _newest_line(windows: Windows) -> ClockFit | None:
-    """Return the line through the newest windows that lie on one; None where LEAST_WINDOWS do not."""
+    """Return the line through the newest of `windows`, which are in the order of time; None where no line fits.
+
+    The line is tried through all windows, then without the older half, and so on while LEAST_WINDOWS are left. It fits
+    with a residual under MOST_RESIDUAL_US and one of the NEWEST_WINDOWS on it.
+    """
     # no line fits across a clock that was set, or stood still for a while: the older half is dropped until one does
     while len(windows) >= LEAST_WINDOWS:
         fit, is_left = _robust_line(windows)
@@ -240,7 +248,10 @@ def _newest_line(windows: Windows) -> ClockFit | None:
 
 
 def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
-    """Return the line through the windows, outliers left out, and whether all of the NEWEST_WINDOWS lie off it."""
+    """Return the line through the windows, in the order of time, and whether all of the NEWEST_WINDOWS lie off it.
+
+    Windows further than OUTLIER deviations from a line of median slope and level are left out. At least two windows.
+    """
     newest_s = windows[-1][1]
     half = len(windows) // 2
     slope = _median([(b[0] - a[0]) / (b[1] - a[1]) for a, b in zip(windows, windows[-half:], strict=False)])

@@ -34,7 +34,8 @@ class SerialOptions(Strict, frozen=True):
 def open_serial(device: Device, options: SerialOptions) -> SerialPort:
     """Open `device.port` exclusively, with its driver's latency timer at 1 ms where that can be set.
 
-    What had come before is discarded. Raises BackendError saying why the port does not open.
+    What had come before is discarded. Raises BackendError saying why the port does not open, and what to do where that
+    is known.
     """
     try:
         port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)
