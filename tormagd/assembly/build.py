@@ -97,8 +97,9 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
     """Build the core for `config.scene` from the scene's file and the file of the scene's model.
 
     `scene` replaces the scene in the file; None reads the file. `models` is the folder of the scene's model. None takes
-    the folder of the scene's file, and also checks the scene's signal against the gap's speed. Raises ConfigError where
-    scene, model and configuration do not fit each other, or a file is refused.
+    the folder of the scene's file, and also checks the scene's signal against the gap's speed, for `missed`. The gap's
+    speed is the scene's where that is lower. Raises ConfigError where scene, model and configuration do not fit each
+    other, or a file is refused.
     """
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
@@ -127,7 +128,9 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     """Return the scene's element as the model describes it, and the choice of the search for its field.
 
-    Raises DomainError where the model does not fit the scene's insert and gaps, or the search does not fit the model.
+    The choice of the thesis's search also tells epsilon in its reason. A pad has no force law, and without the term
+    `memory` nothing is remembered. Raises DomainError where the model does not fit the scene's insert and gaps, or the
+    search does not fit the model.
     """
     terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
@@ -184,7 +187,8 @@ def _pad(finger: Finger, model: ForceModel) -> tuple[Contact, FieldOfGap, float]
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
     """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`, to hold the model against.
 
-    Raises DomainError where the law does not hold for the gaps. The thesis prints no law for a pad.
+    Raises DomainError where the law does not hold for the gaps, and for an unknown insert. Do not call it for a pad:
+    the thesis prints no law for one, and nothing is refused here.
     """
     fitted, metres = scene.insert, 1e-3
     geometry = Geometry(

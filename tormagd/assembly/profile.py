@@ -53,7 +53,8 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def learned(self, now_ns: int) -> Learned:
         """Return what is still known of the device at CLOCK_REALTIME `now_ns`.
 
-        Scale and offset become as uncertain as a day makes them, and a sensor's zero older than ZERO_LASTS_S is 0.
+        Scale and offset become as uncertain as a day makes them, and a sensor's zero saved ZERO_LASTS_S or more from
+        `now_ns` is 0. The factor at a creep and the carriages' lag stay.
         """
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
@@ -66,7 +67,7 @@ def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str,
     """Return the profile that keeps `learned` of the device `serial_number` with the insert `insert`.
 
     `model` is the model's fingerprint, SHA-256 in hexadecimal. `saved_ns` is the time of saving, CLOCK_REALTIME. A
-    scale less certain than an unseen device's is kept as certain as that.
+    scale less certain than an unseen device's is kept as certain as that. Nothing is checked, and no file is written.
     """
     return Profile(
         v=VERSION,

@@ -29,9 +29,10 @@ class Missed(NamedTuple):
 
 
 def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_speed_mm_s: float) -> Missed:
-    """Return what ideal carriages miss of forces (n, N) at rising times (n, s), which they follow without preview.
+    """Return what ideal carriages miss of forces (n >= 2, N) at rising times (n, s), which they follow without preview.
 
-    They begin at the first force. `shown` gives the force over the gap, `gap_speed_mm_s` is their top speed.
+    They begin at the first force, and change it by at most what their top speed `gap_speed_mm_s` gives at the force
+    where they are. `shown` gives the force over the gap. The mean is over the n - 1 steps.
     """
     tenth_N = max(max(forces_N) - min(forces_N), 1e-9) / 10.0
     furthest: dict[int, Point] = {}

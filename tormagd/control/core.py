@@ -41,7 +41,10 @@ _PAUSED: Final = OperatingState.PAUSED
 
 @final
 class Planner:
-    """Planning half of the core, for one device: turns the newest setpoint and measurement into a plan of the gap."""
+    """Planning half of the core, for one device: turns the newest setpoint and measurement into a plan of the gap.
+
+    It holds the planning stages, whose fields are all of its state, and the newest plan, `planned`.
+    """
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begin at `now_s` with the gap open and nothing known of the device."""
@@ -82,7 +85,8 @@ class Planner:
     def _held_N(self, measured: Measured | None, device: DeviceFit) -> float:
         """Return the force of `device`, N, at the gap where it is: `measured`, or open where that is None or not homed.
 
-        The portrait's gap for a force is corrected by as much as the newest plan's gap is beside it.
+        The portrait's gap for a force is corrected by as much as the newest plan's gap is beside it, unless the ceiling
+        held that plan.
         """
         portrait, planned = self._portrait, self.planned
         if measured is None or not measured.is_homed:
@@ -130,7 +134,10 @@ class Planner:
 
 @final
 class Stepper:
-    """Driving half of the core, for one device: turns measurements and plans into duties, and latches faults."""
+    """Driving half of the core, for one device: turns measurements and plans into duties, and latches faults.
+
+    It holds the operating state with the latched faults (`safety`), the measuring stage, the watches, and the actuator.
+    """
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
         """Begin disabled at `now_s`. `move` is the actuator of the gap; None: the carriages."""
@@ -246,7 +253,10 @@ class Stepper:
         return measure.without_position(measured)
 
     def _hold(self, now_s: float) -> Duty:
-        """Return duties of 0 in mode RUN: the device answers, and friction holds the gap. The watch counts nothing."""
+        """Return duties of 0 in mode RUN: the device answers, and friction holds the gap. The watch counts nothing.
+
+        The limit is ENCODER in a leap, else HOST_STALL after a stall of this host, else DEVICE_SILENT.
+        """
         limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
         if self.measure.leap is not None:
             limit = Limit.ENCODER

@@ -24,7 +24,8 @@ MIN_DT_S: Final = 5e-6
 class Measure:
     """The stage that turns one device's messages into positions, filtered speeds and the handle's motion.
 
-    `sight` tells whether the device is silent, `leap` whether an encoder has stepped as no carriage moves.
+    It keeps the newest record, `measured`. `sight` tells whether the device is silent, `leap` whether an encoder has
+    stepped as no carriage moves.
     """
 
     measured: Measured | None = None
@@ -138,7 +139,11 @@ class Measure:
         )
 
     def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
-        """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` after `last`."""
+        """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` > 0 after `last`.
+
+        Rates are filtered, with their sign along the way of the handle, or inwards for a finger. A finger's depth is
+        its position, and at least 0 mm.
+        """
         before = last.handle
         travel_mm = position_mm - last.handle_mm
         rate_mm_s = low_pass(before.turn.direction * before.rate_mm_s, travel_mm / dt_s, dt_s, RATE_FILTER_S)

@@ -19,7 +19,10 @@ SHOWN_S: Final = 0.1
 
 @final
 class Sight:
-    """Whether the loop is blind, told from the times of steps and of new States; at first it is not."""
+    """Whether the loop is blind, told from the times of steps and of new States; at first it is not.
+
+    It keeps when a State was last new, and when the last stall of the loop ended and how long it was.
+    """
 
     seen_s: float = math.inf
     "When a new State was last found; inf before the first."
@@ -52,10 +55,11 @@ class Sight:
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 
     def update(self, last_s: float, now_s: float, is_new: bool) -> None:
-        """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind`.
+        """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind` and `was_blind`.
 
-        `is_new` says that a State has come since the last step. A step that comes too late ends a stall: the loop is
-        blind until a later step finds a new State.
+        `is_new` says that a State has come since the last step. The loop is blind after no new State for longer than
+        BLIND_S and BLIND_PERIODS periods. A step that comes later than that ends a stall, which is noted. The loop is
+        then blind until a later step finds a new State.
         """
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:

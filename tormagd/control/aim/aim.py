@@ -63,8 +63,11 @@ class Element(NamedTuple):
 
 @final
 class Aim:
-    """The last stage of planning: turns the force asked for into a field, the field into a gap, and both into a
-    plan."""
+    """The last stage of planning: turns the force asked for into a field, the field into a gap, both into a plan.
+
+    It keeps the newest plan's number and field, and the newest `question` to a search beside the plans and its
+    `answer`.
+    """
 
     number: int = 0
     "Number of the newest plan."
@@ -91,7 +94,7 @@ class Aim:
         self._low_confidence: Final = config.limits.low_confidence
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
-        """Begin at `now_s`, and return a plan with the gap open, no setpoint and this `number`.
+        """Begin at `now_s`, and return a plan with the gap open, no setpoint, the limit NO_SETPOINT and this `number`.
 
         The element's field lags `lag_mT` behind the gap's. The field of the open gap becomes the newest `answer`.
         """
@@ -137,16 +140,16 @@ class Aim:
     def answer_to(self, question: Question) -> Answer:
         """Search the field for `question`, for a search that runs beside the plans, and return the answer.
 
-        Changes nothing. Raises DomainError for a number that is not finite.
+        Changes nothing: the answer is not kept. Raises DomainError for a number that is not finite or too large.
         """
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        """Return the field for the model's force `wanted_N`.
+        """Return the field for the model's force `wanted_N`; of several the one nearest `element_mT`.
 
         Where the search runs beside the plans, note the `question` for it, and return its newest answer. Raises
-        DomainError for an answer older than OLDEST_ANSWER_S.
+        DomainError for an answer older than OLDEST_ANSWER_S, and for a number that is not finite or too large.
         """
         if not self._is_beside:
             return self._search.solve(curve, wanted_N, self.element_mT)

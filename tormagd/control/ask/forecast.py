@@ -99,7 +99,11 @@ LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
 
 @final
 class Forecast:
-    """Learner of one stream of setpoints, which forecasts how the force goes on."""
+    """Learner of one stream of setpoints, which forecasts how the force goes on.
+
+    It keeps the forces of the last ten seconds on a grid of GRID_S. It also keeps the newest forecast, the guesses that
+    are not judged yet, and the forecast's skill.
+    """
 
     stamp_s: float
     "Stamp of the newest setpoint; -inf before the first."
@@ -205,7 +209,7 @@ class Forecast:
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
         """Add `count` points to the grid, up to a new setpoint, and judge the guesses for them by what came.
 
-        A forecast that does not reach beyond the new setpoint is dropped.
+        A forecast that reaches at most one point beyond the new setpoint is dropped.
         """
         spacing_s = stamp_s - self.stamp_s
         times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]

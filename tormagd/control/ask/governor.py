@@ -48,8 +48,9 @@ Bounds = tuple[float, float]
 class Governor:
     """The stage that turns setpoints, of one publisher after another, into the forces to render.
 
-    In its methods, `dt_s` is the time since the last plan, `force_N` what is asked for now, and `bounds` what scene and
-    device allow. `lag_s` is the lag of the carriages.
+    It keeps what was asked last, the setpoints' slope and forecast, who holds the brake, and the gap's path. It also
+    keeps the ramps to a new publisher and to another wall. In its methods, `dt_s` is the time since the last plan,
+    `force_N` what is asked for now, and `bounds` what scene and device allow. `lag_s` is the lag of the carriages.
     """
 
     time_s: float

@@ -27,8 +27,10 @@ def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
 
 @final
 class Way:
-    """The stage that follows a brake's handle along the way of the task: its place, its rate, and whether it pushes
-    on."""
+    """The stage that follows a brake's handle along the way of the task: its place, its rate, and whether it pushes on.
+
+    It keeps the newest `travel`, and where the way last changed.
+    """
 
     travel: Travel = AT_REST
     "The newest travel; at rest before a measurement."
@@ -42,8 +44,10 @@ class Way:
     def update(self, measured: Measured | None, is_sensor_believed: bool) -> Travel:
         """Return the handle's travel, and keep it in `travel`.
 
-        `measured` is None while the device is silent: the handle counts as resting where it was. With
-        `is_sensor_believed` False the force shows no way, and only travel on the encoder does.
+        `measured` is None while the device is silent: the handle counts as resting where it was. A force over PULLS_N
+        against the encoder's motion says that this is the way; one below -UNSEEN_N says that the other is. Between
+        them, the way changes after SLID_MM on the encoder: since it turned, and from where the way last changed. With
+        `is_sensor_believed` False only such travel counts.
         """
         before = self.travel
         if measured is None:

@@ -75,7 +75,11 @@ NOTHING_LEARNED: Final = Learned()
 
 @final
 class Believe:
-    """The stage that learns one device from its readings: it updates the estimators, and says what is believed."""
+    """The stage that learns one device from its readings: it updates the estimators, and says what is believed.
+
+    It holds the element's memory, the watch on the encoder, and the estimators of strength, slow friction, sensor zero,
+    sensor trust and carriage lag. It also keeps which fit was taught from another day.
+    """
 
     read: int = -1
     "Number of the newest measurement that taught; -1 before the first."
@@ -199,7 +203,11 @@ class Believe:
             self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, measured: Measured | None, model_N: float | None) -> Belief:
-        """Return the belief. `model_N` is the model's force now; None: nothing is predicted."""
+        """Return the belief, and change nothing. `model_N` is the model's force now; None: nothing is predicted.
+
+        Nothing is predicted either without `measured` (None: a silent device), or where the contact's force is not
+        known. A lost encoder adds the limit HANDLE_LOST.
+        """
         device = at_speed = self.device
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
@@ -251,9 +259,11 @@ class Believe:
         return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
 
     def _hear_at_creep(self, now_s: float, measured: Measured, model_N: float, dt_s: float, is_mobilised: bool) -> None:
-        """Learn slow friction from one reading of a handle that creeps, without a dispute.
+        """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise.
 
-        A handle that rests or comes to rest teaches nothing.
+        In a dispute, or without the term `creep`, nothing is learned. The model's force follows the handle's travel in
+        any other case. A handle that rests or comes to rest teaches nothing, nor does a zero that is not known. Unless
+        `is_mobilised`, only a reading greater than expected teaches.
         """
         self.strength.settle()
         if not self._has_creep or self.sensor.is_disputed:
@@ -274,8 +284,9 @@ class Believe:
     def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit.
 
-        A dispute of device and sensor may begin or end. In a dispute, or while the zero is unknown, the fit learns
-        nothing. Sets `limits`.
+        A dispute of device and sensor may begin or end. A zero that a reversal shows may shift the fit in it. In a
+        dispute, or while the zero is unknown, the fit learns nothing. Sets `limits`: SENSOR_ZERO, and SENSOR,
+        DEVICE_OR_SENSOR, OFFSET_UNKNOWN or TRIM.
         """
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
@@ -322,7 +333,8 @@ class Believe:
         """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing.
 
         `model_N` is the model's force. A fit from another day that the first slide contradicts is forgotten first.
-        Where the fit does not learn, the readings' mean is only compared with it: a dispute may begin.
+        Where the fit does not learn, the readings' mean is only compared with it: a dispute may begin. The force at a
+        creep stays. A fit at one of its bounds adds the limit TRIM.
         """
         if self._has_creep:
             self.slow.follow(model_N, measured.handle_mm)

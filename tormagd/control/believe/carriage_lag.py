@@ -26,7 +26,10 @@ AGE_S: Final = 0.0015
 
 @final
 class CarriageLag:
-    """Estimator of one device's carriage lag: the time constant `lag_s` from planned to measured gap."""
+    """Estimator of one device's carriage lag: the time constant `lag_s` from planned to measured gap.
+
+    It keeps the gap that is expected now, None before a plan's, and whether the carriages are behind a jump.
+    """
 
     lag_s: float = 0.0
     "T, 0..MAX_LAG_S."

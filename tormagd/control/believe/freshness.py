@@ -27,7 +27,10 @@ HEARD: Final = 100
 
 @final
 class Freshness:
-    """Judge of whether one force sensor still shows new values."""
+    """Judge of whether one force sensor still shows new values.
+
+    It keeps the newest reading and how long it has stood, the force since, and the sensor's noise, runs and step.
+    """
 
     has_heard: bool = False
     "Whether a first reading has come."

@@ -27,7 +27,10 @@ FORGETS_S: Final = 5.0
 
 @final
 class HandleWatch:
-    """Watch on the handle's encoder: compares the force of a resting handle with the model's force at the gap."""
+    """Watch on the handle's encoder: compares the force of a resting handle with the model's force at the gap.
+
+    It keeps where and how long the handle has stood, the least force since, and whether the encoder `is_lost`.
+    """
 
     at_mm: float = math.inf
     "The encoder's place at which the handle stands."
@@ -56,9 +59,10 @@ class HandleWatch:
     def update(self, sensed_s: float, handle_mm: float, reading_N: float, model_N: float) -> None:
         """Take one reading of handle and force, and update `is_lost`.
 
-        `model_N` is the model's force at the measured gap. The encoder is lost where it stands while the force rises by
-        RISES_N and the model's by MODEL_RISES_N. A motion of the handle, or a pause of more than UNHEARD_S, clears
-        `is_lost`. A `sensed_s` (host's clock) that is not newer changes nothing.
+        `model_N` is the model's force at the measured gap. Once it has stood for SETTLES_S, the encoder is lost where
+        the force has risen over RISES_N from its least, the model's over MODEL_RISES_N. The least is forgotten slowly.
+        A motion of over STANDS_MM, or a pause of more than UNHEARD_S, clears `is_lost`. A `sensed_s` (host's clock)
+        that is not newer changes nothing.
         """
         dt_s = sensed_s - self.heard_s
         if not dt_s > 0.0:

@@ -24,10 +24,10 @@ BEYOND_MM: Final = 2.0
 
 @final
 class ElementMemory:
-    """Relaxation and field lag of one element, from the first known gap on.
+    """Relaxation and field lag of one element, from the first known gap on: `relaxed_N` and `lag_mT`.
 
     A brake is taken as rested at the gap it was switched on with, and relaxes for a handle at the roller's speed. A pad
-    is taken as untouched, and relaxes for what presses it.
+    is taken as untouched, and relaxes for what presses it. It also keeps the newest gap's field and its time.
     """
 
     field_mT: float = 0.0
@@ -112,9 +112,10 @@ class ElementMemory:
         self.free, self.added = self._free.relaxed(free_N), self._added.relaxed(added_N)
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
-        """Follow a straight change of the gap's field to `field_mT`.
+        """Follow a straight change of the gap's field to `field_mT` at `now_s`.
 
-        `curve` is the force over the field without memory, `free_N` its force at 0 mT.
+        Sets `field_mT`, `time_s`, `lag_mT` and `relaxed_N`. `curve` is the force over the field without memory,
+        `free_N` its force at 0 mT. An element that does not relax keeps `relaxed_N`.
         """
         self.lag_mT = self.lag_at_mT(field_mT)
         dt_s = max(now_s - self.time_s, 0.0)

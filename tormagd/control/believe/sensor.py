@@ -59,7 +59,8 @@ TRUSTED_AGAIN_S: Final = 1.0
 class SensorTrust:
     """Judge of one force sensor against the fit of its device. Finds, follows and ends their disputes.
 
-    It notes by how much the fit has to go back where a dispute begins.
+    It notes by how much the fit has to go back where a dispute begins (`back_N`). In one it follows by how much
+    readings lead the fit (`lead_N`). `is_disputed` stops learning; `is_doubted` says that the sensor is wrong.
     """
 
     known_s: float = 0.0

@@ -232,7 +232,8 @@ class Strength:
     def update(self, model_N: float, reading_N: float, dt_s: float) -> None:
         """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`.
 
-        Scale and offset are held within the bounds; `is_held` says so.
+        Scale and offset are held within the bounds; `is_held` says so. Updates `surprise_N`, with which the offset is
+        learned sooner.
         """
         error_N = reading_N - self.fit.force_N(model_N)
         self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)

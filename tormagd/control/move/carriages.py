@@ -40,8 +40,9 @@ LAGGING_MM: Final = 0.1
 class Carriages(Actuator):
     """The actuator that drives the two carriages of one device.
 
-    Carriages whose motors are livelier than believed get ahead of what is expected, and `acceleration_scale` grows.
-    Weaker ones are asked for no less.
+    It keeps the gap's reference, the gap expected behind it, and a position loop for each carriage. Carriages whose
+    motors are livelier than believed get ahead of what is expected, and `acceleration_scale` grows. Weaker ones are
+    asked for no less.
     """
 
     def __init__(self, config: Config, scene: Scene) -> None:
@@ -180,7 +181,8 @@ class Carriages(Actuator):
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
         """Update `acceleration_scale` after a period in which the acceleration limit held the reference back.
 
-        The errors are the gap's, expected minus measured. While the reference slows down nothing is learned.
+        The errors are the gap's, expected minus measured: carriages that are ahead raise it, others lower it, within 1
+        to MAX_ACCELERATION_SCALE. While the reference slows down nothing is learned.
         """
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
             return

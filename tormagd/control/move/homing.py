@@ -29,7 +29,11 @@ _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
 
 @final
 class Homing:
-    """The watch on one homing of the device after another; `faults` are those of the newest look."""
+    """The watch on one homing of the device after another; `faults` are those of the newest look.
+
+    It keeps how far open each carriage has been, which open switches were seen, and for how long the force was too
+    great.
+    """
 
     is_running: bool = False
     "Whether the device homes, as of the newest look."
@@ -96,7 +100,11 @@ class Homing:
         self.max_N = max(self._ceiling_N, RISES * abs(measurement.force_N))
 
     def _follow(self, now_s: float, measurement: Measurement) -> None:
-        """Watch a homing that goes on, and set the first fault that shows."""
+        """Watch a homing that goes on, and set the first fault that shows; else leave `faults`.
+
+        In this order: WRONG_DIRECTION for a carriage over BACKS_OFF_MM back, HOMING after LONGEST_S, OVER_FORCE after
+        OVER_S of too much force, STATUS_STALE.
+        """
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm

@@ -46,7 +46,11 @@ def is_open(measurement: Measurement, is_placed: bool) -> bool:
 
 @final
 class Opening:
-    """The watch on the opening of a device that is not driven by the core; `faults` are those of the newest look."""
+    """The watch on the opening of a device that is not driven by the core; `faults` are those of the newest look.
+
+    It keeps how late each carriage is, how long a device without known places has not been open, and which requests
+    count.
+    """
 
     is_watching: bool = False
     "Whether the newest look was judged."
@@ -127,7 +131,11 @@ class Opening:
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
 
     def _follow(self, measurement: Measurement) -> None:
-        """Judge the carriages by their places: NOT_OPENING where one is later than LATE_S."""
+        """Judge the carriages by their places: NOT_OPENING where one is later than LATE_S.
+
+        The device's own opening speed, lower at a low supply voltage, says how far they should have come since the last
+        State.
+        """
         dt_s = max(measurement.device_time_s - self.device_s, 0.0)
         share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
         speed_mm_s = share * self._full_mm_s

@@ -60,7 +60,8 @@ def ceiling_N(scene: Scene) -> float:
 class Watch:
     """The watch on one device: counts for how long a driven device misbehaves, and tells its faults and limits.
 
-    Times count in periods: a process that stood still saw nothing.
+    It keeps these times, when the device was enabled, and the newest duties. Times add up the ticks' lengths, s: a
+    process that stood still saw nothing.
     """
 
     enabled_s: float = math.inf
@@ -231,7 +232,9 @@ class Watch:
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
         """Return the faults of motion and force, by the counted times.
 
-        SENSOR is one only where the scene needs the sensor, OVER_FORCE only on a brake.
+        WRONG_DIRECTION, SKEW, FOLLOWING_ERROR, OVER_FORCE, SENSOR and NO_MOTION may show. SENSOR is one only where the
+        scene needs the sensor, OVER_FORCE only on a brake. A carriage against its duty shows sooner with SKEW or
+        NO_MOTION.
         """
         faults: list[Fault] = []
         is_skewed = abs(measured.skew_mm) > self._max_apart_mm
@@ -261,10 +264,11 @@ class Watch:
         return is_left_still or is_right_still
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        """Count in `opposed_s` for how long a carriage moves against its duty, where this is over
-        `limits.no_motion_duty`.
+        """Count in `opposed_s`, by `dt_s`, for how long a carriage moves against its duty.
 
-        The count stands while a driven carriage stands, and ends once one moves the right way or none is driven.
+        Only a duty over `limits.no_motion_duty`, without its sign, drives a carriage, and only a speed over STILL_MM_S
+        is a motion. While either carriage moves against its duty the count goes on. Else it becomes 0 where one moves
+        the right way or none is driven, and stands where driven carriages stand.
         """
         left_mm_s = right_mm_s = 0.0
         is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
