@@ -73,7 +73,11 @@ log = logging.getLogger(__name__)
 
 
 class _Connections:
-    """The connections of one endpoint, counted from the events of its socket monitor."""
+    """The connections of one endpoint, counted from the events of its socket monitor.
+
+    It keeps each connection's address, how often each address was admitted, the peers whose keys were refused, and why
+    the newest handshake failed.
+    """
 
     def __init__(self, name: str, endpoint: "zmq.Socket[bytes]", is_guarded: bool) -> None:
         self.name, self.endpoint, self.is_guarded = name, endpoint, is_guarded
@@ -132,7 +136,9 @@ class _Connections:
 class Admission:
     """Decides who may connect to the daemon's sockets: by CURVE key, and by the number of connections of an address.
 
-    `keys` is None where no endpoint is guarded. Create it before any guarded socket is bound.
+    `keys` is None where no endpoint is guarded. Create it before any guarded socket is bound. It keeps the `allowed`
+    keys and the count of `refusals`. It also counts in `oversize` the publishers that were cut off for too long a
+    message.
     """
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
@@ -254,7 +260,8 @@ class Admission:
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
         """Tell whether the key `public` may use the endpoint `name`, and count the answer.
 
-        A refused key is counted with the reason and noted: its connection is closed soon.
+        A refused key is counted with the reason and noted: its connection is closed soon. An admitted publisher that
+        returns at once counts as cut off for a message that was too long.
         """
         known = self._endpoints[name]
         if self.has_role(public, MAY[name]):

@@ -27,7 +27,7 @@ class Arming:
     """Progress of one `arm`: gives each command that leads to ENABLED once, as soon as the state allows it.
 
     Ends with a refusal at every fault that was not latched when it began: a person clears only faults that they have
-    seen. No clock.
+    seen. `given` lists the commands so far, `is_over` tells the end, `refusal` why it failed. No clock.
     """
 
     def __init__(self, now_s: float, faults: tuple[Fault, ...]) -> None:
@@ -48,8 +48,8 @@ class Arming:
         """Give the next command by calling `give`, once its time has come; end in ENABLED or at a refusal.
 
         `give` raises RefusedError. Refusals named in WAITS are tried again for PATIENCE_S; any other ends the arming.
-        So does a device that is still busy MOVES_S after a command. Nothing is raised: `refusal` says why the arming
-        ended.
+        So do a new fault, a device that is not connected, and one that is still busy MOVES_S after a command. Nothing
+        is raised: `refusal` says why the arming ended. Once over, it does nothing.
         """
         if self.is_over:
             return

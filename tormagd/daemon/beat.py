@@ -45,7 +45,8 @@ class Delay(NamedTuple):
 class Phases:
     """Runs the parts of every beat: all phases in order, then one of the slices, which take turns.
 
-    An exception ends only its own part of that beat; it is logged, unless its message is that part's last one.
+    An exception ends only its own part of that beat; it is logged, unless its message is that part's last one. `spent`
+    has the parts' times, `blamed` how often each made a beat late.
     """
 
     def __init__(
@@ -131,7 +132,11 @@ class Phases:
         return delay
 
     def tell(self) -> None:
-        """Log the number of late beats and the worst of them since the last line, at most once in NEWS_NS."""
+        """Log the number of late beats and the worst of them since the last line, at most once in NEWS_NS.
+
+        The line is an error where the worst delay was over `stall_ns`, else a warning. Without late beats nothing is
+        logged.
+        """
         now_ns = self._clock_ns()
         if self._late and now_ns >= self._tell_ns:
             took_ns, culprit, share_ns = self._worst

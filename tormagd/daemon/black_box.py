@@ -69,7 +69,8 @@ class BlackBox:
     """Hands the core's journal to the keeper, a process that writes black boxes into `folder`.
 
     Nothing is kept where `folder` is None, where mcap is not installed, or where the keeper does not start. `report`
-    then says why. `key` names the file with the key that seals black boxes; empty for none.
+    then says why. `key` names the file with the key that seals black boxes; empty for none. `journal` takes the
+    entries.
     """
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int, key: str = "") -> None:
@@ -144,7 +145,8 @@ class BlackBox:
         """Ask the keeper to write a black box, and return the path that it will have.
 
         `reason` becomes part of its name, `details` of its contents. It also holds what comes in the next `after_s`.
-        Clears the last refusal. Raises RefusedError without a keeper.
+        Clears the last refusal; `look` notes how the writing ended. A ninth request that waits drops the oldest. Raises
+        RefusedError without a keeper.
         """
         if self._folder is None or self._beside is None:
             raise RefusedError(

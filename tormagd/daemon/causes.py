@@ -34,9 +34,10 @@ class Causes:
             self.stall = StallReport(stall_ms, delay.culprit)
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
-        """Log the newly latched `faults` with cause and remedy, and remember the figures of their causes.
+        """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes.
 
-        `measurement` is None without a device: only HOST_STALL then has figures.
+        `measurement` is None without a device: only HOST_STALL then has figures. A fault without figures keeps its
+        cause in words alone.
         """
         figures = {} if measurement is None else _figures(stepper, measurement)
         for fault in faults:

@@ -18,7 +18,11 @@ log = logging.getLogger(__name__)
 
 
 class ControlLoop:
-    """The control loop: each period, step the core on the newest measurement and drive the device."""
+    """The control loop: each period, step the core on the newest measurement and drive the device.
+
+    It keeps the last step's `output`, its plan `used` and its `measurement`, the loop's `timing`, and the newest
+    `arming`.
+    """
 
     def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
         self.stepper, self._connection, self._journal = stepper, connection, journal
@@ -47,18 +51,20 @@ class ControlLoop:
         self.timing.record(beat.due_ns, beat.start_ns, time.monotonic_ns(), beat.merged)
 
     def command(self, name: str, conditions: Conditions) -> None:
-        """Carry out an operator's command. Raises RefusedError where `conditions` or the state do not allow it.
+        """Carry out an operator's command, note it in the journal, and log it if it was taken.
 
-        An arming under way ends first, as overtaken, whether or not the command is then refused.
+        Raises RefusedError for a name that is no command, and where `conditions` or the state do not allow it. An
+        arming under way ends first, as overtaken, whether or not the command is then refused.
         """
         if self.arming is not None:
             self.arming.end(RefusedError("overtaken", f"{name} came before it was armed", "tormagctl arm"))
         self._give(name, conditions)
 
     def arm(self, conditions: Conditions) -> None:
-        """Begin an arming, or go on with the one under way, and give its next command.
+        """Begin an arming, or go on with the one under way, and give its next command if its time has come.
 
-        Raises RefusedError where the arming ends refused in this call.
+        An arming that begins may clear the faults that are latched now. Raises RefusedError where the arming ends
+        refused in this call.
         """
         if self.arming is None or self.arming.is_over:
             self.arming = Arming(time.monotonic(), self.stepper.safety.faults)

@@ -193,8 +193,8 @@ class Daemon:
     def _drive(self, beat: Beat) -> None:
         """Drive the device along the newest plan.
 
-        A late tick is put down to the part that delayed it. New faults are explained in the log, and a black box is
-        written.
+        A tick more than a period late is put down to the part that delayed it. New faults are explained in the log, and
+        a black box is written that goes on for AFTER_FAULT_S.
         """
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
@@ -229,7 +229,8 @@ class Daemon:
         """Replace the running core by `core`, made for `scene`, between two beats.
 
         Operating state, faults and homing stay. What was learned of the device stays where insert and model do. The
-        newest setpoint is forgotten, profiles are read again, and the black box begins anew.
+        newest setpoint is forgotten, profiles are read again, telemetry reports on the new scene, and the black box
+        begins anew.
         """
         control, inference, before, now_s = self._control, self._inference, self._core, time.monotonic()
         learned, safety = inference.planner.believe.learned(), control.stepper.safety

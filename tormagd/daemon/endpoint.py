@@ -68,7 +68,8 @@ class Endpoint:
     """The daemon's four sockets: takes setpoints, publishes telemetry and recording, answers requests.
 
     With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO. `priority` lists the sources
-    that may take the brake, the foremost first. `keys` is None where no endpoint is guarded.
+    that may take the brake, the foremost first. `keys` is None where no endpoint is guarded. It holds the `inbox` of
+    setpoints, the waiting `requests`, the `admission` of peers, and the topics' `listeners`.
 
     Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
     """
@@ -166,9 +167,11 @@ class Endpoint:
                 return
 
     def serve(self, answer: Answer, most: int) -> int:
-        """Answer the waiting requests, `most` at most, for ANSWERS_NS; return the number answered.
+        """Answer the waiting requests, `most` at most, for about ANSWERS_NS; return the number answered.
 
-        `answer` returns the result of a request, or raises RefusedError.
+        `answer` returns the result of a request, or raises RefusedError, which becomes the reply. A request that cannot
+        be decoded, is not permitted or was overtaken is answered with the reason. A reply to a client that has gone is
+        dropped.
         """
         until_ns = time.monotonic_ns() + ANSWERS_NS
         for number in range(most):
@@ -268,9 +271,10 @@ class Endpoint:
         return Waiting(envelope, data, self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
-        """Carry out and answer a `stop` or `disable`; return False, with nothing done, for anything else.
+        """Carry out and answer a `stop` or `disable`, and return True, also where it was refused.
 
-        Where it succeeds, requests that came before it count as overtaken.
+        Where it succeeds, requests that came before it count as overtaken. Returns False, with nothing done, for
+        anything else.
         """
         try:
             request = decode(waiting.data, Request)

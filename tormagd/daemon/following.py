@@ -46,11 +46,11 @@ class Following:
         self._rate_mm_s = self._turned_mm = 0.0
 
     def look(self, tick: TickRecord) -> None:
-        """Take one tick, and add its error for each delay where it counts.
+        """Take one tick, and add its squared error for each delay where it counts.
 
-        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED, after MOST_DELAY_S of
-        setpoints. Sums fade by a factor e in FORGETS_S. Out of ENABLED or without a setpoint, arrival and setpoints are
-        forgotten.
+        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED. It does so after
+        MOST_DELAY_S of setpoints, from the first force within the tolerance on. Sums fade by a factor e in FORGETS_S.
+        Out of ENABLED or without a setpoint, arrival and setpoints are forgotten.
         """
         asked_N, measured_N, kept = tick.setpoint_cf, tick.measured_cf, self._kept
         self._weight *= kept

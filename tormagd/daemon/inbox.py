@@ -48,7 +48,10 @@ log = logging.getLogger(__name__)
 
 
 class _Source:
-    """One publisher: its newest setpoint, sequence, clock, unit of stamps, manner of sending, and counts."""
+    """One publisher: its newest setpoint, sequence, clock, unit of stamps, manner of sending, and counts.
+
+    `cause` and `remedy` tell what is wrong with its clock or stamps, as of the last `refresh`; empty where nothing is.
+    """
 
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
         self.setpoint, self.heard_s = setpoint, now_s
@@ -77,9 +80,10 @@ class _Source:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, needs: Needs) -> None:
-        """Make `setpoint` the source's newest, and add its delay to the statistics.
+        """Make `setpoint` the source's newest, heard at `now_s` and stamped by `delay_s`, its age on arrival.
 
-        `delay_s` is its age on arrival by the corrected clock; below 0 counts as 0.
+        `delay_s` is by the corrected clock; below 0 counts as 0. Once the clock's offset is known, delay and manner of
+        sending are judged by the scene's `needs`.
         """
         clock = self.clock
         if clock.is_settled:
@@ -93,9 +97,10 @@ class _Source:
 
 
 class SetpointInbox:
-    """Chooses the setpoint to plan for: the newest valid one of the source that holds the brake.
+    """Chooses the setpoint to plan for, `newest`: the newest valid one of the source that holds the brake (`hold`).
 
-    No sockets, no clock. `priority` lists sources, the foremost first.
+    No sockets, no clock. `priority` lists sources, the foremost first. It keeps up to SOURCES sources, counts messages
+    as `accepted`, `refused` or `dropped`, and keeps the `last_refusal`.
     """
 
     def __init__(self, priority: tuple[str, ...] = ()) -> None:
@@ -136,8 +141,9 @@ class SetpointInbox:
     def give(self, name: str, now_s: float) -> None:
         """Make the source `name` the holder of the brake, as an operator's choice.
 
-        Its newest setpoint becomes the one to plan for, unless it is the holder already. Raises RefusedError for a
-        source that is not known, or whose newest setpoint is no longer valid.
+        Its newest setpoint becomes the one to plan for, and a log line is queued, unless it is the holder already.
+        Sources of higher priority do not take the brake from it. Raises RefusedError for a source that is not known, or
+        whose newest setpoint is no longer valid.
         """
         source = self._sources.get(name)
         if source is None:
@@ -209,7 +215,12 @@ class SetpointInbox:
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
     def report(self, now_s: float) -> SetpointReport:
-        """Return counts, the last refusal, and each source's `seq`; in full for the holder and the newest others."""
+        """Return counts, the last refusal, and each source's `seq`, with full reports on the holder and the newest
+        others.
+
+        There are REPORTED full reports at most. At `now_s` a source is stale or not, and silent for so long. Delays and
+        the judgement of a clock are of the source's last `refresh`.
+        """
         newest = sorted(self._sources, key=lambda name: (name != self.hold.source, -self._sources[name].heard_s))
         return SetpointReport(
             accepted=self.accepted,

@@ -22,7 +22,11 @@ log = logging.getLogger(__name__)
 
 
 class InferenceLoop:
-    """The inference loop: plans for the inbox's newest setpoint, and calls `on_failure` for a plan that failed."""
+    """The inference loop: plans for the inbox's newest setpoint, and calls `on_failure` for a plan that failed.
+
+    It holds the `planner` with the newest plan, the loop's `timing`, and the search `beside` the plans, None without
+    one.
+    """
 
     def __init__(
         self,
@@ -86,7 +90,12 @@ class InferenceLoop:
         return is_made
 
     def _make_plan(self, now_s: float, measured: Measured | None, is_followed: bool) -> None:
-        """Take the search's newest answer, plan at `now_s`, and ask the search the next question."""
+        """Take the search's newest answer, plan at `now_s` for the inbox's newest setpoint, and ask the next question.
+
+        The plan becomes `planner.planned`. `measured` is None while the device is silent; `is_followed` says whether
+        the gap follows the plans. A plan that fails is not raised: see `_begin_afresh`. Without a search beside the
+        plans nothing is asked. Answer and plan are noted in the journal.
+        """
         setpoint, beside = self._inbox.newest, self.beside
         answer = None if beside is None else beside.answer()
         if answer is not None:

@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run `tormagd` with `arguments`, None: those of the process; return the exit code.
 
     0: ended on request; 1: could not run; 2: command line or configuration refused. Errors go to stderr, as does the
-    log.
+    log. `--help` and `--version` raise SystemExit.
     """
     write_in_any_encoding()
     try:

@@ -78,7 +78,8 @@ class ProfileFolder:
 class Profiles:
     """Keeps what each device has shown of itself, and teaches it when the device is connected again.
 
-    `believe` holds what is learned, `teach` replaces it. A `folder` of None keeps nothing.
+    `believe` holds what is learned, `teach` replaces it. A `folder` of None keeps nothing. It knows the connected
+    device's serial number, whether its profile is used, and that profile's `digest`.
     """
 
     def __init__(self, folder: ProfileFolder | None, believe: Believe, teach: Callable[[Learned], None]) -> None:

@@ -91,7 +91,11 @@ class _Mark(NamedTuple):
 
 @final
 class RateGroup:
-    """The timing of one periodic activity: counts, lateness and execution time of its runs."""
+    """The timing of one periodic activity: counts, lateness and execution time of its runs.
+
+    Counts of `runs`, `merged`, `overruns` and `stalls` are since the start; `lateness_us`, `exec_us` and `delay_ns` are
+    the newest run's.
+    """
 
     def __init__(self, name: str, period_ns: int) -> None:
         self.name = name
@@ -136,8 +140,8 @@ class RateGroup:
     def report(self) -> RateReport:
         """Return counts since the start, and rate, grade and percentiles over one to two horizons.
 
-        Percentiles are those of the last `refresh` of the histograms. The worst lateness is since the start, and 0 Hz
-        stands for fewer than two runs.
+        Percentiles are those of the last `refresh` of the histograms. The grade is `error` after a stall, `warning`
+        after an overrun, else `good`. The worst lateness is since the start, and 0 Hz stands for fewer than two runs.
         """
         since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"

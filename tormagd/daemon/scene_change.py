@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneChange:
-    """Changes the running scene, one change at a time.
+    """Changes the running scene, one change at a time; `newest` reports on the newest change.
 
     `build` makes the core of a scene and raises ConfigError. `require` raises RefusedError where the device is in use.
     `take` puts the core in the place of the running one.

@@ -32,7 +32,7 @@ class Service:
         `planned_s` and `received_s` are the times of the newest plan and state, None before the first; `limit_s` is how
         old they may be. False before the first plan. A device that was identified and has fallen silent while its port
         is open counts as not fresh. A port that is not open, a device not yet identified, or one whose firmware was
-        refused does not.
+        refused does not: its time counts from now.
         """
         if planned_s is None or now_s - planned_s > limit_s:
             return False

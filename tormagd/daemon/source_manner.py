@@ -74,8 +74,10 @@ class SourceManner:
         self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
 
     def _judged(self, past_s: float, lost: int, preview_s: float, needs: Needs) -> dict[Limit, Explanation]:
-        """Return what is wrong in a window of `past_s` in which `lost` messages were missing; empty where nothing
-        is."""
+        """Return what is wrong in a window of `past_s` in which `lost` messages were missing; empty where nothing is.
+
+        SOURCE_LOSS, SOURCE_SELDOM (not within `preview_s`), SOURCE_LATE and SOURCE_JITTER may be found.
+        """
         sent = self._messages + lost
         found = {}
         if lost > MOST_LOST * sent:

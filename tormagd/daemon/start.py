@@ -28,7 +28,8 @@ def start(options: argparse.Namespace) -> int:
     """Build the core and run the daemon as the command line and its configuration say; return the exit code.
 
     0: ended on request; 1: could not run, with the reason on stderr. `--check` prints what would run, as JSON, and runs
-    nothing. Raises ConfigError where configuration, scene, keys or backend are refused.
+    nothing; 1 then says that it could not be printed. Raises ConfigError where configuration, scene, keys or backend
+    are refused, with the file's line where one is to blame.
     """
     try:
         config = _configured(options)
@@ -48,10 +49,10 @@ def start(options: argparse.Namespace) -> int:
 
 
 def _configured(options: argparse.Namespace) -> Config:
-    """Return the file's configuration with the command line's scene, and the scene's rates where `rates.of_scene` is
-    set.
+    """Return the file's configuration with the command line's scene, and its rates where `rates.of_scene` is set.
 
-    Raises ConfigError.
+    Reads the configuration's file and the scene's. Raises ConfigError where either is refused, or the scene's rates
+    are.
     """
     config = load_config(options.config)
     if options.scene is not None:

@@ -22,8 +22,9 @@ def tick_record(
 ) -> TickRecord:
     """Return the record of one control tick, number `number`, along `plan`. Call right after the step.
 
-    `measurement` is None without a device: its fields are None, too. Fields are given by position: by name it takes ten
-    times as long.
+    It is stamped with CLOCK_REALTIME now. `measurement` is None without a device: its fields are None, too. Carriage
+    places are None unless homed. `governed_cf` is None and `limits` empty unless the device is driven. Fields are given
+    by position: by name it takes ten times as long.
     """
     measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
     is_placed = measured is not None and measured.is_homed
@@ -122,7 +123,8 @@ def snapshot(
     """Return the telemetry message `sequence` of the newest `tick`.
 
     `age_s` is the setpoint's, None without one. `handle` is the handle's place, mm, and rate, mm/s, positive pushing
-    on; None without a device. `mark` is the newest, None before the first.
+    on; None without a device. `verdict` is None without a setpoint, `mark` before the first. Gap, carriages and skew
+    are None unless homed, the field while the device is not driven.
     """
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0

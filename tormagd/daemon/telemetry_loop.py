@@ -65,8 +65,9 @@ log = logging.getLogger(__name__)
 class TelemetryLoop:
     """The telemetry loop: publishes what the control and inference loops do, and answers requests.
 
-    One phase of every beat and three slices. `not_granted` is what the kernel refused at the start. `config_file` names
-    the file of `config`, None for the defaults.
+    `record` and `publish` are phases of every beat, `tell` and `serve` slices. `not_granted` is what the kernel refused
+    at the start. `config_file` names the file of `config`, None for the defaults. It keeps the ticks that are not
+    published yet, the newest snapshot and status, and the newest mark.
     """
 
     def __init__(
@@ -282,9 +283,10 @@ class TelemetryLoop:
             yield from (self._way.to_duty, *self._phases.spent.values())
 
     def _answer(self, request: Request) -> Any:
-        """Return the result of a request. Raises RefusedError.
+        """Return the result of a request: for `status` and `describe` a report, for any other what `command` returns.
 
-        A `status` is packed once for all who ask in a telemetry period. All but `status` and `describe` is carried out.
+        A `status` is packed once for all who ask in a telemetry period. Raises RefusedError for a request that is
+        refused.
         """
         if request.command == "status":
             # built once for everybody who asks in this period
@@ -320,9 +322,9 @@ class TelemetryLoop:
     def command(self, request: Request) -> dict[str, Any]:
         """Carry out a request that is no question, and return its result as plain data.
 
-        A request takes the brake, confirms, marks, keeps a black box, arms, or changes the scene. Any other is a
-        command to the operating state. Raises RefusedError where the state or the arguments do not allow it. The next
-        `status` is made anew.
+        `take` gives the brake, `confirm` settles a dispute, `mark` adds a mark, `blackbox` keeps a black box, `arm`
+        arms, and `use-scene` changes the scene. Any other name goes to the operating state. Raises RefusedError for an
+        unknown name, and where the state or the arguments do not allow it. The next `status` is made anew.
         """
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
@@ -358,9 +360,10 @@ class TelemetryLoop:
         return msgspec.to_builtins(self._mark)  # type: ignore[no-any-return]
 
     def _confirm(self, what: object) -> dict[str, Any]:
-        """Take the operator's word on what is wrong, "device" or "sensor"; log it and return it.
+        """Take the operator's word on what is wrong, "device" or "sensor"; log it and return `{"confirmed": what}`.
 
-        Raises RefusedError for any other word, and where the readings agree with the device.
+        The planner ends the dispute or stops believing the sensor, and the journal notes it. Raises RefusedError for
+        any other word, and where the readings agree with the device.
         """
         try:
             wrong = msgspec.convert(what, Disputed)
@@ -377,7 +380,7 @@ class TelemetryLoop:
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
-        """Give the brake to the source of this name; return its name with that of the holder before.
+        """Give the brake to the source of this name, log it, and return its name with that of the holder before.
 
         Raises RefusedError for what is no text, an unknown source, and one whose newest setpoint is no longer valid.
         """

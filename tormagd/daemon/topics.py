@@ -17,7 +17,10 @@ NS = 1_000_000_000
 
 
 class Topics:
-    """Publishes the topics `motion` and `verdict` as a phase of every beat, and makes both for snapshots, too."""
+    """Publishes the topics `motion` and `verdict` as a phase of every beat, and makes both for snapshots, too.
+
+    It keeps which motion and which setpoints were published last, and the running scene's `core`.
+    """
 
     def __init__(
         self, config: Config, core: Core, control: ControlLoop, inference: InferenceLoop, endpoint: Endpoint
@@ -51,9 +54,9 @@ class Topics:
         return None if inbox.newest is None else self._verdict(*inbox.newest_is(), self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
-        """Publish the handle's newest motion; return False where it is not due or was not sensed anew.
+        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without a device.
 
-        Due times that were missed are not made up for.
+        It is stamped with CLOCK_REALTIME of when it was sensed. Due times that were missed are not made up for.
         """
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:

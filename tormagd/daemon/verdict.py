@@ -50,8 +50,8 @@ def judged(
     """Judge the setpoint that `plan` was made for: rendered, arrives in some time, or cannot, and why.
 
     `gap_mm` is the measured gap, None without a homed device. Rendered means within the scene's tolerance. Cannot: not
-    ENABLED, no valid setpoint, or a limit that keeps the force away for good. The time is that of the gap's way at its
-    speed, or of the ramp, plus the lag.
+    ENABLED, no homed device, no valid setpoint, or a limit that keeps the force away for good. Why is the state, or the
+    limits. The time is that of the gap's way at its speed, or of the ramp, plus the lag.
     """
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:

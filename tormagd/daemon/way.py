@@ -16,7 +16,10 @@ BUDGET_MS = 400.0
 
 
 class Way:
-    """Measures the delay from a setpoint's stamp to the first duty that follows it. Give it each control tick."""
+    """Measures the delay from a setpoint's stamp to the first duty that follows it. Give it each control tick.
+
+    `to_duty` has the delays, us.
+    """
 
     def __init__(self) -> None:
         self.to_duty = Histogram()
@@ -36,7 +39,8 @@ class Way:
     def report(self, device_us: float | None, lag_s: float) -> WayReport:
         """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known.
 
-        `device_us` is the link's median round trip, None without one; `lag_s` is the carriages' lag.
+        `device_us` is the link's median round trip, us, None without one; `lag_s` is the carriages' lag. The sum has
+        the 99th percentile of the delay to the duty.
         """
         to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
