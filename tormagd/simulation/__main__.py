@@ -39,8 +39,9 @@ FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come.
 
-    `arguments` None: those of the process. Exits with 2 for usage or parts that cannot be used; returns 1 where stdout
-    cannot be written.
+    `arguments` None: those of the process. Writes `--truth` while it runs, and says on stderr how often it fell behind
+    real time. Returns 0, or 1 where stdout cannot be written. Raises SystemExit(2) for usage, or parts that cannot be
+    used.
     """
     command = parser()
     options = command.parse_args(arguments)

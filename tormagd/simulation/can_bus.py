@@ -80,9 +80,10 @@ class SimulatorBus(can.BusABC):
             raise can.CanOperationError("the simulator has gone", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        """Return the next frame, or None after `timeout` seconds, and that it is not filtered yet.
+        """Return the next frame and that it is not filtered yet; in place of the frame None after `timeout` seconds.
 
-        An error frame is one with ERROR_FLAG. Raises can.CanOperationError: the simulator has gone, or sent no frame.
+        A `timeout` of None waits for ever. An error frame is one with ERROR_FLAG. Raises can.CanOperationError: the
+        simulator has gone, or sent no frame.
         """
         try:
             if timeout != 0:

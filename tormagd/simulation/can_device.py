@@ -49,11 +49,11 @@ class CanLine(Protocol):
 
 
 class CanDevice:
-    """One device and the bus it is on.
+    """One device and the bus it is on: the frames that wait, the one under way, and those that are not fetched yet.
 
-        receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
-        transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
-        advance(now_s)                only lets time pass
+    receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
+    transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
+    advance(now_s)                only lets time pass
 
     Times are seconds from power-on. A time before the last, over all three, raises ValueError.
     """

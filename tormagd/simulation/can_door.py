@@ -102,7 +102,10 @@ class CanDoor:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove the socket at `path` if nobody listens there. Raises OSError where it cannot."""
+    """Remove the socket at `path` if nobody listens there; leave it where somebody does, and do nothing without one.
+
+    Raises OSError where that cannot be found out, as for a file that is no socket, or it cannot be removed.
+    """
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
         try:
             probe.connect(str(path))

@@ -86,7 +86,8 @@ class MessageDevice:
     """The simulated device at the level of messages: payloads in, payloads out, whatever carries them.
 
     `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`. Times are the
-    host's, seconds from power-on. Faults strike at their times.
+    host's, seconds from power-on. Faults strike at the firmware's first tick from their times on; those that last act
+    until `mend`. It holds the `plant` and the `firmware`.
     """
 
     def __init__(
@@ -455,11 +456,12 @@ class SerialDevice(Protocol):
 class VirtualDevice:
     """The device behind a serial line: bytes in, bytes out, both paced to the baud rate.
 
-        receive(now_s, data)   the host hands bytes to its port; they arrive one by one from then on
-        transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
-        advance(now_s)         only lets time pass
+    receive(now_s, data)   the host hands bytes to its port; they arrive one by one from then on
+    transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
+    advance(now_s)         only lets time pass
 
-    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError.
+    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError. Frames that
+    the device cannot decode are dropped, and counted in `statistics`.
     """
 
     def __init__(

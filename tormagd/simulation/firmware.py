@@ -116,7 +116,11 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 
 @final
 class Firmware:
-    """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall."""
+    """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall.
+
+    `mode`, latched `faults`, `homed` and the bridges' `output` are its state, besides the motion under way and the
+    counters of what it accepted last.
+    """
 
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm
@@ -242,7 +246,11 @@ class Firmware:
         return None if self._ticks % STATUS_TICKS else self.status(sensors)
 
     def _tick_run(self, time_s: float, sensors: Sensors) -> None:
-        """Watch a run: any fault ends it and opens the gap."""
+        """Watch a run: any fault is latched, ends it and opens the gap.
+
+        That is SUPPLY, TEMPERATURE, OVERCURRENT, COMMAND_TIMEOUT, END_STOP or SKEW. Without one, an opening duty at an
+        open switch is taken away.
+        """
         left_mm, right_mm = self._positions_mm(sensors)
         fault = self._causes(time_s, sensors)
         if time_s - self._drive_s > COMMAND_TIMEOUT_S:
@@ -257,7 +265,11 @@ class Firmware:
         self.output = self._bounded(self.output, sensors)
 
     def _tick_motion(self, time_s: float, sensors: Sensors) -> None:
-        """Advance homing or retraction by one tick; at its end take over the zeros, latch faults and rest."""
+        """Advance homing or retraction by one tick, and set `output`; at its end take the zeros over and rest.
+
+        Other faults end a homing and open the gap, as its failure does. A reversed motor or encoder is latched at once
+        as HOMING_FAILED, drives off. A retraction goes on while it latches UNCOMMANDED_MOTION or RETRACT_FAILED.
+        """
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
         homing = isinstance(motion, Homing)

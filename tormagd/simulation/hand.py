@@ -256,7 +256,7 @@ _FELT: dict[str, tuple[float, float, float]] = {
 
 
 def parse_hand(spec: str) -> Hand:
-    """Return the hand that the command-line word `spec`, one of KNOWN, stands for.
+    """Return the hand that the command-line word `spec`, one of KNOWN, stands for; a size not given takes its default.
 
     A word that ends with .csv names a recording, which is read. Raises HandError for an unknown word or a size out of
     range, with what is allowed; for a recording, as `read_recording`.

@@ -221,8 +221,9 @@ class Homing:
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """Advance by one tick, `dt_s` long and ending at `time_s`; set `duties` and return the outcome.
 
-        FAILED after the time limit, a failed search or a back-off that takes too long. REVERSED once a carriage that
-        went back towards closed has been braked. DONE once both switches have been found twice; else MOVING.
+        FAILED after the time limit, a failed search or a back-off that takes too long; `duties` may stay as they were.
+        REVERSED once a carriage that went back towards closed has been braked. DONE once both switches have been found
+        twice; else MOVING.
         """
         if time_s >= self._deadline_s:
             return Outcome.FAILED

@@ -306,8 +306,9 @@ def plant_names() -> tuple[str, ...]:
 def load_plant(path_or_name: str | Path) -> PlantParameters:
     """Read a plant by the name of a packaged one (`sample_1`) or from a TOML file.
 
-    Raises PlantError for a missing or unreadable file, bad TOML, and unknown or missing keys. Values that are not
-    finite, out of range, or contradict each other raise PlantError, too.
+    A file with `carriages` states only a pad or the second plant's element: all other parts are those of the plant that
+    it names. Raises PlantError for a missing or unreadable file, bad TOML, and unknown or missing keys. Values that are
+    not finite, out of range, or contradict each other raise PlantError, too.
     """
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)

@@ -46,7 +46,8 @@ class Patient:
     """Robot's tip that follows the handle with a first-order lag, in a vessel with an elastic wall, which may beat.
 
     `wall_mm` counts from the handle's place at the first update, where the tip begins. Over `buckling_N` the catheter
-    buckles: the force grows no more, and the tip stays behind. Raises ValueError for sizes that make no sense.
+    buckles: the force grows no more, and the tip stays behind. It keeps the places of robot and tip, the vessel's
+    friction, and where the wall was met. Raises ValueError for sizes that make no sense.
     """
 
     def __init__(
@@ -101,7 +102,8 @@ class Patient:
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
     """Return the fields of a setpoint that says what the tip feels, `felt`, in the way of `mode`, one of MODES.
 
-    Mode `law` names the wall only once the tip has met it.
+    Mode `force` gives `servo_cf`, the size of the force. The others give wall and friction together as `servo_cf`. Of
+    these `way` adds the friction as `withdraw_cf`, `law` the wall as `contact` once the tip has met it.
     """
     if mode == FORCE:
         return {"servo_cf": abs(felt.force_N)}

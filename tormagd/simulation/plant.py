@@ -28,7 +28,8 @@ _ROUNDING: Final = 1e-6
 class Truth(Value):
     """The plant's true state at one time. `force_N` has the sign of the motion that it resists.
 
-    At a pad, `handle_mm` is the finger's depth in it and `force_N` pushes the finger out.
+    `left_mm` and `right_mm` are the carriages' distances from the centre plane. `kinetic_N` is the friction of a handle
+    that slides now. At a pad, `handle_mm` is the finger's depth in it and `force_N` pushes the finger out.
     """
 
     def __init__(
@@ -166,8 +167,10 @@ class Plant:
         self._left_V, self._right_V = left_V, right_V
 
     def advance(self, dt_s: float) -> None:
-        """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each
-        millisecond."""
+        """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each millisecond.
+
+        What is left of a substep waits for the next call.
+        """
         self._target_s = target_s = self._target_s + dt_s
         due = int(target_s / self._substep_s + _ROUNDING)
         if due == self._substeps:
@@ -232,8 +235,10 @@ def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None
 
 @final
 class ForceSensor:
-    """The force sensor: samples at its own rate, adds noise and a drifting offset, saturates, and shows a sample after
-    a delay."""
+    """The force sensor: samples at its own rate, adds noise and a drifting offset, saturates, and shows samples late.
+
+    `reading_N` is the newest sample that shows; 0 before the first.
+    """
 
     def __init__(self, plant: PlantParameters, noise: random.Random) -> None:
         sensor = plant.force_sensor

@@ -42,8 +42,10 @@ class Pty:
         return os.read(self._ours, READ_BYTES)
 
     def write(self, data: bytes) -> None:
-        """Hand bytes to the host. When nobody reads, the unread ones are thrown away, as in any receiver that
-        overruns."""
+        """Hand bytes to the host. When nobody reads, bytes are thrown away, as in any receiver that overruns.
+
+        The unread ones go where they and `data` would be MAX_UNREAD_BYTES. Where the line takes nothing, both go.
+        """
         (unread,) = struct.unpack("i", fcntl.ioctl(self._theirs, termios.FIONREAD, bytes(4)))
         if unread + len(data) > MAX_UNREAD_BYTES - 1:
             termios.tcflush(self._theirs, termios.TCIFLUSH)

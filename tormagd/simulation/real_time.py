@@ -66,9 +66,9 @@ def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: T
     """Run `device` behind `door` in real time until `stopped()`, and return how well real time was kept.
 
     `stopped` is asked before each wait, which ends with the device's next event or with something from a host. A
-    wake-up late by more than SLIP_S makes the device's time stand still for as long. `truth`, unless None, gets
-    TRUTH_HEADER and a row each TRUTH_PERIOD_S. Freezes the garbage collector's present objects. Raises what `door` and
-    `truth` raise.
+    wake-up more than LATE_S late is counted; more than SLIP_S late makes the device's time stand still for as long.
+    `truth`, unless None, gets TRUTH_HEADER and a row each TRUTH_PERIOD_S. Freezes the garbage collector's present
+    objects. Raises what `door` and `truth` raise.
     """
     # nothing made so far will die: keep the collector from walking it while the device runs
     gc.freeze()

@@ -113,7 +113,10 @@ class SecondElement:
         return self._slid(speed_mm_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
-        """The rest of the step that is prepared, with the handle at that mean speed."""
+        """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`.
+
+        Sets `force_N`, the contact's age and its springs.
+        """
         self.force_N, self._age_s, self._stretched_mm = self._slid(speed_mm_s)
 
     def _slid(self, speed_mm_s: float) -> tuple[float, float, list[float]]:

@@ -22,7 +22,11 @@ JOIN_MM = 10.0
 
 
 def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
-    """Return the radial moment at each gap by the plant's field law, T m, without hysteresis."""
+    """Return the radial moment at each gap (n, mm) by the plant's field law, T m, without hysteresis.
+
+    The law of the thesis goes over into the power law within JOIN_MM from 95 mm on, and is its tangent under 45 mm.
+    Raises DomainError for constants or gaps outside the power law's range.
+    """
     power = PowerFieldLaw(plant.field.coefficient, plant.field.exponent).radial_moment_Tm(gap_mm)
     if plant.field.law == "power":
         return power
@@ -58,7 +62,8 @@ def pull_over_gap(plant: PlantParameters) -> Curve:
 def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: float) -> Curve:
     """Return the fresh, cool insert's kinetic friction as a table over the radial moment, T m to N.
 
-    Raises tormagd.physics.errors.DomainError where the moments leave the force law's domain.
+    The table has MOMENT_POINTS from `weakest_Tm` to `strongest_Tm`. Raises tormagd.physics.errors.DomainError where
+    these leave the force law's domain.
     """
     elastomer = Elastomer(
         shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,

@@ -34,7 +34,10 @@ SAMPLES_PER_CYCLE = 175
 
 @final
 class TactilePad:
-    """One pad with its past: conditioning by strain (Mullins effect) and relaxing stress. A new pad is unworked."""
+    """One pad with its past: conditioning by strain (Mullins effect) and relaxing stress. A new pad is unworked.
+
+    It keeps the greatest depth so far, the present one, and what is left of earlier stress.
+    """
 
     def __init__(self, parameters: PadParameters) -> None:
         self._parameters = parameters
@@ -83,7 +86,8 @@ class TactilePad:
     def advance(self, dt_s: float, displacement_mm: float, rate_mm_s: float, field_mT: float) -> float:
         """Advance by `dt_s` and return the force at the step's end, N, never negative.
 
-        Displacement, rate and field are those at the end. Raises `DomainError` as `elastic_parts_N` does.
+        The pad is conditioned and relaxes meanwhile. Displacement, rate and field are those at the end. Raises
+        `DomainError` as `elastic_parts_N` does; the pad's past may have changed then.
         """
         if dt_s != self._dt_s:
             self._step, self._field_step = self._series.discretise(dt_s), self._field_series.discretise(dt_s)
