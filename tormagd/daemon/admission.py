@@ -244,7 +244,11 @@ class Admission:
                 _end(descriptor, address)
 
     def _admit(self) -> None:
-        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most."""
+        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most.
+
+        200 lets the peer in, 400 does not. A peer that is let in has its key as user id. Each answer is counted, as in
+        `_is_admitted`.
+        """
         for _ in range(AT_ONCE):
             if not self._arrivals.has(self._zap):
                 return

@@ -47,6 +47,7 @@ def header(config: Config, core: Core) -> dict[str, str]:
     """Return the header of a black box of `core`.
 
     It holds what a replay needs to build the core again, and versions and hashes to check that it is the same one.
+    Reads the sources' files for their hash.
     """
     configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
@@ -188,7 +189,10 @@ class BlackBox:
         )
 
     def close(self) -> None:
-        """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most."""
+        """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and leave it then.
+
+        Does nothing without a keeper.
+        """
         beside = self._beside
         if beside is not None:
             self._send(End())

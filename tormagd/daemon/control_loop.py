@@ -53,8 +53,9 @@ class ControlLoop:
     def command(self, name: str, conditions: Conditions) -> None:
         """Carry out an operator's command, note it in the journal, and log it if it was taken.
 
-        Raises RefusedError for a name that is no command, and where `conditions` or the state do not allow it. An
-        arming under way ends first, as overtaken, whether or not the command is then refused.
+        `name` is one of `operating_state.COMMANDS`, which `arm` is not. Raises RefusedError for any other, and where
+        `conditions` or the state do not allow it. An arming under way ends first, as overtaken, whether or not the
+        command is then refused.
         """
         if self.arming is not None:
             self.arming.end(RefusedError("overtaken", f"{name} came before it was armed", "tormagctl arm"))

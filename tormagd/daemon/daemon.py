@@ -141,8 +141,9 @@ class Daemon:
     async def run(self) -> None:
         """Open the device and run until SIGTERM or SIGINT; then open the gap, keep the profile and close everything.
 
-        SIGHUP reads keys and configuration again. Freezes the garbage collector and shortens the interpreter's switch
-        interval, both for the whole process.
+        Systemd is told that it stops. The black box is finished, and the search's process ended. SIGHUP reads keys and
+        configuration again. Freezes the garbage collector and shortens the interpreter's switch interval, both for the
+        whole process. Raises OSError where the kernel gives no timer.
         """
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, self._ended.set)

@@ -204,8 +204,11 @@ class Endpoint:
         self._context.destroy(linger=0)
 
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
-        """Return a new socket of this kind, guarded where it has to be, and bound. Raises OSError naming the
-        endpoint."""
+        """Return a new socket of this kind, guarded where it has to be, bound to `address`, with bounded queues.
+
+        The file of an `ipc://` address is made, and removed by `close`. An XPUB tells every subscription. Raises
+        OSError naming the endpoint.
+        """
         made = self._context.socket(kind)
         options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
         if kind == zmq.XPUB:

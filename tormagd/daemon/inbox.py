@@ -406,7 +406,9 @@ def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: 
 def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: int) -> tuple[str, str]:
     """Return what is wrong with a publisher's clock, and the remedy; two empty texts where nothing is.
 
-    `fit` is the clock's line, None without one. `stamp_ns` is its newest stamp.
+    Told are an offset that is not known yet, one beyond AHEAD_S, and a clock that was never set. So are a clock set
+    within STEP_NAMED_S, and a drift surely over MOST_DRIFT_PPM. `fit` is the clock's line, None without one. `stamp_ns`
+    is its newest stamp.
     """
     if not clock.is_settled:
         return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"

@@ -51,7 +51,10 @@ class Histogram:
             self._most_now = value_us
 
     def refresh(self) -> None:
-        """Compute `report` anew from what is counted."""
+        """Compute `report` anew from what is counted: p50, p99, p99.9 and the largest, us; 0 while nothing is.
+
+        A percentile is the upper edge of its bin, but not above the largest.
+        """
         most = round(max(self._most_now, self._most_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []

@@ -29,7 +29,10 @@ class Order(Enum):
 
 @final
 class Sequence:
-    """Follows a publisher's count `seq` through restarts. `session` is None where the publisher states none."""
+    """Follows a publisher's count `seq` through restarts. `session` is None where the publisher states none.
+
+    Counts messages that are missing in `lost`, and new runs in `restarts`.
+    """
 
     def __init__(self, session: int | None, seq: int) -> None:
         self.session, self.seq = session, seq

@@ -15,7 +15,10 @@ _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
 
 
 class Service:
-    """What systemd is to be told of the daemon: ready, status, alive. No socket, no clock: `notify` sends it."""
+    """What systemd is to be told of the daemon: ready, status, alive. No socket, no clock: `notify` sends it.
+
+    It keeps what was told last, and when the device was last heard.
+    """
 
     def __init__(self) -> None:
         self.is_ready = False

@@ -35,7 +35,8 @@ JITTER_SHARE = 1.0 / 16.0
 class SourceClock:
     """Estimates one publisher's clock offset and the delay of its messages, from stamps and arrivals.
 
-    Give it each message in the order of sending. No clock of its own.
+    Give it each message in the order of sending. No clock of its own. It keeps `offset_s`, the constant part of the way
+    `way_s`, the jitter, and how often and when the clock was set.
     """
 
     def __init__(self) -> None:

@@ -43,7 +43,10 @@ def needs_of(scene: Scene) -> Needs:
 
 
 class SourceManner:
-    """Judges once a second how the setpoints of one publisher come. Give it each message."""
+    """Judges once a second how the setpoints of one publisher come. Give it each message.
+
+    `found` has what was wrong in the newest full window, by limit.
+    """
 
     def __init__(self) -> None:
         self.found: dict[Limit, Explanation] = {}

@@ -15,7 +15,10 @@ SLOW = 0.03
 
 
 class StampUnit:
-    """Finds out whether the stamps of one publisher count ns. Give it each message."""
+    """Finds out whether the stamps of one publisher count ns. Give it each message.
+
+    `is_known` says that it was found out, `wrong` names another unit; empty for ns.
+    """
 
     def __init__(self) -> None:
         self.is_known = False

@@ -237,7 +237,11 @@ class TelemetryLoop:
         return is_homed(self._connection.measurement, self._control.stepper.measured)
 
     def _snapshot(self, now_s: float) -> Telemetry:
-        """Return the telemetry message of the newest tick."""
+        """Return the telemetry message of the newest tick, with states and beliefs as they are at `now_s`.
+
+        A tick must be kept. The message has the setpoint's age (None without one), the handle's motion, the verdict and
+        the newest mark.
+        """
         stamp = self._endpoint.inbox.newest
         age_s = None if stamp is None else now_s - stamp.stamp_s
         planner, stepper = self._inference.planner, self._control.stepper
@@ -247,8 +251,11 @@ class TelemetryLoop:
         return snapshot(self._ticks[-1], *known, *told, self._mark)
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
-        """Tell systemd what is new: readiness, status, and that the daemon lives while plans and device states are
-        fresh."""
+        """Tell systemd what is new: readiness, which is logged, the status line, and that the daemon lives.
+
+        It lives while plans and device states are no older than `realtime.watchdog_ms`; else nothing says so, and
+        systemd's watchdog runs out.
+        """
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
         is_alive = service.is_alive(
@@ -446,7 +453,10 @@ class TelemetryLoop:
         )
 
     def _arm_report(self) -> ArmReport | None:
-        """Return the report on the newest arming; None before the first."""
+        """Return the report on the newest arming: commands given, whether it is over, and why it failed, if so.
+
+        None before the first.
+        """
         arming = self._control.arming
         if arming is None:
             return None

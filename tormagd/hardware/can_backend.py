@@ -56,7 +56,10 @@ class CanOptions(Strict, frozen=True):
 
 
 class CanBackend:
-    """An open CAN bus and the conversation with one node on it: a `Backend`."""
+    """An open CAN bus and the conversation with one node on it: a `Backend`. Nothing here waits.
+
+    It counts the frames in a row that the bus did not take; `stream` counts all else.
+    """
 
     def __init__(self, port: str, options: CanOptions, bus: can.BusABC, held: int | None = None) -> None:
         """Take over the open `bus`; `close` shuts it down.

@@ -89,7 +89,11 @@ _NO_REQUEST: Final = DeviceRequest.NONE
 
 @final
 class DeviceLink:
-    """One conversation with a device, from the opening of the port to its loss. A new opening needs a new link."""
+    """One conversation with a device, from the opening of the port to its loss. A new opening needs a new link.
+
+    It keeps `state` and its `cause`, the device's `identity`, the pending request, and the newest messages, of which it
+    makes a measurement. `round_trip`, `clock` and `quality` tell how the wire carries. No I/O and no clock.
+    """
 
     __match_args__: ClassVar = (
         "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_drives", "_handle_mm",

@@ -75,7 +75,10 @@ class Counts(Value):
 
 @final
 class LinkWatch:
-    """The figures of one conversation, renewed every LOOKED_S from its counters."""
+    """The figures of one conversation, renewed every LOOKED_S from its counters.
+
+    It keeps the counters of the last looks, and when the next is due.
+    """
 
     __match_args__: ClassVar = ("_counts", "_due_s", "_round_trip_s")
 

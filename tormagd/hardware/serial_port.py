@@ -18,7 +18,10 @@ UNSENT_BYTES: Final = 512
 
 @final
 class SerialPort:
-    """An open, exclusively held serial port and the conversation on it: a `Backend`. Nothing here waits."""
+    """An open, exclusively held serial port and the conversation on it: a `Backend`. Nothing here waits.
+
+    It keeps the bytes that the driver has not taken yet.
+    """
 
     def __init__(self, port: serial.Serial) -> None:
         self._port = port

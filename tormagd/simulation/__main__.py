@@ -70,7 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
     """Return the device and the door that the options ask for, to be closed by `resources`.
 
-    Raises PlantError, HandError, FaultError, DomainError, BuildError or OSError.
+    Without `--hand` it is `steady`, or `pressing` at a pad. A CAN door without a path gets a temporary folder. Raises
+    PlantError, HandError, FaultError, DomainError, BuildError or OSError.
     """
     boot = FIRMWARES[options.firmware]
     plant = load_plant(options.plant)

@@ -76,8 +76,9 @@ class Axis:
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
         """Advance the drive and its carriage by one time step, `dt_s`.
 
-        `voltage_V` is the mean voltage at the motor; None is an open bridge, in which no current flows. `attraction_N`
-        is the magnets' pull.
+        Sets angle, speed, current, place and `contact_N`. `voltage_V` is the mean voltage at the motor; None is an open
+        bridge, in which no current flows. `attraction_N` is the magnets' pull. The current is held within its limit,
+        the carriage between its stops; friction may hold either.
         """
         # four times a simulated millisecond: hence local names, and `_lead_of` written out in the second half
         coupling_Nm_A = self._coupling_Nm_A

@@ -35,8 +35,7 @@ class BusDoor:
         return (self._fd,)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Take at most FRAMES_AT_ONCE frames from the bus if it is `readable`, and send what the device has sent by
-        `now_s`.
+        """Take up to FRAMES_AT_ONCE frames from the bus if it is `readable`; send what the device has sent by `now_s`.
 
         Ignored are frames that are no classical data frames of 11 bits, or carry a function that only the device sends.
         Raises can.CanError when the bus goes away, or does not take a frame at once.

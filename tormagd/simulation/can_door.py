@@ -38,10 +38,10 @@ class CanDoor:
         return (self._listener.fileno(), *self._hosts)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Admit hosts and take their frames; hand every frame that has gone by until `now_s` to all hosts but its
-        sender.
+        """Admit hosts, take their frames, and hand on every frame that has gone by until `now_s`.
 
-        A host that has left, or sent what is no frame, is disconnected. One that does not read loses frames.
+        A frame goes to all hosts but its sender. A host that has left, or sent what is no frame, is disconnected. One
+        that does not read loses frames.
         """
         for descriptor in readable:
             if descriptor in self._hosts:

@@ -78,7 +78,7 @@ class _View(ctypes.Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    """Load the library, once, and declare its functions' types.
+    """Load the library, once for this process, and declare its functions' types.
 
     Raises BuildError where the library cannot be built, or its structures are laid out otherwise than ctypes does it.
     """

@@ -202,7 +202,10 @@ class MessageDevice:
             self._time_s = time_s
 
     def _switch(self) -> None:
-        """Put the firmware's present output at the motors, as supply and faults let it."""
+        """Put the firmware's present output at the motors, in steps of the PWM, as supply and faults let it.
+
+        Both bridges are open where the output is not enabled, or without supply.
+        """
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
@@ -221,8 +224,10 @@ class MessageDevice:
         return (time_s - self._boot_s) * self._rate
 
     def _tick(self, time_s: float) -> None:
-        """Begin the faults that are due, then let the firmware tick; a frozen one is reset once its watchdog's time is
-        over."""
+        """Begin the faults that are due, then let the firmware tick, and send its Status if one is due.
+
+        A frozen firmware does not tick; it is reset once its watchdog's time is over.
+        """
         self._ticks += 1
         while self._faults and self._faults[0].at_s <= time_s:
             self._strike(time_s, self._faults.popleft())
@@ -285,7 +290,11 @@ class MessageDevice:
         self.outbox.append(Packet(time_s, function, payload))
 
     def _sensors(self) -> Sensors:
-        """Return what the electronics measure now, faults included."""
+        """Return what the electronics measure now, faults included.
+
+        Encoders count from the firmware's last boot. End switches follow the carriages' true places. Force is the
+        sensor's reading, the temperature the element's.
+        """
         plant, struck = self.plant, self._struck
         left_m, right_m = plant.left.position_m, plant.right.position_m
         switches = 0
@@ -315,7 +324,10 @@ class MessageDevice:
         return math.floor(self.plant.handle_mm * self._handle_counts_per_mm)
 
     def _reset(self, time_s: float) -> None:
-        """Boot the firmware again: mode, zero, clock and pending answers are lost, and encoders count from here."""
+        """Boot the firmware again: mode, zero, clock and pending answers are lost, and encoders count from here.
+
+        Faults of the device, and messages on their way to it, stay.
+        """
         self.firmware = self._boot(self.parameters)
         self._answers.clear()
         self._answer_s = math.inf
@@ -372,7 +384,11 @@ class MessageDevice:
         self._switch()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
-        """Begin `fault` at `time_s`. Raises ValueError for a name whose effect is not defined here."""
+        """Begin `fault` at `time_s`: what it does is in `faults.KNOWN`, its size in percent, if it has one, in `fault`.
+
+        What acts on the bridges is put at the motors at once. Raises ValueError for a name whose effect is not defined
+        here.
+        """
         if fault.name in STANDING:
             self._struck.add(fault.name)
         match fault.name:

@@ -198,7 +198,8 @@ class Firmware:
     def _obey(self, time_s: float, command: Retract | Home | Clear, sensors: Sensors) -> bool:
         """Carry out `command` unless the mode forbids it, and return whether it was accepted.
 
-        Status acknowledges only an accepted command. Retract is refused in LATCHED, Home outside IDLE. Clear is refused
+        Status acknowledges only an accepted command. Retract begins to open, or goes on; it is refused in LATCHED. Home
+        begins a homing, unhomed; it is refused outside IDLE. Clear drops all faults and leads to IDLE. It is refused
         while motors are on, a lasting cause is still there, or the schema does not match.
         """
         if isinstance(command, Retract):
@@ -350,7 +351,10 @@ class Firmware:
         )
 
     def _rest(self, time_s: float, mode: DeviceMode) -> None:
-        """Open the bridges and enter `mode`; LATCHED also makes the device unhomed."""
+        """Open the bridges, end the motion, and enter `mode`; LATCHED also makes the device unhomed.
+
+        The watch on motion by itself begins anew.
+        """
         self.mode = mode
         self.output = OFF
         self._motion = None
@@ -366,7 +370,10 @@ class Firmware:
     # -- watches -------------------------------------------------------------------------------------------------
 
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
-        """Return the faults whose cause is there now, whatever the device does: supply and temperature."""
+        """Return the faults whose cause is there now, whatever the device does: SUPPLY and TEMPERATURE.
+
+        The supply has to be LEAST_SUPPLY_V to MOST_SUPPLY_V, the temperature at most MAX_TEMPERATURE_C.
+        """
         causes = NO_FAULT
         if not LEAST_SUPPLY_V <= sensors.supply_V <= MOST_SUPPLY_V:
             causes |= DeviceFault.SUPPLY

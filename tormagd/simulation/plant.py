@@ -191,7 +191,10 @@ class Plant:
         self._substeps = due
 
     def _advance_element(self, time_s: float) -> None:
-        """Move the hand to `time_s`, then advance the element and the force sensor by their step."""
+        """Move the hand to `time_s`, then advance the element and the force sensor by their step.
+
+        Sets `handle_mm` and `handle_mm_s`. A hand that feels moves as the element's friction lets it.
+        """
         hand, element, before_mm = self._hand, self.element, self.handle_mm
         if isinstance(element, PressedPad):
             self.handle_mm = hand.position_mm(time_s)

@@ -120,8 +120,10 @@ class SecondElement:
         self.force_N, self._age_s, self._stretched_mm = self._slid(speed_mm_s)
 
     def _slid(self, speed_mm_s: float) -> tuple[float, float, list[float]]:
-        """Return force, contact age and spring lengths at the end of a step at the mean speed `speed_mm_s`; the state
-        stays."""
+        """Return force, N, contact age, s, and spring lengths, mm, at the end of a step at the mean speed `speed_mm_s`.
+
+        The state stays.
+        """
         second, dt_s = self._second, self._dt_s
         # exact for a constant speed: what is left of the age, and what the step adds to it
         renewed = abs(speed_mm_s) * dt_s / second.renewed_mm

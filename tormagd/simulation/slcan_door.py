@@ -23,7 +23,10 @@ _FRAME = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
 class SlcanAdapter:
-    """Translator between the serial characters of the Lawicel protocol and CAN frames; no I/O and no clock."""
+    """Translator between the serial characters of the Lawicel protocol and CAN frames; no I/O and no clock.
+
+    It keeps whether the channel `is_open`, and a command that is not complete yet.
+    """
 
     def __init__(self) -> None:
         self.is_open = False

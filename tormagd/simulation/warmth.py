@@ -18,8 +18,7 @@ class Warmth:
         self.temperature_C = self._ambient_C
 
     def advance(self, time_s: float) -> float:
-        """Set `temperature_C` to that of `time_s`, seconds since power-on; return the force there over that of a cool
-        elastomer."""
+        """Set `temperature_C` to that of `time_s`, s since power-on; return the factor on a cool elastomer's force."""
         if self._warming_K > 0.0:
             self.temperature_C = self._ambient_C - self._warming_K * math.expm1(
                 -self._drift_K_s * time_s / self._warming_K

@@ -117,8 +117,8 @@ class Aim:
 
         `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent.
         `memory` gives the lag of the element's field. Updates `number` and `element_mT`, and `question` where a search
-        runs beside the plans. Raises DomainError where no gap gives the field, or the newest answer is older than
-        OLDEST_ANSWER_S.
+        runs beside the plans. Raises DomainError where no gap gives the field, a number is not finite, or the newest
+        answer is older than OLDEST_ANSWER_S.
         """
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)

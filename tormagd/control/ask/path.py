@@ -37,7 +37,10 @@ FLATTEST_N_MM: Final = 1e-3
 
 @final
 class Path:
-    """Finder of the gap's best path, for one portrait (force over gap) and one top speed of the gap; without state."""
+    """Finder of the gap's best path, for one portrait (force over gap) and one top speed of the gap; without state.
+
+    Its methods raise DomainError for NaN.
+    """
 
     def __init__(self, portrait: Portrait, gap_speed_mm_s: float) -> None:
         self._portrait: Final = portrait

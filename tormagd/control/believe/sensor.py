@@ -211,8 +211,9 @@ class SensorTrust:
     def _judge(self, over_N: float, is_strange: bool, dt_s: float) -> None:
         """Judge who is right by how much the readings are over the fit's force, `over_N`.
 
-        With `is_strange` no device gives such readings. May doubt the sensor, and begin or end a dispute. In a dispute
-        moves `lead_N`.
+        With `is_strange` no device gives such readings: after WRONG_S of them the sensor is doubted, in a dispute. A
+        dispute ends once readings have agreed for AGREES_S, of a doubted sensor for TRUSTED_AGAIN_S. In one, `lead_N`
+        follows readings above the fit, by RISES_N_S at most; it returns to 0 for others, and for a doubted sensor.
         """
         agrees = not is_strange and abs(over_N) <= AGREES_N + self.slack_N
         self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)

@@ -69,7 +69,10 @@ class Level(Value):
 
 @final
 class SensorZero:
-    """Estimator of one sensor's zero, `zero_N`, with its variance."""
+    """Estimator of one sensor's zero, `zero_N`, with its variance.
+
+    It keeps the levels of the handle's present way and of the way before, until a reversal has told the zero.
+    """
 
     zero_N: float = 0.0
     "What the sensor reads without a force."

@@ -32,7 +32,10 @@ NOISE_N: Final = 0.03
 
 @final
 class SlowFriction:
-    """Estimator of one device's factor k: its force at rest over its force at speed."""
+    """Estimator of one device's factor k, its force at rest over its force at speed, and of how much of it was learned.
+
+    It also keeps the model's force as far as the contact's bristles have followed it, `followed_N`.
+    """
 
     factor: float = 1.0
     "k."

@@ -70,7 +70,10 @@ def electrical_time_s(motor: Motor) -> float:
 
 
 def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
-    """Return H(z) from duty to carriage position, mm, of third order, exact for a duty held over each period."""
+    """Return H(z) from duty to carriage position, mm, of third order, exact for a duty held over each period.
+
+    `period_s` is its sampling time. Friction and load are left out.
+    """
     inductance_H = motor.inductance_mH * 1e-3
     advance_mm = motor.screw_lead_mm / (2.0 * math.pi * motor.gear_ratio)
     # states: current A, motor speed rad/s, carriage position mm; last row and column carry the held input
@@ -121,7 +124,8 @@ def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
 def margins(motor: Motor, position: Position, period_s: float, *, delay_periods: float = 1.0) -> Margins:
     """Return the margins of one carriage's position loop as it is computed: PID and its filter in z, H(z), and a delay.
 
-    `delay_periods` is the delay of the exchange, in periods of `period_s`.
+    They are the gain margin, dB, the phase margin, degrees, and the crossover, Hz. Margins are negative where the loop
+    swings. `delay_periods` is the delay of the exchange, in periods of `period_s`.
     """
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)

@@ -20,7 +20,10 @@ ON_TARGET_MM: Final = 0.001
 
 @final
 class Pid:
-    """The position loop of one carriage. Its integral starts at 0: friction holds a resting carriage."""
+    """The position loop of one carriage: it keeps the integral, and whether the newest duty was held back.
+
+    The integral starts at 0: friction holds a resting carriage.
+    """
 
     integral: float = 0.0
     "The integral part of the duty."

@@ -159,8 +159,11 @@ class Watch:
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """Return the limits SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK, as they show now. Changes
-        nothing."""
+        """Return the limits that show now, and change nothing: SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK.
+
+        They show over the warning skew, for SHOWN_S after a stall of the loop, and with an old Sense. LINK_DEGRADED
+        shows on a lossy or slow wire, CLOCK for a clock off by over CLOCK_OFF.
+        """
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
