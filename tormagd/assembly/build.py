@@ -339,8 +339,9 @@ def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
 def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
     """Return what ideal carriages at the gap's speed miss of the scene's signal; None where the scene states no signal.
 
-    The signal's file is read from the folder `beside`. Raises ConfigError for a file that is refused, and where the RMS
-    error is over the scene's `tolerance_rms_N`.
+    The first LOOKED_AT_S of the signal count, within what scene and device give. Its file is read from the folder
+    `beside`. Raises ConfigError for a file that is refused, and where the RMS error is over the scene's
+    `tolerance_rms_N`.
     """
     if scene.signal is None:
         return None

@@ -66,9 +66,9 @@ class Planner:
         """Make the next plan, keep it in `planned`, and return it. All planning stages take one update.
 
         `setpoint` is None without a publisher. `measured` is None while the device is silent: nothing is learned of it.
-        Where the gap does not follow the plans (`is_followed`), they begin where it is.
-        Raises DomainError for a number that is not finite, a field that no gap gives, or a search's answer that is too
-        old. The stages are then half updated: call `afresh`.
+        Where the gap does not follow the plans (`is_followed`), they begin where it is. From the plan's gap the
+        carriages' lag is learned, for the next plan. Raises DomainError for a number that is not finite, a field that
+        no gap gives, or a search's answer that is too old. The stages are then half updated: call `afresh`.
         """
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
@@ -266,7 +266,8 @@ class Stepper:
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
         """Return the duties that follow `plan`, or hold the gap while PAUSED, and count what the watch sees.
 
-        A duty that is not finite gives the fault NOT_FINITE, as in `_begin_anew`.
+        The limits are those of actuator and watch. A duty that is not finite gives the fault NOT_FINITE, and duties of
+        0, as in `_begin_anew`.
         """
         followed = None if self.safety.operating_state is _PAUSED else plan
         try:

@@ -90,7 +90,10 @@ class Measure:
         self.measured = self._first(measurement)
 
     def _first(self, measurement: Measurement) -> Measured:
-        """Return a record of `measurement` at rest, with a handle that has not travelled."""
+        """Return a record of `measurement` at rest, with a handle that has not travelled.
+
+        The handle's way, which the sign of the force is by, counts as positive.
+        """
         return Measured(
             number=measurement.number,
             is_homed=measurement.is_homed,

@@ -158,9 +158,10 @@ class Admission:
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
-        """Set the options of the endpoint `name` on its socket, and begin to watch its connections. Call before `bind`.
+        """Begin to watch the connections of the endpoint `name`, and set the options of its socket if it is guarded.
 
-        A guarded socket asks for CURVE keys. Raises OSError where `is_guarded` and the daemon has no keys.
+        Call before `bind`. A guarded socket asks for CURVE keys. Raises OSError where `is_guarded` and the daemon has
+        no keys.
         """
         if is_guarded:
             if self._keys is None:
@@ -214,10 +215,11 @@ class Admission:
         return {name: len(known.addresses) for name, known in self._endpoints.items()}
 
     def let_in(self, allowed: Allowed) -> None:
-        """Replace the list of allowed keys by `allowed`, and log it.
+        """Replace the list of allowed keys by `allowed`, and log it; keys that have lost a role are logged as a
+        warning.
 
-        Where a key has lost a role, all peers of the guarded telemetry and recording endpoints are cut off. Peers that
-        are still allowed reconnect by themselves.
+        Where a key has, all peers of the guarded telemetry and recording endpoints are cut off. Peers that are still
+        allowed reconnect by themselves.
         """
         before, self.allowed = self.allowed, allowed
         roles = Counter(role for listed in allowed.values() for role in listed.roles)
@@ -319,9 +321,10 @@ class Admission:
             self._count_oversize(known.name, address)
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
-        """Forget a closed connection, and count a refusal where its peer never got in and was not counted before.
+        """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many.
 
-        A publisher that had got in is noted in `left`: it may come back at once.
+        A refused key that was counted already is not counted again. A publisher that had got in is noted in `left`: it
+        may come back at once.
         """
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None

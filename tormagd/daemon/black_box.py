@@ -118,10 +118,11 @@ class BlackBox:
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
-        """Add the record of a control period to the journal, with the states after it.
+        """Add the record of a control period to the journal. Does nothing without a keeper.
 
-        Every PART_TICKS periods the entries go to the keeper. What its socket does not take is lost and counted, and a
-        snapshot follows. An entry that cannot be encoded ends the black box. Does nothing without a keeper.
+        Every PART_TICKS periods the entries go to the keeper. What its socket does not take is lost and counted. After
+        a loss, and every SNAPSHOT_S, a snapshot of both states follows. An entry that cannot be encoded ends the black
+        box.
         """
         if self._beside is None:
             return

@@ -236,9 +236,9 @@ class SetpointInbox:
     def _judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> bool:
         """Judge a decoded setpoint; return True if it became the newest.
 
-        A stray of its sequence is dropped and counted. One whose source may not take the brake is refused and counted,
-        and `last_refusal` stays. Raises MessageError for one source too many, for stamps that do not count ns, and for
-        a stamp too far ahead.
+        A stray of its sequence is dropped and counted. One whose source may not take the brake, or that is stale itself
+        beside another holder, is refused and counted; `last_refusal` stays. A new run of the holder's begins a ramp.
+        Raises MessageError for one source too many, for stamps that do not count ns, and for a stamp too far ahead.
         """
         source, order = self._sources.get(setpoint.source), Order.NEWER
         if source is None:

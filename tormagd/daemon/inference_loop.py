@@ -112,7 +112,7 @@ class InferenceLoop:
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
         """Reset the planner after a plan or forecast that failed, withdraw the newest setpoint, and call `on_failure`.
 
-        `error` is logged, unless its message is that of the last one.
+        The journal notes it. `error` is logged, unless its message is that of the last one.
         """
         if str(error) != self._failure:  # the first failure is news, the same one again is not
             self._failure = str(error)

@@ -158,10 +158,10 @@ class Profiles:
         )
 
     def _take(self, reading: "asyncio.Future[Profile | None]") -> None:
-        """Teach the profile that was read, and note its digest.
+        """Teach the profile that was read, note its digest, and log its age.
 
-        It is dropped where it was refused, where another device is connected by now, or where this one has shown
-        itself. Without a file nothing happens.
+        One that was refused is logged, and `report` says why. It is dropped where another device is connected by now,
+        or where this one has shown itself. Without a file nothing happens.
         """
         try:
             profile = reading.result()

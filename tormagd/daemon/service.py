@@ -70,8 +70,8 @@ def status_line(
 ) -> str:
     """Return one line for `systemctl status`: the operating state with its faults, or the scene.
 
-    Then comes the next command, if one is needed. While the link does not run, its state, `cause` and `remedy` come
-    instead.
+    Then comes the next command, if one is needed: `tormagctl status` with faults, `tormagctl arm` where it is not
+    homed. While the link does not run, its state, `cause` and `remedy` come instead.
     """
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:

@@ -467,6 +467,7 @@ class TelemetryLoop:
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:
         """Return the reports that take most of a status' time, by the names of its fields.
 
+        They are `link`, `profile`, `setpoints`, `peers`, `rates`, `phases_us`, `late_ticks_by`, `way` and `black_box`.
         They are made anew every TELL_S, after a command, and when the state of the link changes.
         """
         if now_s - self._reported_s >= TELL_S or self._connection.state is not self._reported_state:

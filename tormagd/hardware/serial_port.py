@@ -52,8 +52,8 @@ class SerialPort:
     def send(self, message: Message) -> None:
         """Write one frame behind what the driver had not taken yet; bytes that it does not take now are kept.
 
-        Raises BackendError when the port is gone or more than UNSENT_BYTES wait, and EncodeError for a value that does
-        not fit the wire.
+        Such a message counts in `statistics.unsent`. Raises BackendError when the port is gone or more than
+        UNSENT_BYTES wait, and EncodeError for a value that does not fit the wire.
         """
         data = self._unsent + self.stream.pack(message)
         try:

@@ -26,9 +26,10 @@ def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
 
 
 def make_prompt(port: serial.Serial, sysfs: Path = SYSFS) -> None:
-    """Set the latency timer of an open port to 1 ms, where it has one that is longer. A refusal is logged as a warning.
+    """Set the latency timer of an open port to 1 ms, where it has one that is longer. Raises nothing.
 
-    ASYNC_LOW_LATENCY needs no rights beyond the open port; the file in sysfs needs root's.
+    A timer that stays longer is logged as a warning. ASYNC_LOW_LATENCY needs no rights beyond the open port; the file
+    in sysfs needs root's.
     """
     found_ms = latency_ms(port.port, sysfs)
     if found_ms is None or found_ms <= PROMPT_MS:

@@ -406,10 +406,11 @@ def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
 
 
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
-    """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED.
+    """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED, `resume` in PAUSED.
 
-    `home` is among them where the device is not `is_homed`, or a latched fault took the positions away. The commands
-    are taken only once the causes of the faults have gone.
+    Elsewhere `enable` is the last, and `clear-fault` the first in FAULT. `home` is among them where the device is not
+    `is_homed`, or a latched fault took the positions away. The commands are taken only once the causes of the faults
+    have gone.
     """
     if state.operating_state is ENABLED:
         return ()

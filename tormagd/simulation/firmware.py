@@ -154,8 +154,9 @@ class Firmware:
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         """Act on one message of the host at `time_s` and return what to answer; a message of a device is ignored.
 
-        A Hello with another schema or protocol version latches SCHEMA_MISMATCH, which opens the gap. A command with the
-        nonce accepted last is ignored. NONE is no answer.
+        A Hello's nonce counts as the one accepted last. A Hello with another schema or protocol version latches
+        SCHEMA_MISMATCH, which opens the gap unless the drives are off. A command with the nonce accepted last is
+        ignored. NONE is no answer.
         """
         if isinstance(message, Drive):
             return self._drive(time_s, message, sensors)

@@ -59,8 +59,9 @@ class SlcanAdapter:
     def _answer(self, command: bytes) -> bytes:
         """Carry out a command that is no frame, and return its answer.
 
-        `O` opens the channel, `C` closes it. Bit rates are accepted while it is closed, without effect. An unknown
-        command is refused.
+        `O` opens the channel, `C` closes it. An empty command is accepted, and so are bit rates while it is closed,
+        without effect. `V`, `N` and `F` are answered by TOLD. Any other is refused, as `O` and bit rates are while it
+        is open.
         """
         match command[:1]:
             case b"":  # hosts send empty lines to end whatever was there before

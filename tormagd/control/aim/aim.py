@@ -232,7 +232,8 @@ class Aim:
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
         """Return the gap's speed, mm/s, and acceleration, mm/s^2, at the beginning of the path `path_N` (7) of forces.
 
-        Both are held within what the configuration lets the gap do.
+        They are those of the parabola nearest to the path along the portrait, opening positive. Both are held within
+        what the configuration lets the gap do.
         """
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
         start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))

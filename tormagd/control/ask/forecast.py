@@ -168,8 +168,8 @@ class Forecast:
         """Make a forecast from the newest point of the grid, and return whether one was due.
 
         A forecast is due after every EVERY points, once the history has MIN_HISTORY points. It is empty where the
-        history has no stretch like the newest. Its guess, and that of the slope `slope_N_s`, are noted; `update` judges
-        them by what comes.
+        history has no stretch like the newest; the skill of SHORT_S is then lost. Its guess, and that of the slope
+        `slope_N_s`, are noted; `update` judges them by what comes.
         """
         if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
             return False

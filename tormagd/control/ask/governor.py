@@ -319,8 +319,9 @@ class Governor:
     ) -> list[float]:
         """Return the forces (7) at PATH_S along the setpoints' slope, or the forecast, weighted by `foresight`, 0..1.
 
-        Now is `soon_s` after the newest stamp. Where the gap gets there soon, the path is the best one for these
-        forces. Updates `sent_N` and `expected_N`.
+        Now is `soon_s` after the newest stamp; the slope carries AHEAD_S at most. Off a ramp, where the gap gets there
+        within NEAR_S, a `foresight` above 0 mixes in the best path for these forces. Updates `sent_N` and `expected_N`:
+        None where no such path is followed.
         """
         begins_s = soon_s + foresight * lag_s
         times_s = _FORECAST_S if foresight > 0.0 else PATH_S
@@ -387,7 +388,8 @@ class Governor:
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
     """Raise DomainError where a number of `setpoint` or its age is not finite or beyond LARGEST.
 
-    Also raise it for a preview whose `preview_dt_s` is not above 0.
+    Also raise it for a preview whose `preview_dt_s` is not above 0. Forces of a preview are looked at only where their
+    sum is beyond LARGEST.
     """
     if not (
         -_LARGEST <= age_s <= _LARGEST

@@ -225,9 +225,9 @@ class Believe:
     def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
         """Learn from the newest reading, with the model's force `model_N` at the measured gap.
 
-        Where friction is mobilised and the handle moves, the reading counts as one at speed, else as one at a creep.
-        The watch on a brake's encoder takes every reading. An old force, and a reading within MIN_DT_S of the last,
-        teach nothing else.
+        Where friction is mobilised and the handle moves, the reading counts as one at speed. It counts as one at a
+        creep else, and for a handle that is stuck or rests beside a moved gap. The watch on a brake's encoder takes
+        every reading. An old force, and a reading within MIN_DT_S of the last, teach nothing else.
         """
         if self._nominal.contact.slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
@@ -319,7 +319,8 @@ class Believe:
     def _dispute(self, model_N: float) -> None:
         """Take the device for what it was before the readings left the fit, and the zero for unknown.
 
-        Before the handle has slid, only what was taught from another day remains of the fit.
+        Before the handle has slid, only what was taught from another day remains of the fit. The force at a creep
+        stays, as far as it was learned there.
         """
         self.zero.doubt()
         before_N = self.strength.fit.force_N(model_N)

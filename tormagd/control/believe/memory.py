@@ -82,8 +82,9 @@ class ElementMemory:
     def update(self, now_s: float, measured: Measured) -> None:
         """Follow lag and relaxation to `now_s`, along a straight change to the `measured` gap.
 
-        Where the device is not homed, a brake only notes how far its gap has opened, and a pad's gap counts as open.
-        Raises DomainError for a gap outside the field law's range.
+        The first known gap begins them, for a brake as rested where it was switched on. Where the device is not homed,
+        a brake only notes how far its gap has opened, and a pad's gap counts as open. A gap counts as at most BEYOND_MM
+        beyond the closed end. Raises DomainError for a gap outside the field law's range.
         """
         slides = self._nominal.contact.slides
         is_empty = self.time_s == -math.inf

@@ -125,8 +125,9 @@ class SensorTrust:
         """Take one reading and judge it against `fit`. May begin or end a dispute, and doubt the sensor.
 
         The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1. `reading_N` is the force against this
-        motion, less the sensor's zero, which is known to within `zero_sd_N`. The model's force is `model_N`. The
-        reading stands for `dt_s` > 0. All arguments are finite. In a dispute, updates `lead_N`.
+        motion, less the sensor's zero, which is known to within `zero_sd_N`; in a dispute it counts as known. The
+        model's force is `model_N`. The reading stands for `dt_s` > 0. All arguments are finite. In a dispute, updates
+        `lead_N`.
         """
         if self.is_disputed:
             zero_sd_N = 0.0  # a reversal has to tell the zero first
@@ -193,7 +194,9 @@ class SensorTrust:
     ) -> None:
         """Update `slack_N`: what the device may show that its fit did not, as conditions have changed of late.
 
-        Also updates the means and the direction that changes are counted from.
+        It is raised at once by what the model's force and the rate differ from their means. A zero that is not known
+        raises it, too, twice after a turn. It is forgotten over LATELY_S. Also updates these means, and the handle's
+        direction.
         """
         # where the handle has turned a wrong zero counts twice
         is_turned = direction * self.direction < 0.0

@@ -178,8 +178,9 @@ def observe(
     """Return the fit after one reading, and whether one of the `bounds` held its scale.
 
     `measured_N` is the reading, `model_N` the model's force, `dt_s` the time since the last reading. At `dt_s` <= 0 the
-    fit is unchanged. The offset adapts in about `adapts_in_s`, and is not bounded here. Without `learns_scale` or
-    `learns_offset` this value stays, and its variance counts (Schmidt). All arguments are finite.
+    fit is unchanged. The offset adapts in about `adapts_in_s`, and is not bounded here. Where the scale is held, the
+    offset alone takes the error. Without `learns_scale` or `learns_offset` this value stays, and its variance counts
+    (Schmidt). All arguments are finite.
     """
     if dt_s <= 0.0:
         return fit, False

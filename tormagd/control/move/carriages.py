@@ -102,9 +102,9 @@ class Carriages(Actuator):
     ) -> Drive:
         """Return the duties of one tick, `dt_s` > 0 after the last, and take both position loops one tick on.
 
-        `plan` None holds the gap. With a plan the gap opens while the force is over the ceiling, `is_over`. Updates
-        reference, expected gap, integrals and counts, and may learn `acceleration_scale`. Call `begin` first. Raises
-        DomainError for a duty that is not finite: call `forget` then.
+        `plan` None holds the gap. With a plan the gap opens while the force is over the ceiling, `is_over`. The limits
+        OVER_FORCE, RATE and SATURATED may show. Updates reference, expected gap, integrals and counts, and may learn
+        `acceleration_scale`. Call `begin` first. Raises DomainError for a duty that is not finite: call `forget` then.
         """
         assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
@@ -195,7 +195,7 @@ class Carriages(Actuator):
     def _feed_forward(self, reference: Reference, pull: float) -> float:
         """Return the duty for the reference's speed and acceleration, with friction and the magnets' `pull`, a duty.
 
-        It is 0 in a scene without the term `motor`.
+        The pull counts only to open. The duty is 0 in a scene without the term `motor`.
         """
         if not self._has_motor:
             return 0.0

@@ -136,9 +136,10 @@ class Watch:
     ) -> tuple[Fault, ...]:
         """Return all faults that show now, and change nothing: `operating_state.latch` sorts them.
 
-        `leap` is an encoder step that no carriage makes, None without one: ENCODER shows once a later Status has come.
-        `sensor_doubted_s` is how long the force sensor has not been believed. Faults of link and motion show only while
-        `safety.is_driven`, those of motion not during a leap.
+        Those of the device and OUT_OF_STROKE always may. `leap` is an encoder step that no carriage makes, None without
+        one: ENCODER shows once a later Status has come. `sensor_doubted_s` is how long the force sensor has not been
+        believed. Faults of link and motion show only while `safety.is_driven`, those of motion not during a leap.
+        DEVICE_NOT_RUNNING shows alone, once STARTING_S have passed since enabling.
         """
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
@@ -182,7 +183,8 @@ class Watch:
         """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`.
 
         Counts for how long a gap strays, a carriage stands or goes against its duty, and the force is over the ceiling.
-        A count begins again where its cause has gone. On a brake the force counts only while the handle moves.
+        A count begins again where its cause has gone. On a brake the force counts only while the handle moves. The
+        duties are kept for the next tick.
         """
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
@@ -212,8 +214,9 @@ class Watch:
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
         """Return the faults of the link: messages too old, a round trip too long, a device's clock too far off.
 
-        While the answer to the first Drive after a stall may be on its way, no message is too old. A Sense is too old
-        only where the scene needs the sensor.
+        They are MEASUREMENT_STALE, SENSE_STALE, STATUS_STALE, LINK_DEGRADED and CLOCK. While the answer to the first
+        Drive after a stall may be on its way, no message is too old. A Sense is too old only where the scene needs the
+        sensor.
         """
         faults: list[Fault] = []
         # the tick nearest to the end of a timeout judges it: the next one could be a period late
