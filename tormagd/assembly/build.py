@@ -390,8 +390,8 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
     """Return the search that `scene` names, with its settings. Raises DomainError for settings that it does not have.
 
-    Where the scene leaves the choice: the portrait where the handle's rate is no term, Newton's method where the force
-    `rises` with the field, else the k-nearest search.
+    Where the scene leaves the choice, it is the portrait if the handle's rate is no term. With the rate it is Newton's
+    method where the force `rises` with the field, else the k-nearest search.
     """
     wanted = scene.solver
     if wanted.name == AUTO:

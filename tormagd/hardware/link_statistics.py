@@ -46,9 +46,9 @@ class RoundTrip:
     the last Drive before the Hello. That fixes how far the two counters are apart. A Drive that is lost later, or not
     answered, moves them further apart.
 
-    A Status names the last Drive that the device accepted. Round trips count only once a Status confirms them; where
-    it contradicts them, the recent ones are forgotten but for that of the Drive it names. One lost Drive alone looks
-    like an answer that is still on its way: round trips are then one period too long until the next Identity.
+    A Status names the last Drive that the device accepted. Round trips count only once a Status confirms them. Where it
+    contradicts them, the recent ones are forgotten but for that of the Drive it names. One lost Drive alone looks like
+    an answer that is still on its way. Round trips are then one period too long until the next Identity.
     """
 
     __match_args__: ClassVar = (
@@ -88,7 +88,7 @@ class RoundTrip:
     def state(self, counter: int, now_s: float) -> None:
         """Note that the State with this counter came at `now_s`; its round trip counts once a Status confirms it.
 
-        A State that would answer a Drive which is not sent yet shows that the counters do not match: then no round trip
+        A State that would answer a Drive which is not sent yet shows that the counters do not match. Then no round trip
         is taken until a Status or an Identity matches them again.
         """
         self._state, self._newest_s = counter, now_s

@@ -24,13 +24,14 @@ def _is_set(bits: int, place: int) -> bool:
 class Measurement(Value):
     """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s.
 
-    Three streams make it, and any of them may stop. On the host's clock, `received_s` is when the newest State came,
-    `sensed_s` the newest Sense (currents, force, handle), `reported_s` the newest Status (mode, switches, faults,
-    temperature, supply). `device_time_s` is the device's own clock, unwrapped from an arbitrary start. `handle_mm` is
-    the travel of the roller's surface, unwrapped. `number` counts the states since the device was identified.
+    Three streams make it, and any of them may stop. On the host's clock, `received_s` is when the newest State came.
+    `sensed_s` is when the newest Sense came (currents, force, handle), `reported_s` the newest Status (mode, switches,
+    faults, temperature, supply). `device_time_s` is the device's own clock, unwrapped from an arbitrary start.
+    `handle_mm` is the travel of the roller's surface, unwrapped. `number` counts the states since the device was
+    identified.
 
-    `delay_s` is the age of the first Drive that a Status does not show obeyed yet, at most the way there and back; of
-    the last two Statuses the lesser, and 0 unless the device is in RUN. `link` is how well the wire carries.
+    `delay_s` is the age of the first Drive that a Status does not show obeyed yet, at most the way there and back. It
+    is the lesser of the last two Statuses', and 0 unless the device is in RUN. `link` is how well the wire carries.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
 
 
 def make_prompt(port: serial.Serial, sysfs: Path = SYSFS) -> None:
-    """Set the latency timer of an open port to 1 ms, where it has one that is longer. Raises nothing.
+    """Set the latency timer of an open port to 1 ms, where it has one that is longer.
 
     A timer that stays longer is logged as a warning. ASYNC_LOW_LATENCY needs no rights beyond the open port; the file
     in sysfs needs root's.

@@ -44,8 +44,8 @@ class NearestFieldSearch:
     at the ends of reach.
 
     The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where the force
-    rises with the field there is one root, and one neighbour finds it. Where it also falls there are several, each on
-    a branch of its own: with too few neighbours all candidates may lie on another branch than the last field's.
+    rises with the field there is one root, and one neighbour finds it. Where it also falls there are several, each on a
+    branch of its own. With too few neighbours all candidates may then lie on another branch than the last field's.
 
     `fields_mT` is an even grid, as `field_grid` makes it. `batch` gives the forces on the grid; None: the curve does.
     Raises `DomainError` unless `neighbours` is 1 to the number of grid points.

@@ -44,7 +44,7 @@ def attraction_N(gap_mm: Real, magnet: CuboidMagnet) -> Real:
     """Return the attraction between two identical coaxial blocks at a face-to-face gap, N, >= 0.
 
     A float gives a float, an array one of its shape and type. Raises `DomainError` unless the gap is from 0.01 mm to 50
-    times the shortest edge. The force falls with gap^-4 while the corner terms grow: for a 40 x 40 x 20 mm block the
+    times the shortest edge. The force falls with gap^-4 while the corner terms grow. For a 40 x 40 x 20 mm block the
     relative error is 1e-12 up to 100 mm and 1e-6 at 1000 mm.
     """
     edges_m = (magnet.width_m, magnet.depth_m, magnet.thickness_m)

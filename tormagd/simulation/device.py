@@ -476,8 +476,8 @@ class VirtualDevice:
     transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
     advance(now_s)         only lets time pass
 
-    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError. Frames that
-    the device cannot decode are dropped, and counted in `statistics`.
+    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError. Damaged
+    frames are dropped, and counted in `statistics`.
     """
 
     def __init__(
