@@ -28,9 +28,10 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 
 @contextlib.contextmanager
 def in_place_of(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which replaces `path` at the end.
+    """Give a path beside `path` to write to, which replaces `path` at the end.
 
-    After an OSError, inside or at the end, that file is removed and `path` stays as it was.
+    After an OSError, inside or at the end, that file is removed and `path` stays as it was. Any other error leaves
+    both.
     """
     beside = path.with_name(f"{path.name}.part")
     try:

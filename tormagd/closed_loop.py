@@ -158,7 +158,10 @@ class VirtualBus:
 
 
 class ClosedLoop:
-    """A daemon's core and its simulated device in one process and one virtual time, which starts at 0."""
+    """A daemon's core and its simulated device in one process and one virtual time, which starts at 0.
+
+    Holds the stages, the connection, the port, the count of periods, the newest duties, and the question to a search.
+    """
 
     def __init__(
         self, config: Config, stepper: Stepper, planner: Planner | None, device: SerialDevice | VirtualBus
@@ -207,7 +210,7 @@ class ClosedLoop:
         return self.connection.measurement
 
     def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
-        """Run one control period, and return what happened in it.
+        """Run one control period, and return what happened in it: the device runs on, then read, plan, step and send.
 
         `setpoint` is the newest; None: no publisher. With a `plan` nothing is planned, and this one is used: a bench
         sweep asks for gaps, not forces. Raises ValueError without a plan in a loop without a planner, and DomainError
@@ -260,8 +263,9 @@ class ClosedLoop:
     def arm(self, plan: Plan | None = None) -> None:
         """Connect, home and enable, as an operator does.
 
-        `plan` is used in every tick, as in `tick`. Raises RuntimeError where the device does not answer, begin to home,
-        or home within HOMING_S each, or is not enabled. Raises RefusedError for a refused command.
+        `plan` is used in every tick, as in `tick`; None lets the planner plan. Raises RuntimeError where the device
+        does not answer, begin to home, or home within HOMING_S each, or is not enabled. Raises RefusedError for a
+        refused command.
         """
         self._until(lambda m: True, "answer", plan)
         self.command("home")
@@ -280,8 +284,8 @@ class ClosedLoop:
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
         """Plan where a setpoint is new or the inference period is over; without a planner do nothing.
 
-        Before, a search's answer that is due is handed over. After, a forecast is made, and the plan's question to a
-        search is noted, unless one is pending.
+        `setpoint` None: no publisher. Before, a search's answer that is due is handed over. After, a forecast is made,
+        and the plan's question to a search is noted, unless one is pending.
         """
         planner = self.planner
         if planner is None:
@@ -294,7 +298,11 @@ class ClosedLoop:
             self._asked = self._asked or planner.question
 
     def _search(self, planner: Planner, now_s: float) -> None:
-        """Answer the pending question once SEARCH_S is over, as a search in a process of its own would."""
+        """Answer the pending question once SEARCH_S is over, as a search in a process of its own would; else do
+        nothing.
+
+        The answer goes to the planner, and no question is pending then.
+        """
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
             planner.answered(planner.aim.answer_to(asked))

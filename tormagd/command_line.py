@@ -27,7 +27,8 @@ class Parser(argparse.ArgumentParser):
     options: tuple[str, ...] = ()
 
     def error(self, message: str) -> NoReturn:
-        """Raise it."""
+        """Raise UsageError with this message, cut to LONGEST characters; for an unknown option also what may have been
+        meant."""
         if message.startswith(UNKNOWN_OPTION):
             known = self.options or tuple(self._option_string_actions)
             message += did_you_mean(message.removeprefix(UNKNOWN_OPTION).split()[0], known)

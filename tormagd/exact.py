@@ -41,7 +41,8 @@ def kinds(*types: type[Value] | type[Enum]) -> Kinds:
 
 
 def plain(thing: object) -> Any:
-    """Return `thing` as plain data.
+    """Return `thing` as plain data: a value, or what changes in place, becomes a map of its fields, a tuple becomes a
+    list.
 
     Raises TypeError for what has no fields, and is neither plain, an enumerator, a tuple, a list nor a deque.
     """
@@ -62,7 +63,11 @@ def plain(thing: object) -> Any:
 
 
 def _fields(thing: object) -> tuple[str, ...]:
-    """Return the names of the fields of `thing`, in order; empty for an enumerator and for what has none."""
+    """Return the names of the fields of `thing`; empty for an enumerator and for what has none.
+
+    They are those of `__match_args__` in that order; or else, in the order of the alphabet, its attributes without a
+    leading underscore.
+    """
     if isinstance(thing, Enum):
         return ()
     if hasattr(thing, "__match_args__"):
@@ -75,7 +80,11 @@ def _fields(thing: object) -> tuple[str, ...]:
 
 
 def restored(data: Any, known: Kinds) -> Any:
-    """Return the value that `data` stand for, of the types in `known`. Raises InexactError."""
+    """Return the value that `data` stand for, of the types in `known`; an array becomes a tuple, `{"list": [...]}` a
+    list.
+
+    Raises InexactError for an unknown type, other fields than the type's, or values that it refuses.
+    """
     if type(data) in _AS_THEY_ARE:
         return data
     if isinstance(data, list | tuple):
@@ -103,8 +112,11 @@ def restored(data: Any, known: Kinds) -> Any:
 
 
 def restore(thing: Any, data: Any, known: Kinds) -> None:
-    """Give `thing`, which changes in place, the fields that `data` stand for. Raises InexactError; some may be set by
-    then."""
+    """Give `thing`, which changes in place, the fields that `data` stand for; what changes in place inside it is kept,
+    and filled.
+
+    Raises InexactError for other fields or values; some may be set by then.
+    """
     name = type(thing).__name__
     fields = data.get(name) if isinstance(data, dict) else None
     if not isinstance(fields, dict) or set(fields) != set(_fields(thing)):
@@ -131,7 +143,8 @@ def packed(data: Any) -> bytes:
 def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
     """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with the value of each there.
 
-    None where they are the same to the bit. Where the right one has no such place, its value is None.
+    None where they are the same to the bit. Where the right one has no such place, its value is None. Where one only
+    ends earlier, the place is "length", with both counts of values.
     """
     if packed(left) == packed(right):
         return None

@@ -24,7 +24,8 @@ Allowed = Mapping[str, Listed]
 
 
 class KeyRing:
-    """The daemon's own key pair, and the accepted public keys of each role.
+    """The daemon's own key pair `server`, and the accepted public keys of each role, as read when it was made, in
+    `allowed`.
 
     Raises ConfigError naming file and remedy where keys are missing, damaged, or open to others.
     """
@@ -41,7 +42,7 @@ class KeyRing:
     def load_allowed(self) -> Allowed:
         """Read the key folders of all roles again and return the accepted keys; `allowed` stays as it is.
 
-        Raises ConfigError as `load_folder`.
+        A key in several folders has all their roles, and the name of the last. Raises ConfigError as `load_folder`.
         """
         found: dict[str, Listed] = {}
         for role, folder in self._folders.items():

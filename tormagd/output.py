@@ -21,7 +21,7 @@ _ALIKE = {"±": "+-", "·": "-", "…": "~"} | dict(zip("▁▂▃▄▅▆▇�
 
 
 def _alike(error: UnicodeError) -> tuple[str, int]:
-    """What a stream writes for characters that its encoding lacks: what is alike, or JSON's escapes."""
+    """Return what a stream writes for characters that its encoding lacks: what is alike, or JSON's escapes."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
@@ -32,7 +32,7 @@ codecs.register_error("alike", _alike)
 
 
 def write_in_any_encoding() -> None:
-    """From here on stdout and stderr take any text, whatever their encoding is."""
+    """Make stdout and stderr take any text from here on, whatever their encoding is."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="alike")
@@ -58,7 +58,10 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
 
 
 def write_answer(text: str, program: str) -> bool:
-    """Write to stdout what `program` was asked for; False where that could not be, which stderr is told."""
+    """Write to stdout what `program` was asked for; False where that could not be, which stderr is told.
+
+    True also where stdout is closed, or its reader has gone: it meant to.
+    """
     lost = write_line(text, sys.stdout)
     # a reader that stopped reading meant to; a disk that is full did not
     if lost is None or isinstance(lost, BrokenPipeError):

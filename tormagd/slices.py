@@ -17,6 +17,8 @@ _SYSTEM_CALL = {"x86_64": 314, "aarch64": 274}
 
 
 class _Attributes(ctypes.Structure):
+    """The kernel's `struct sched_attr`, as sched_setattr(2) takes it."""
+
     _fields_ = (
         ("size", ctypes.c_uint32),
         ("policy", ctypes.c_uint32),

@@ -49,9 +49,10 @@ def calibrate_insert(
 ) -> Outcome:
     """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`.
 
-    `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. Raises as `armed` and
-    `Run.play`. Raises CommandError (REFUSED) for an unknown insert, a still handle, another publisher, or a sweep or
-    fit that is not good enough. Then there is no model file.
+    `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. The outcome holds the
+    fitter's answer. Raises as `reach`, `armed`, `Run.play` and `Run.wait_for_handle`. Raises CommandError (REFUSED) for
+    an unknown insert, before anything moves, and for a daemon without a range of force. REFUSED are also sweeps or a
+    fit that are not good enough: then there is no model file.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
@@ -78,7 +79,11 @@ def calibrate_insert(
 
 
 def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
-    """Tell the person how to turn the handle, wait until it moves, and return the ticks of one sweep."""
+    """Tell the person how to turn the handle, wait until it moves, play one sweep, and return its ticks by COLUMNS.
+
+    `number` counts from 0, and picks the rate and the pace that is asked for. Shows a progress bar. Raises as
+    `Run.wait_for_handle` and `Run.play`.
+    """
     waveform = up_and_down(forces, rates_N_s[number])
     label = f"sweep {number + 1} of {len(rates_N_s)}"
     print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
@@ -94,8 +99,11 @@ def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
-    """Write the CSV file that `FITTING` reads: of each sweep every fourth tick, of those in which every value is
-    known."""
+    """Write the sweeps as the CSV file `path` that `FITTING` reads, with FILE_COLUMNS; a file there is replaced.
+
+    Ticks with an unknown value are left out, and of the rest every fourth is kept. Time, s, begins with the earliest
+    sweep; `sweep` counts from 0; `gap_mm` is left plus right. Raises OSError.
+    """
     start_s = min((float(sweep["monotonic_s"][0]) for sweep in sweeps if sweep["monotonic_s"].size), default=0.0)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -115,9 +123,10 @@ def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
 
 
 def _ask_fitter(*arguments: str) -> dict[str, Any]:
-    """Run the fitting process and return its answer; SIGINT and SIGTERM end it.
+    """Run the fitting process on `arguments`, and return the `result` that it prints; SIGINT and SIGTERM end it.
 
-    Raises CommandError (REFUSED) where it refuses, dies without an answer, or is interrupted.
+    Raises CommandError (REFUSED) where it refuses, with its own code and hint; where it ends without an answer; or
+    where it was interrupted.
     """
     command = [sys.executable, "-m", FITTING, *arguments]
     with (
@@ -149,7 +158,10 @@ def _ask_fitter(*arguments: str) -> dict[str, Any]:
 
 
 def _text(result: dict[str, Any]) -> str:
-    """Say how well the fitted model was judged, and what to do with it."""
+    """Say how well an insert's fitted model did on sweeps kept from the fit, and what to do next.
+
+    `result` is the fitting process's answer; errors are told in mN beside what is allowed and the sensor's noise.
+    """
     metrics = result["metrics"]
     return (
         f"{result['model']}: {result['insert']}, {result['created']}, {result['rows']} rows. On sweeps kept from the "
@@ -174,8 +186,10 @@ def calibrate(
 ) -> Outcome:
     """Calibrate one of: the device, an `insert`, or the `motors`; asks for agreement first unless `is_agreed`.
 
-    Raises CommandError (USAGE) for options that do not fit each other, a file that exists or has no folder, or a faulty
-    scene. Without agreement, stdin has to be a terminal. Raises as the three calibrations do.
+    `out` is the new file of the model or motor log, and None for `device`. `csv` gets an insert's training data.
+    `rates_N_s` are an insert's sweeps, `side` the motor that is logged. Raises CommandError (USAGE) for options that do
+    not fit each other, a file that exists or has no folder, or a faulty scene. USAGE is also agreement that is needed
+    where stdin is no terminal. Raises as the three calibrations do.
     """
     if [insert is not None, motors, device].count(True) != 1:
         raise usage_error("give one of --insert NAME, --motors and --device", "tormagctl calibrate --help shows them")

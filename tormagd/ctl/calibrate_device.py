@@ -37,7 +37,11 @@ DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
 
 
 def lesson(forces: Range) -> tuple[Waveform, Waveform]:
-    """Return two waveforms: ramps by which the device shows itself, and steps that judge what was learned."""
+    """Return two waveforms: RAMPS_S up and down, by which the device shows itself, and STEP_SHARES that judge what was
+    learned.
+
+    Both lie between CLEAR_N above the least force and the most; each step is held for STEP_S.
+    """
     low_N = forces.least_N + CLEAR_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (forces.most_N, low_N)]
     levels_N = [low_N + share * (forces.most_N - low_N) for share in STEP_SHARES]
@@ -51,8 +55,9 @@ def lesson(forces: Range) -> tuple[Waveform, Waveform]:
 def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
     """Let the daemon learn the device, judge it by steps, and wait until its profile is kept. The gap opens in the end.
 
-    `scene_most_N` is the greatest force to ask for. Raises as `armed` and `Run.play`. Raises CommandError (REFUSED)
-    where no profile is kept, the handle hardly moves, or the daemon doubts the force sensor.
+    `scene_most_N` is the greatest force to ask for. The outcome holds serial number, what was learned, the figures of
+    `judged`, and the profile's folder. Raises as `reach`, `armed`, `Run.wait_for_handle` and `Run.play`. Raises
+    CommandError (REFUSED) where no profile is kept, the handle hardly moves, or the daemon doubts the force sensor.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         profile = client.status().profile
@@ -74,10 +79,12 @@ def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -
 
 
 def judged(steps: Columns, waveform: Waveform, zero_N: float) -> dict[str, Any]:
-    """Return how far the measured force is from the asked one on the steps, by keys of `--json`, in N.
+    """Return how far the measured force is from the asked one on the steps, by keys of `--json`.
 
-    `mean_error_N` and `worst_error_N` are over the steps' means, less `zero_N`, after ARRIVED_S of each; `noise_N` is
-    the median standard deviation within one. Raises CommandError (REFUSED) where the handle hardly moved.
+    `steps` counts those with a moving handle. Of each, ticks count after ARRIVED_S while the handle slides.
+    `mean_error_N`, measured less asked, and `worst_error_N`, a size, are over the steps' means, less `zero_N`.
+    `noise_N` is the median standard deviation within a step. Raises CommandError (REFUSED) where the handle hardly
+    moved.
     """
     require_sliding(steps)
     begin_s = float(steps["monotonic_s"][0])
@@ -132,8 +139,11 @@ def _still(share: float) -> CommandError:
 
 
 def _kept(client: Client) -> ProfileReport:
-    """Wait until the daemon has written the profile anew. Raises CommandError (REFUSED) where it has not within
-    KEPT_WITHIN_S."""
+    """Wait until the daemon has written the profile anew, and return its report; one written up to a second before
+    counts.
+
+    Raises CommandError (REFUSED) where the daemon says that it cannot write it, or has not within KEPT_WITHIN_S.
+    """
     began_s = time.monotonic()
     while True:
         profile = client.status().profile
@@ -145,7 +155,7 @@ def _kept(client: Client) -> ProfileReport:
 
 
 def _not_kept(profile: ProfileReport) -> CommandError:
-    """Return the error (REFUSED) for a daemon that keeps no profile."""
+    """Return the error (REFUSED) for a daemon that keeps no profile, with the reason that `profile` gives."""
     return CommandError(
         Exit.REFUSED,
         "not_kept",
@@ -155,7 +165,11 @@ def _not_kept(profile: ProfileReport) -> CommandError:
 
 
 def _text(result: dict[str, Any]) -> str:
-    """Say what the device showed of itself, how well the steps were followed, and where the profile is."""
+    """Say what the device showed of itself, how well the steps were followed, and where the profile is.
+
+    `result` is that of `calibrate_device`: serial number, belief, the figures of `judged`, profile. Forces are told in
+    mN.
+    """
     return (
         f"device {result['serial_number']}: {result['scale']:.3f} +- {result['scale_sd']:.3f} times the model's force, "
         f"{result['offset_N'] * 1e3:+.0f} +- {result['offset_sd_N'] * 1e3:.0f} mN; its sensor reads "

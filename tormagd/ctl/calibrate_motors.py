@@ -50,7 +50,10 @@ LONGEST_HOLE_S = 0.02
 
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
     """Return the waveform to ask for: ramps, then jumps, `rounds` times, from CLEAR_N above the least force to the
-    most."""
+    most.
+
+    A ramp of RAMPS_S goes up and then down. A jump takes 1 ms, and its force is held for JUMP_S.
+    """
     low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]
     # each there in a millisecond, and held
@@ -61,9 +64,9 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
     """Drive both carriages through `excitation`, and write the log of one to the new file `path`.
 
-    The gap opens in the end. Raises as `armed` and `Run.play`. Raises CommandError (REFUSED) for a control rate under
-    LEAST_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this shows only after the
-    drive.
+    The gap opens in the end. Raises as `reach`, `armed` and `Run.play`. Raises CommandError (REFUSED) for a control
+    rate under LEAST_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this shows only
+    after the drive.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         waveform = excitation(reach(client, scene_most_N))
@@ -94,12 +97,13 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
 
 def motor_log(ticks: Columns, side: Side) -> Columns:
-    """Return the motor log's columns from control ticks, evenly spaced on the device's clock, with time from 0.
+    """Return the motor log's LOG_COLUMNS from control ticks, evenly spaced on the device's clock, with time from 0.
 
     A row's voltage is the one sent in answer to the row's position: duty times supply. Positions are from the centre
-    plane, positive as the gap opens; `force_N` is the force at the roller and says nothing about the motor. Ticks
-    without news from the device are left out. Between measurements voltages are held, other values interpolated.
-    Raises CommandError (REFUSED) where the device was silent for more than LONGEST_HOLE_S, or throughout.
+    plane, positive as the gap opens; `reference_mm` is half the gap's reference. `force_N` is at the roller. Ticks with
+    an unknown value, or without news from the device, are left out. The step is the median one: voltages are held,
+    other values interpolated. Raises CommandError (REFUSED) where the device was silent for more than LONGEST_HOLE_S,
+    or throughout.
     """
     known = np.isfinite(np.column_stack([ticks[name] for name in COLUMNS])).all(axis=1)
     time_s = ticks["device_time_s"][known]

@@ -70,7 +70,10 @@ def seconds_bar(duration_s: float, label: str) -> "tqdm[Any]":
 
 
 class Run:
-    """An armed device: forces go out, control ticks come in. Made by `armed`."""
+    """An armed device: forces go out, control ticks come in. Made by `armed`.
+
+    Holds the sockets, the names of the columns that are read, and when the daemon was last heard.
+    """
 
     def __init__(
         self,
@@ -87,8 +90,9 @@ class Run:
     def play(self, waveform: Waveform, bar: "tqdm[Any]") -> Columns:
         """Publish `waveform` in real time, and return what its ticks tell: an array for each column asked for.
 
-        NaN is a value not known, or a word. Raises CommandError: FAULT or REFUSED where the device stops rendering
-        meanwhile, and `interrupted_run`; UNREACHABLE where the daemon goes.
+        NaN is a value not known, or a word. `bar` advances by the seconds that passed. Raises CommandError: FAULT or
+        REFUSED where a tick is not ENABLED, REFUSED where the person interrupts. UNREACHABLE is a daemon without ticks
+        for SILENT_S, or with those of another version.
         """
         rows: list[list[float]] = []
         start_s = time.monotonic()
@@ -99,8 +103,11 @@ class Run:
         return dict(zip(self._columns, table.T, strict=True))
 
     def exchange(self, force_N: float) -> list[list[float]]:
-        """Publish one force, and return the rows of ticks until the next force is due, 1/RATE_HZ later. Raises as
-        `play`."""
+        """Publish one force, valid for VALID_FOR_MS, and return the rows of ticks until the next is due, 1/RATE_HZ
+        later.
+
+        Raises as `play`.
+        """
         if self._is_interrupted():
             raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
@@ -114,7 +121,7 @@ class Run:
         return rows
 
     def wait_for_handle(self, force_N: float) -> None:
-        """Publish one force until the handle moves; needs the column `handle_rate_mm_s`.
+        """Publish one force until the handle moves at MOVING_MM_S or more; needs the column `handle_rate_mm_s`.
 
         Raises as `play`, and CommandError (REFUSED) where the handle stands still for HANDLE_PATIENCE_S.
         """
@@ -160,9 +167,11 @@ class Run:
 
 
 def reach(client: Client, scene_most_N: float) -> Range:
-    """Return the forces that can be asked for.
+    """Return the forces that can be asked for: from the daemon's least to its most, or to `scene_most_N` where that is
+    less.
 
-    Raises CommandError (REFUSED) where another source holds the brake, or published within RECENT_SETPOINT_MS.
+    Raises CommandError (REFUSED) where another source holds the brake, or published within RECENT_SETPOINT_MS. Raises
+    as `Client.status`.
     """
     status = client.status()
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
@@ -230,7 +239,7 @@ def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
 
 
 def _other_version(address: str, error: ValueError) -> CommandError:
-    """Return the refusal of ticks that cannot be read."""
+    """Return the error (UNREACHABLE) for ticks that cannot be read."""
     return CommandError(
         Exit.UNREACHABLE,
         "unintelligible",
@@ -240,7 +249,10 @@ def _other_version(address: str, error: ValueError) -> CommandError:
 
 
 def _enable(client: Client) -> None:
-    """Enable the device, and try again for SILENT_S where its measurements are not fresh."""
+    """Enable the device, and try again for SILENT_S where its measurements are not fresh.
+
+    Raises ClientError for any other refusal, and for this one after SILENT_S.
+    """
     # on a busy machine the newest measurement may be a little old once
     until_s = time.monotonic() + SILENT_S
     while True:

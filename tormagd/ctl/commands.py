@@ -67,7 +67,7 @@ def port(text: str) -> int:
 
 
 def rates(text: str) -> tuple[float, ...]:
-    """Parse 3 to 60 sweep rates, N/s, separated by commas. Raises ArgumentTypeError."""
+    """Parse 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas. Raises ArgumentTypeError."""
     found = tuple(Within(0.02, 10.0, " N/s")(part) for part in text.split(","))
     if not 3 <= len(found) <= 60:
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 3..60 rates")
@@ -100,7 +100,8 @@ def _operate(help_text: str) -> Command:
 
 
 def _waiting(usual_s: float) -> tuple[Option, ...]:
-    """Return the options of a command that waits until the carriages have arrived."""
+    """Return the options of a command that waits until the carriages have arrived: `--timeout`, usually `usual_s`, and
+    `--no-wait`."""
     return (
         option(
             "--timeout",

@@ -24,7 +24,7 @@ def script(parser: ArgumentParser, shell: str) -> str:
 
 
 def _complete_paths(parser: ArgumentParser) -> None:
-    """Mark path arguments, also of subcommands, for completion by files."""
+    """Mark arguments of type Path or metavar FILE, also of subcommands, for completion by files. Changes the parser."""
     for action in parser._actions:
         if action.type is Path or action.metavar == "FILE":
             action.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab looks for it here

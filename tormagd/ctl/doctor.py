@@ -81,10 +81,10 @@ class Running(NamedTuple):
 
 
 def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_s: float, measure: bool) -> Outcome:
-    """Check this machine, and with `measure` also what it holds; the outcome is REFUSED where a check failed.
+    """Check this machine, and with `measure` also which rates it holds; the outcome is REFUSED where a check failed.
 
-    Judges the configuration of the daemon that answers, else `config`, read from `config_file`. Raises CommandError
-    where the measurement fails.
+    Judges the configuration of the daemon that answers, else `config`, read from `config_file`; None means the
+    defaults. A daemon that cannot be asked is a warning. Raises CommandError where the measurement fails.
     """
     machine = Machine(Path("/"))
     known: Running | ClientError = running(endpoints, wait_s)
@@ -116,8 +116,9 @@ def judged(
 ) -> Outcome:
     """Return the report on a machine, on the daemon `known` there, and on the headroom `found`.
 
-    `known` is an error where no daemon could be asked: then the caller's rights are judged. None leaves daemon or
-    headroom out. The outcome is REFUSED where a check failed.
+    `known` is an error where no daemon could be asked: then the caller's rights are judged by `config`. None for either
+    leaves it out. The result holds `checks`, the count of each verdict, and `measured` with `found`. The outcome is
+    REFUSED where a check failed.
     """
     if isinstance(known, Running):
         findings = (*of_daemon(known), *(check(_in_force(known), machine) for check in OF_MACHINE))
@@ -157,8 +158,12 @@ def nobody(why: ClientError | None) -> tuple[Finding, ...]:
 
 
 def of_daemon(known: Running) -> tuple[Finding, ...]:
-    """Return findings on what a daemon says of itself: configuration, build, what the kernel granted, and its
-    device."""
+    """Return findings on what a daemon says of itself: that it runs, build, what it asked of the kernel, and its
+    device.
+
+    FAIL for a setting that the kernel refused, or a link that is not RUNNING. WARN for an interpreted build, and for
+    `fifo_priority` or `lock_memory` that is not set; other settings that are not set have no finding.
+    """
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
     findings = [
@@ -201,7 +206,10 @@ def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
 
 
 def bare_timer(found: Headroom) -> Finding:
-    """Judge how late a thread wakes that does nothing else, at the control rate."""
+    """Judge how late a thread wakes that does nothing else, at the control rate.
+
+    WARN where its p99 is over LATE_SHARE of a period, or it missed more than MISSED_SHARE of its beats.
+    """
     late_us, rate_hz = found.bare.lateness_us, found.bare.rate_hz
     return _finding(
         "bare timer",
@@ -213,7 +221,10 @@ def bare_timer(found: Headroom) -> Finding:
 
 
 def others(found: Headroom) -> Finding:
-    """Judge what a hypervisor and other programs took during the measurement, by the kernel's counters."""
+    """Judge what a hypervisor and other programs took during the measurement, by the kernel's counters.
+
+    WARN above MOST_STOLEN or MOST_WAITED; a wait that is not known passes.
+    """
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
     is_stolen = found.steal > MOST_STOLEN
     return _finding(
@@ -242,7 +253,7 @@ def configured_rate(row: Rate) -> Finding:
 
 
 def preemption(config: Config, machine: Machine) -> Finding:
-    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT only."""
+    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT, else WARN with the model in force."""
     version = machine.text("/proc/version") or ""
     is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
     # the model in force stands in brackets or parentheses; reading it takes root
@@ -277,8 +288,8 @@ def governor(config: Config, machine: Machine) -> Finding:
 
 
 def scheduling(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller may use SCHED_FIFO at the configured priority; FAIL where not, WARN where none is
-    configured."""
+    """Judge whether the caller may use SCHED_FIFO at the configured priority: FAIL where not, WARN for priority 0,
+    which is none."""
     wanted = config.realtime.fifo_priority
     allowed = 99 if machine.has_capability(CAP_SYS_NICE) else int(machine.limit("Max realtime priority"))
     return _finding(
@@ -305,7 +316,8 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
-    """Judge whether control can have a processor to itself; FAIL where a configured one is not online."""
+    """Judge whether control can have a processor to itself: FAIL where a configured one is not online, WARN for under
+    two."""
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:
@@ -329,7 +341,7 @@ def load(config: Config, machine: Machine) -> Finding:
 
 
 def clock_source(config: Config, machine: Machine) -> Finding:
-    """Judge whether reading the time is fast and even, by the kernel's clock source; OK where it is not known."""
+    """Judge whether reading the time is fast and even: WARN unless the clock source is of GOOD_CLOCKS, or not known."""
     name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     return _finding(
         "clock source",
@@ -340,7 +352,8 @@ def clock_source(config: Config, machine: Machine) -> Finding:
 
 
 def swap(config: Config, machine: Machine) -> Finding:
-    """Judge whether the daemon's memory can be paged out: swap is on, and memory is not locked."""
+    """Judge whether the daemon's memory can be paged out: WARN where swap is on and the configuration does not lock
+    memory."""
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
         return Finding("swap", Verdict.OK, "off")
@@ -350,7 +363,7 @@ def swap(config: Config, machine: Machine) -> Finding:
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
-    """Judge whether the kernel stops processes to make huge pages: transparent huge pages may not be "always"."""
+    """Judge whether the kernel stops processes to make huge pages: WARN where transparent huge pages are "always"."""
     active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
     found = active[1] if active else "not in this kernel"
     return _finding(
@@ -362,7 +375,8 @@ def huge_pages(config: Config, machine: Machine) -> Finding:
 
 
 def run_directory(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller can make sockets where the configuration wants them; OK where they need no directory."""
+    """Judge whether the caller can write where the configured control socket lies: FAIL where not; OK for no ipc://
+    path."""
     address = config.endpoints.control
     if not address.startswith("ipc:///"):
         return Finding("run directory", Verdict.OK, f"none needed for {address}")
@@ -386,7 +400,10 @@ def run_directory(config: Config, machine: Machine) -> Finding:
 
 
 def port(config: Config, machine: Machine) -> Finding:
-    """Judge whether the device's port is there and open to the caller; a name that is no path is a CAN interface."""
+    """Judge whether the device's port is there and open to the caller: FAIL where not.
+
+    A name that is no path is a CAN interface: WARN where it is not there.
+    """
     name = config.device.port
     if not name.startswith("/"):
         is_there = machine.path(f"/sys/class/net/{name}").exists()
@@ -413,7 +430,8 @@ def port(config: Config, machine: Machine) -> Finding:
 
 
 def port_holder(config: Config, machine: Machine) -> Finding:
-    """Judge whether a process other than tormagd has the port open; FAIL names it."""
+    """Judge whether a process other than tormagd has the port open; FAIL names each. Of a pseudo-terminal only lock
+    holders count."""
     name = config.device.port
     target = machine.resolved(name)
     others = machine.holders([target])[0][target] if name.startswith("/") else []
@@ -428,7 +446,8 @@ def port_holder(config: Config, machine: Machine) -> Finding:
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:
-    """Judge how long a USB serial chip keeps received bytes back; OK where the port has no such timer."""
+    """Judge how long a USB serial chip keeps received bytes back: WARN over FAST_LATENCY_MS; OK where the port has no
+    such timer."""
     adapter = os.path.basename(machine.resolved(config.device.port))  # noqa: PTH119
     file = f"/sys/bus/usb-serial/devices/{adapter}/latency_timer"
     latency_ms = machine.number(file) if adapter else None

@@ -115,9 +115,11 @@ def rates(config: Config, found: Headroom) -> Iterator[Rate]:
 
 
 def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: int, inference_hz: int) -> Rate:
-    """Judge one rate: a control tick has to fit its period however late it wakes, a plan what the tick leaves.
+    """Judge one rate `hz` of `loop`, beside the other loop's: `used` is the larger share of time and of processor.
 
-    All of it is one thread, so the sum has to fit one processor, too.
+    A control tick has to fit its period even when it wakes late (p99); a plan, with the tick before it, in the median.
+    All runs in one thread, so ticks and plans together must fit one processor. It holds up to MOST_USED; else `change`
+    says what helps.
     """
     late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us
     period = 1e-6 * control_hz

@@ -22,8 +22,9 @@ def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) 
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
     """Make the daemon's key pair where there is none, and one for each of `clients`, by role; or only one for `client`.
 
-    The folder gets `server.key_secret`, `server.key`, each `NAME.key_secret`, and a folder for each role with every
-    `NAME.key` that is let in. Raises CommandError (USAGE) where a file exists or cannot be made, or both are given.
+    `client` None makes no such pair. The folder gets `server.key_secret`, `server.key`, each `NAME.key_secret`, and a
+    folder for each role with every `NAME.key` that is let in. Raises CommandError (USAGE) where a file exists or cannot
+    be made, or both `client` and `clients` are given.
     """
     names = [name for listed in clients.values() for name in listed]
     if client is not None and names:
@@ -52,7 +53,10 @@ def show_keys(path: Path) -> Outcome:
 
 
 def _made(name: str, role: str, secret_in: Path, public_in: Path) -> dict[str, str]:
-    """Make one key pair, its secret and its public part in different folders, and describe it."""
+    """Make a key pair `name`, its secret part in one folder and its public part in the other, and describe it.
+
+    Raises ConfigError where a file exists or cannot be made.
+    """
     secret, public = generate(name, secret_in, public_in)
     return {
         "name": name,

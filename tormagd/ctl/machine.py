@@ -97,7 +97,8 @@ class Machine:
         return printable(self.text(f"/proc/{process_id}/comm") or "?")
 
     def lock_owners(self, absolute: str) -> list[int]:
-        """List the processes, of any user, that hold a flock on a file; empty where there is no such file."""
+        """List the ids of the processes, of any user, that hold a flock on a file, sorted; empty where there is no such
+        file."""
         try:
             status = self.path(absolute).stat()
         except OSError:

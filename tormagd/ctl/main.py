@@ -48,7 +48,8 @@ EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command, print its outcome or error, and return the exit code; 130 after Ctrl-C.
 
-    `arguments` None takes those of the process. A missing extra is a usage error that names it.
+    `arguments` None takes those of the process. Wrong arguments and a missing extra, which is named, give 2. `--help`
+    and `--version` raise SystemExit.
     """
     write_in_any_encoding()
     given = sys.argv[1:] if arguments is None else arguments
@@ -78,7 +79,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Outcome:
-    """Import the command's function and call it with its options and what it needs; opens a client where needed."""
+    """Import the command's function, call it with its options and what it needs, and return its outcome.
+
+    Loads the configuration and opens a client where needed. `doctor` without --config reads SERVICE_CONFIG where that
+    exists. Raises CommandError (USAGE) for a faulty configuration or endpoint, and as the function.
+    """
     command = COMMANDS[options.command]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
@@ -133,7 +138,10 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of `tormagctl`'s arguments; completions and man pages are made from it, too."""
+    """Return the parser of `tormagctl`'s arguments; completions and man pages are made from it, too.
+
+    Shared options may stand before or after the command. It raises UsageError for arguments that it refuses.
+    """
     # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
     shared = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     _add(shared, SHARED)

@@ -35,10 +35,11 @@ UP = "Whether the daemon answers"
 
 
 def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
-    """Return the metrics as text; with a `port` of 127.0.0.1, serve them until Ctrl-C or SIGTERM.
+    """Return the metrics as text where `port` is None; else serve them at that port of 127.0.0.1 until Ctrl-C or
+    SIGTERM.
 
-    Each scrape asks the daemon anew. Raises CommandError (USAGE) where the port is taken, and as `Client.status` where
-    no daemon answers at the start.
+    Port 0 takes one that is free; the address is said on stderr. Each scrape asks the daemon anew. Raises CommandError
+    (USAGE) where the port is taken, and as `Client.status` where no daemon answers at the start.
     """
     with Client(endpoints, wait_s) as client:
         client.status()
@@ -97,7 +98,8 @@ def _family(
     values: Mapping[tuple[str, ...], float | None],
     unit: float = 1.0,
 ) -> Iterator[Metric]:
-    """Yield one metric with a sample for each known value, by its labels; none at all without labels and value."""
+    """Yield one metric with a sample for each known value, times `unit`, by its labels; none at all without labels and
+    value."""
     family = kind(f"tormag_{name}", text, labels=labels)
     for key, value in values.items():
         if value is not None:
@@ -107,7 +109,7 @@ def _family(
 
 
 def _families(status: Status) -> Iterator[Metric]:
-    """Yield every metric of a status, in base units."""
+    """Yield every metric of a status, in base units (s, N, m, T). An unknown value has no sample."""
     link, setpoints, rates, followed = status.link, status.setpoints, status.rates, status.following
     error_N, aligned_N, delay_ms = (None, None, None) if followed is None else msgspec.structs.astuple(followed)
     sources, trip_us = setpoints.by_source, status.link.round_trip_us

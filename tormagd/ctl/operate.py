@@ -39,10 +39,10 @@ COMES_BACK_S = 0.6
 
 
 def arm(client: Client, timeout_s: float) -> Outcome:
-    """Have the daemon clear faults, home and enable, as far as needed, and say each step on stderr.
+    """Have the daemon clear faults, home and enable, as far as needed, within `timeout_s`, and say each step on stderr.
 
-    Raises CommandError (REFUSED) where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables: the
-    gap opens.
+    The outcome tells the steps `given` (none: it was armed already), state and seconds. Raises CommandError (REFUSED)
+    where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables: the gap opens.
     """
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
@@ -57,11 +57,11 @@ def arm(client: Client, timeout_s: float) -> Outcome:
 
 
 def operate(client: Client, command: str) -> Outcome:
-    """Give one command that the daemon carries out or refuses at once.
+    """Give one command of DONE, which the daemon carries out or refuses at once, and return its answer.
 
     `stop` without a device gives an outcome of REFUSED: the gap does not open. After a fault was cleared, watches for
-    COMES_BACK_S. Raises CommandError: REFUSED where the answer does not show the state, FAULT where the fault comes
-    back; and as `Client.request`.
+    COMES_BACK_S; without a fault there is nothing to clear, and that is said. Raises CommandError: REFUSED where the
+    answer does not show the state, FAULT where the fault comes back; and as `Client.request`.
     """
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
@@ -188,7 +188,10 @@ def _statuses(client: Client, doing: str, timeout_s: float) -> Iterator[tuple[fl
 
 
 def require_no_fault(state: Status, what: str) -> None:
-    """Raise CommandError (FAULT) where the device is in FAULT: which fault, why, and what to do."""
+    """Raise CommandError (FAULT) where the device is in FAULT: which fault, why, and what to do.
+
+    The message begins with `what`. The cause told is of a fault other than STOPPED, where there is one.
+    """
     if state.operating_state != "FAULT":
         return
     # what the device met says more than that somebody stopped it

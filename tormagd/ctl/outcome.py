@@ -55,7 +55,11 @@ def usage_error(message: str, hint: str) -> CommandError:
 
 @contextmanager
 def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
-    """Turn an exception of these kinds raised within this context into a usage error with the same text."""
+    """Turn an exception of these kinds raised within this context into a CommandError (USAGE) with the same text and
+    `hint`.
+
+    Of an OSError the text is the file's name and the reason.
+    """
     try:
         yield
     except kinds as error:

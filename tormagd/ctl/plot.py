@@ -8,9 +8,11 @@ from tormagd.recording.reader import RecordingError, RecordingFile
 
 
 def plot(source: Path, target: Path) -> Outcome:
-    """Draw the recording `source` into the picture file `target`, whose suffix says its format.
+    """Draw the recording `source` into the picture file `target`, whose suffix says its format; a file there is
+    replaced.
 
-    Raises CommandError (USAGE) where the recording cannot be read or is empty, or the picture not be written.
+    The outcome tells counts, errors of following in N, limits and faults. What came before a cut is drawn, and the cut
+    said. Raises CommandError (USAGE) where the recording cannot be read or is empty, or the picture not be written.
     """
     with as_usage_error(RecordingError, hint="give a file that tormagctl record has made"):
         recording = RecordingFile(source)

@@ -67,7 +67,10 @@ class Ports(msgspec.Struct, frozen=True):
 
 
 def ports(config: Config, root: Path = Path("/")) -> Outcome:
-    """Look for serial ports and CAN channels now, for at most about DETECTION_S, and report them."""
+    """Look for serial ports and CAN channels now, for at most about DETECTION_S, and report them.
+
+    Silences python-can's log below CRITICAL. `root` is where the machine's file system begins.
+    """
     # it says at every start which makers' libraries are not installed
     logging.getLogger("can").setLevel(logging.CRITICAL)
     import can

@@ -34,7 +34,10 @@ SILENT_S = 1.0
 
 class Recorder:
     """Writes a recording to the file `path`; or, where `path` is a folder, to segments in it within the folder's
-    budget."""
+    budget.
+
+    `writer` is the open file, or the present segment, and counts what was written; whoever made the recorder closes it.
+    """
 
     def __init__(
         self,
@@ -138,7 +141,10 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
-    """Ask the daemon what it runs, and return it as metadata: JSON unless a string; unknown values are left out."""
+    """Ask the daemon what it runs, and return it as metadata: JSON unless a string; unknown values are left out.
+
+    Raises as `Client.describe`.
+    """
     with Client(endpoints, wait_s) as client:
         known = msgspec.to_builtins(client.describe())
     return {
@@ -166,7 +172,12 @@ def _record(
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
-    """Write what arrives until the time or an interrupt ends it, then what still waits, and return the outcome."""
+    """Write what arrives until `duration_s` or an interrupt ends it, then what still waits, and return the outcome.
+
+    The last takes LONGEST_END_S at most. A message that cannot be read is counted, and the first told on stderr. The
+    outcome counts what was written and lost: UNREACHABLE where ticks were missing for over SILENT_S at the end, REFUSED
+    where ticks were lost. Raises OSError where nothing more can be written.
+    """
     writer, unreadable = recorder.writer, 0
     start_s = heard_s = time.monotonic()
     is_over = False

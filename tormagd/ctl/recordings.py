@@ -24,11 +24,11 @@ def mark(client: Client, text: str) -> Outcome:
 
 
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
-    """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy.
+    """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy to `target`.
 
-    `path` None takes the configured folder to list or prune. The outcome is REFUSED where pruning was not enough, or an
-    exported file was altered, or sealed without the configured key. Raises CommandError (USAGE) where a path cannot be
-    used.
+    `path` None takes the configured folder to list or prune; to mark or export it is a USAGE error. The outcome is
+    REFUSED where pruning was not enough, or an exported file was altered, or sealed without the configured key. Raises
+    CommandError (USAGE) where a path cannot be used.
     """
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):
@@ -58,7 +58,8 @@ def _list(folder: RecordingFolder) -> Outcome:
 
 
 def _row(segment: Segment) -> dict[str, Any]:
-    """Describe one segment by its overview; without one, `said` tells why."""
+    """Describe one segment by its overview: size, duration, faults, marks; where it cannot be read, `said` tells
+    why."""
     row: dict[str, Any] = {
         "name": segment.path.name,
         "began_s": segment.began_s,
@@ -80,7 +81,8 @@ def _row(segment: Segment) -> dict[str, Any]:
 
 
 def _prune(folder: RecordingFolder) -> Outcome:
-    """Delete what is over the budget; REFUSED where that is not enough."""
+    """Delete what is over the budget, and name it; REFUSED, with the reason, where that is not enough. Raises
+    OSError."""
     gone = folder.prune()
     over = folder.make_room(0)
     names = [each.path.name for each in gone]
@@ -89,7 +91,11 @@ def _prune(folder: RecordingFolder) -> Outcome:
 
 
 def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
-    """Copy a recording to a new file, check the copy's seals, and say their verdict; half a copy is deleted."""
+    """Copy a recording to a new file, check the copy's seals under `key`, and say their verdict; REFUSED where unsound.
+
+    `target` is the file, or a folder in which the copy has the same name. Half a copy is deleted. Raises OSError where
+    the copy exists or cannot be made, CommandError (USAGE) for a `target` of None.
+    """
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target

@@ -24,10 +24,11 @@ def replay(
     faults: Sequence[str],
     config_file: Path | None,
 ) -> Outcome:
-    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulator.
+    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulated `plant`.
 
-    The outcome is REFUSED where the replay is not bit-exact, or the file was altered, or sealed without the configured
-    key. Raises CommandError (USAGE) where file or options cannot be used, or it takes over LONGEST_S.
+    `config_file` None means the defaults. The result is that process's report. The outcome is REFUSED where the replay
+    is not bit-exact, or the file was altered, or sealed without the configured key. Raises CommandError (USAGE) where
+    file or options cannot be used, or it takes over LONGEST_S.
     """
     arguments = [
         f"--from={from_s!r}",
@@ -57,7 +58,10 @@ def replay(
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
-    """Return the report's text, and whether the replay was bit-exact."""
+    """Return the text on `done`, the report's `rerun`, and whether it was bit-exact: no first difference.
+
+    The text also tells gaps, damaged frames and, of a difference, its tick, field and both values.
+    """
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     first, difference = done["first_damage"], done["difference"]
     if first is not None:

@@ -35,7 +35,8 @@ def scene(
 ) -> Outcome:
     """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new.
 
-    `share`, `tolerance_N` or `out` choose how the scene is served. Raises CommandError as the six do.
+    `share`, `tolerance_N` or `out` choose how the scene is served, for check only. `new` writes the file `name`, from
+    `force` or answers, and raises CommandError (USAGE) without a name. Raises as the six do.
     """
     named = name or config.scene
     if share is not None or tolerance_N is not None or out is not None:
@@ -64,9 +65,11 @@ def scene(
 
 
 def use_scene(client: "Client", name: str) -> Outcome:
-    """Have a disabled daemon change its scene, and wait until it has.
+    """Have a disabled daemon change its scene, and wait until it has; a shipped scene goes before a file of the same
+    name.
 
-    Raises CommandError (REFUSED) where the daemon refuses the scene or is not ready within LONGEST_S.
+    Raises as `Client.request`. Raises CommandError (REFUSED) where the daemon refuses the scene or is not ready within
+    LONGEST_S.
     """
     scene = str(Path(name).absolute()) if name not in shipped_scenes() and Path(name).exists() else name
     client.request("use-scene", scene=scene)
@@ -128,8 +131,9 @@ def _line(key: str, value: object) -> str:
 def check_scene(name: str, config: Path | None) -> Outcome:
     """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost.
 
-    `config` None means the defaults. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more
-    than its budget; USAGE for a faulty scene.
+    `config` None means the defaults. The cost is known, and held against `budget.core_share`, only where that way of
+    serving was measured. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more than its
+    budget; USAGE for a faulty scene.
     """
     scene = _loaded(name)
     derived = _derived(name, config)
@@ -178,9 +182,11 @@ def check_scene(name: str, config: Path | None) -> Outcome:
 
 
 def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
-    """Say how soon a force comes from where the brake waits, and from higher standby forces: that halfway to the most.
+    """Return a line on how soon a force comes from where the brake waits, and from higher standby forces; none without
+    any.
 
-    `approaches_s` are standby forces, N, with times, s, the present one first; empty for none.
+    The force is halfway from the wait to the most. `approaches_s` are standby forces, N, with times, s, the present one
+    first.
     """
     if not approaches_s:
         return []
@@ -195,7 +201,8 @@ def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]
 def explain_scene(name: str, config: Path | None) -> Outcome:
     """Show every way to serve a scene that was measured, the chosen one, and how well that served other signals.
 
-    Raises CommandError: REFUSED where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
+    `config` is the configuration's file, None the defaults: the way that runs with it is marked. Raises CommandError:
+    REFUSED where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
     """
     file = measured()
     found = measured_as(_loaded(name), file)
@@ -258,7 +265,8 @@ def _loaded(name: str) -> Scene:
 def _derived(name: str, config: Path | None) -> dict[str, Any]:
     """Run the daemon's own check of the scene in a process of its own, and return what it derives.
 
-    Raises CommandError (REFUSED) where the check refuses the scene, or takes over LONGEST_S.
+    `config` None means the defaults. Raises CommandError (REFUSED) where the check refuses the scene, or takes over
+    LONGEST_S.
     """
     arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
     try:

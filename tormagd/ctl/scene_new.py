@@ -30,8 +30,9 @@ Tables = dict[str, Any]
 def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcome:
     """Write the new scene file `out` from a recorded force, or for None from a person's answers, with a fitting insert.
 
-    Raises CommandError: USAGE for files and answers that cannot be used, or nobody to ask; REFUSED where no shipped
-    insert renders the scene. Then there is no file.
+    `config` is the configuration to check it by; None means the defaults. The text warns of a greatest force over
+    RESERVED of the device's. Raises CommandError: USAGE for files and answers that cannot be used, or nobody to ask;
+    REFUSED where no shipped insert renders the scene, or the check fails. Then there is no file.
     """
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
@@ -93,9 +94,11 @@ def _has_reserve(tables: Tables, checked: Outcome) -> bool:
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
-    """Propose a scene's tables for a recorded force: its range, rounded outwards, a tolerance, a steady handle.
+    """Propose a scene's tables for a recorded force: its range, rounded outwards, a tolerance, a steady handle of 42
+    mm/s.
 
-    Raises CommandError (USAGE) for a bad file, or a force that does not change.
+    The resolution is twice the tolerance; the file is named relative to `out`. Raises CommandError (USAGE) for a bad
+    file, or a force that does not change.
     """
     with as_usage_error(ConfigError, hint="a CSV with the columns t_s,force_N"):
         time_s, force_N = recorded(force_file)
@@ -143,7 +146,7 @@ def _answer(question: str, usual: str) -> str:
 
 
 def _number(question: str, usual: float) -> float:
-    """Ask until the answer is a number."""
+    """Ask until the answer is a number, `nan` and `inf` included; an empty line takes `usual`. Raises as `_answer`."""
     while True:
         answer = _answer(question, f"{usual:g}")
         try:
@@ -162,7 +165,7 @@ def _tables(
     signal: Tables,
     handle_mm_s: tuple[float, float],
 ) -> Tables:
-    """Return a scene's tables without an insert, at the least rates."""
+    """Return a scene's tables without an insert, at the least rates; forces are rounded to three digits."""
     force = {"least_N": least_N, "most_N": most_N, "resolution_N": resolution_N, "tolerance_rms_N": tolerance_N}
     return {
         "name": name,
@@ -175,6 +178,6 @@ def _tables(
 
 
 def _rounded(value: float, direction: Callable[[float], int]) -> float:
-    """Round to two digits, by `math.floor` or `math.ceil`."""
+    """Round to two significant digits, down by `math.floor` or up by `math.ceil`."""
     unit = 10.0 ** (math.floor(math.log10(value or 1.0)) - 1)
     return float(f"{direction(round(value / unit, 6)) * unit:.3g}")

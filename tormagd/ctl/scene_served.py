@@ -16,9 +16,9 @@ from tormagd_client.endpoints import ConfigError
 def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
     """Choose the most exact measured way that takes at most `share` of a processor, or the cheapest within an error.
 
-    The error is `tolerance_N`, RMS. With `out` writes the scene, served that way, to this new file. Raises
-    CommandError: USAGE for options and files that cannot be used; REFUSED where nothing was measured, or no way is good
-    enough.
+    The error is `tolerance_N`, RMS; one of both is None. With `out` writes the scene, served that way, to this new
+    file. Raises CommandError: USAGE for another action than check, for both or neither limit, and for files that cannot
+    be used. REFUSED where nothing was measured, or no way is good enough.
     """
     if action != "check" or (share is None) == (tolerance_N is None):
         raise usage_error(

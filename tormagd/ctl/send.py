@@ -91,8 +91,11 @@ def send(
 
 
 def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> Watch:
-    """Check the forces against the daemon's scene and return a watch. Raises CommandError (REFUSED) where not
-    allowed."""
+    """Check the forces against the daemon's scene and return a watch of `source`.
+
+    Raises CommandError: REFUSED where forces are not allowed, UNREACHABLE for another version's scene, FAULT where the
+    device is in FAULT. Raises UnreachableError without an answer; with a key its hint names --blind.
+    """
     try:
         known = client.describe()
     except UnreachableError as error:
@@ -114,10 +117,12 @@ def _publish(
     is_interrupted: Callable[[], bool],
     watch: Watch | None,
 ) -> dict[str, Any]:
-    """Publish setpoints until the time or an interrupt, look at the daemon in between, and return the counts.
+    """Publish setpoints until the time or an interrupt, and return the counts; `watch` looks at the daemon in between,
+    unless None.
 
     Each deadline counts from the start, so that lateness does not add up. A setpoint whose successor is already due is
-    left out. Each carries the `preview` that follow it. Raises CommandError (UNREACHABLE) where the daemon goes.
+    `skipped`. Each carries the `preview` that follow it; after the end these stay at the last force. Raises
+    CommandError (UNREACHABLE) where the daemon goes, and as `Watch.look`.
     """
     sent = skipped = index = 0
     worst_late_s = 0.0

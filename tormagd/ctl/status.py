@@ -100,7 +100,10 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 
 
 def _device(known: Status, colour: Colour) -> list[str]:
-    """Return lines on what the device has shown of itself, how old that is, and why a kept profile is not used."""
+    """Return lines on what the device has shown of itself, and why a kept profile is not used.
+
+    They also tell how long ago that was kept, and the other beliefs that act.
+    """
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
     # without a folder nothing was to be kept
@@ -166,7 +169,10 @@ def _counts(report: LinkReport | SetpointReport, names: tuple[str, ...]) -> str:
 
 
 def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
-    """Return lines on one source: state, delay, losses, clock, and what is wrong."""
+    """Return lines on one source: state, delay, jitter, losses, clock, restarts, and cause and remedy of what is wrong.
+
+    The clock's drift is shown after SURE_WINDOWS.
+    """
     paint = {"holds": colour.green, "refused": colour.yellow}.get(source.state, str)
     delay, behind = source.delay_us, source.clock_behind_ms
     words = {"holds": "holds the brake", "refused": "refused", "stale": f"silent for {source.silent_ms * 1e-3:.1f} s"}
@@ -187,7 +193,10 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
 
 
 def _way(way: WayReport | None, colour: Colour) -> list[str]:
-    """Return lines on the delay from a setpoint's stamp to its force, part by part; empty before the first setpoint."""
+    """Return lines on the delay from a setpoint's stamp to its force, part by part; empty before the first setpoint.
+
+    Over its budget, a line names the part that takes most.
+    """
     if way is None or way.to_duty_us.max == 0.0:
         return []
     to_duty, total_ms = way.to_duty_us, way.total_ms
@@ -286,7 +295,11 @@ def _round_trip(known: RoundTripReport | None) -> str:
 
 
 def _quality(link: LinkReport) -> str:
-    """Say what share of frames was unanswered or damaged lately; "not known yet" where either is None."""
+    """Say what share of Drives was unanswered and of frames damaged in the last second; "not known yet" where either is
+    None.
+
+    Also tells how many messages found the wire full.
+    """
     if link.unanswered_share is None or link.damaged_share is None:
         return "not known yet"
     return (

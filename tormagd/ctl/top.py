@@ -53,7 +53,10 @@ def top(client: Client) -> Outcome:
 
 
 class Watcher:
-    """Gathers telemetry and status for the screen; waits for the daemon only when made, for the first status."""
+    """Gathers telemetry and status for the screen; waits for the daemon only when made, for the first status.
+
+    Holds the last KEPT snapshots, the newest status, every code's explanation so far, and one request under way.
+    """
 
     def __init__(self, client: Client) -> None:
         self._client = client

@@ -106,8 +106,10 @@ def _head(seen: Seen, width: int) -> Text:
 
 
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
-    """Return a row for each curve: name, newest value, sparkline, and the ends of its scale where the terminal is wide
-    enough."""
+    """Return a row for each curve: name, newest value, sparkline of `rows` lines, and the ends of its scale.
+
+    The ends are left out below NARROW. `is_apart` puts an empty row between curves.
+    """
     ends_wide = ENDS if width >= NARROW else 0
     count = max(width - LABEL - VALUE - ends_wide - 3, 8)
     table = _grid(LABEL, VALUE, count, *([ends_wide] if ends_wide else []))
@@ -178,7 +180,11 @@ def _timing(status: Status, width: int) -> Table:
 
 
 def _codes(seen: Seen, width: int) -> Table:
-    """Return rows of faults, then of limits that held lately, the longest first, each with cause and remedy."""
+    """Return rows of faults, then of limits that held in the telemetry kept, the longest first, each with cause and
+    remedy.
+
+    A limit that does not hold now is dim. Without any, one row says so.
+    """
     newest = seen.telemetry[-1] if seen.telemetry else seen.status
     times = Counter(code for each in seen.telemetry for code in each.limits)
     table = _grid(LABEL, width - LABEL - 1, is_cut=False)
@@ -209,7 +215,8 @@ def columns(
 ) -> list[float | None]:
     """Return the newest `count` periods, the oldest first: `of_column` of each period's values, None where it has none.
 
-    Periods are aligned to the clock, so that a column keeps its value while the picture moves on.
+    None and values not finite are left out. Periods are aligned to the clock, so that a column keeps its value while
+    the picture moves on.
     """
     if not times_ns:
         return [None] * count
@@ -234,8 +241,10 @@ def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
 
 
 def sparkline(values: Sequence[float | None], low: float, high: float, rows: int) -> list[str]:
-    """Return `rows` lines of bars, the top line first: `low` is one eighth of a character, `high` all rows, None
-    blank."""
+    """Return `rows` lines of bars, the top line first: `low` is one eighth of a character, `high` all rows, None blank.
+
+    Values outside are clipped; `high` must be above `low`.
+    """
     steps = len(EIGHTHS) - 1
     full = rows * steps
     eighths = [

@@ -62,8 +62,9 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
     """Return why the setpoints of `source` are not rendered, as an error (REFUSED); None while they are.
 
-    With `is_over` only state and source count: limits and the newest setpoint's age do not matter any more. Raises
-    CommandError (FAULT) where the device is in FAULT: then nothing more is to be sent.
+    Reasons in this order: not ENABLED, nothing taken of the source, another holds the brake, its setpoints are stale, a
+    limit of SPOILING. With `is_over` only the first three count. Raises CommandError (FAULT) where the device is in
+    FAULT: then nothing more is to be sent.
     """
     require_no_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
@@ -100,7 +101,8 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
 class Watch:
     """Looks at the daemon's status while one source's setpoints are sent; waits only when made, and in `finish`.
 
-    Raises CommandError (FAULT) where the device is in FAULT already.
+    Counts looks, and looks that saw the force rendered, and keeps the limits met and the newest reason that held it
+    back. Making one raises CommandError (FAULT) where the device is in FAULT already.
     """
 
     def __init__(self, client: Client, source: str) -> None:
@@ -118,8 +120,9 @@ class Watch:
     def look(self) -> None:
         """Take a status that has arrived, or ask for one after LOOK_S, without waiting; call it between setpoints.
 
-        Says on stderr what newly keeps the force from being rendered. Raises CommandError (FAULT) where the device is
-        in FAULT.
+        Says on stderr what newly keeps the force from being rendered. That spoils the sending once a force has been
+        rendered; before, it is waiting. Raises CommandError (FAULT) where the device is in FAULT, and as
+        `Client.answer`.
         """
         now_s = time.monotonic()
         if self._look_s is None:  # an answer may overtake the first setpoint

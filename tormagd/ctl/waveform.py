@@ -44,7 +44,10 @@ def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
 
 def _lines(times_s: Sequence[float], forces_N: Sequence[float], *others: Sequence[float] | None) -> Waveform:
     """Return straight lines between samples; `others` are Sample's other columns in its order, None where there is
-    none."""
+    none.
+
+    Needs two samples or more, at times, s, that rise. Before the first and after the last, their values hold.
+    """
 
     def at(t_s: float) -> Sample:
         right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
@@ -104,7 +107,7 @@ def beat(phase: float) -> float:
 def read_csv(path: Path) -> Waveform:
     """Read a file of forces into a waveform of straight lines between its rows, with time from the first row.
 
-    Raises ForceFileError.
+    Samples carry displacement and rate where the file has those columns. Raises ForceFileError.
     """
     table = read_forces(path)
     start_s = table["t_s"][0]

@@ -27,7 +27,10 @@ WAITING = 50
 
 
 class Live:
-    """Listens to one daemon and sends every browser the same events; `run` has to run beside the browsers."""
+    """Listens to one daemon and sends every browser the same events; `run` has to run beside the browsers.
+
+    Holds the snapshots kept and those not sent yet, status, portrait, explanations of codes, and each browser's queue.
+    """
 
     about: ClassVar[dict[str, Any]] = {"kind": "live"}
     "What the page begins with."
@@ -130,7 +133,10 @@ class Live:
         return {"status": self._status, "explained": self._explained}
 
     def _frame(self, snapshots: Sequence[Telemetry]) -> Frame:
-        """Make a frame with curves of `snapshots`, and limits and latenesses of all that are kept."""
+        """Make a frame with curves of `snapshots`, and limits and latenesses of all that are kept.
+
+        State, faults and belief are those of the last of `snapshots`; the field is None outside DRIVEN.
+        """
         newest, kept = snapshots[-1], self._kept
         times = Counter(code for each in kept for code in each.limits)
         return Frame(

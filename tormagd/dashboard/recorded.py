@@ -77,7 +77,10 @@ class Moments:
 
 
 class Recorded:
-    """A recording with messages, for the page; times are seconds since its first message."""
+    """A recording with messages, for the page; times are seconds since its first message.
+
+    Keeps the stretch that was read last, with its ticks and snapshots.
+    """
 
     def __init__(self, file: RecordingFile) -> None:
         """Raise ValueError where the recording has no message."""
@@ -112,8 +115,12 @@ class Recorded:
         }
 
     def frame(self, at_s: float) -> Frame:
-        """Return the frame that ends at `at_s`, which is clamped to the recording. Raises RecordingError where it
-        cannot be read."""
+        """Return the frame that ends at `at_s`, which is clamped to the recording; its curves have a point every
+        STEP_S.
+
+        Curves come from the ticks, or the snapshots where ticks have no value; the field is None outside DRIVEN. Raises
+        RecordingError where the recording cannot be read.
+        """
         at_s = min(max(at_s, 0.0), self.duration_s)
         from_s = max(at_s - SHOWN_S, 0.0)
         at_ns = self._start_ns + round(at_s * 1e9)
@@ -191,8 +198,10 @@ def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
 
 
 def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
-    """Return the limits present from `from_s` to `at_s`, the largest share first; those in `now` are marked as
-    present."""
+    """Return the limits present from `from_s` to `at_s`, the largest share first; those in `now` are marked as present.
+
+    A message's limits hold until the next, for BREAK_S at most.
+    """
     held_s: defaultdict[str, float] = defaultdict(float)
     steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
     for place in shown.within(from_s, at_s):

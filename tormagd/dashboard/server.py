@@ -30,10 +30,10 @@ HEADERS = {
 
 
 def application(shown: Live | Recorded) -> web.Application:
-    """Return the web application for a live daemon or a recording. Every route is a GET.
+    """Return the web application for a live daemon or a recording. Every route is a GET, for hosts in NAMES only.
 
-    `/live` streams events (503 beyond MOST_BROWSERS); `/frame?at_s=` gives a recording's frame, 410 where it cannot be
-    read.
+    `/` is the page, with files in `/page`, and `/about` what it begins with. `/live` streams events (503 beyond
+    MOST_BROWSERS). `/frame?at_s=` gives a recording's frame: 400 for no number, 410 where it cannot be read.
     """
 
     async def page(request: web.Request) -> web.StreamResponse:

@@ -32,7 +32,9 @@ SHARES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 def main(arguments: list[str] | None = None) -> int:
     """Measure this machine for a configuration, print the result as one JSON object, and return the exit code.
 
-    0; 1 where stdout cannot be written; 2 for a configuration that is refused, or whose scene does not fit it.
+    `arguments` None takes those of the process. 0; 1 where stdout cannot be written; 2 for a configuration that is
+    refused, or whose scene does not fit it. Wrong usage raises SystemExit(2), a simulated device that does not arm
+    RuntimeError.
     """
     parser = argparse.ArgumentParser(prog="python -m tormagd.headroom", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's configuration")
@@ -48,9 +50,10 @@ def main(arguments: list[str] | None = None) -> int:
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
     """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer for `timer_s`.
 
-    `core_s` is the virtual time that the core's calls are taken from. Times in the result are us: `machine_us`,
-    `step_us`, `plan_us` and the bare timer's `lateness_us`. Gives this thread the daemon's scheduling for good. Raises
-    ConfigError where scene and configuration do not fit each other.
+    `core_s` is the virtual time that the core's calls are taken from. Of the result, `machine_us` is a median;
+    `step_us`, `plan_us` and `lateness_us` in `bare` are as `quantiles`. `bare` also holds rate, share missed, and what
+    the kernel refused. Gives this thread the daemon's scheduling for good. Raises ConfigError where scene and
+    configuration do not fit each other, RuntimeError as `calls`.
     """
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority

@@ -14,6 +14,8 @@ REPETITIONS = 25
 
 
 class _Carriage:
+    """A carriage with the integral of its PID: a speed that follows the duty, and the place that it comes to."""
+
     __slots__ = ("integral", "position_mm", "speed_mm_s")
 
     def __init__(self) -> None:

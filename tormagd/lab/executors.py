@@ -31,7 +31,8 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
     """Give the executor that `options` ask for, and shut it down at the end: processes here, or a Dask cluster.
 
-    Raises OSError where no scheduler answers at the address `options.dask`, and LabError for one that is no address.
+    Raises OSError where no scheduler answers at the address `options.dask`, LabError for one that is no address, and
+    ModuleNotFoundError where Dask is not installed.
     """
     if options.dask is None:
         # a fork of this process would inherit the locks of libraries' threads, but not the threads

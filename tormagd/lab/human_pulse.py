@@ -33,7 +33,8 @@ def measured_pulse() -> Array:
 def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int) -> tuple[Array, Array]:
     """Return times, s, and forces, N, of the pulse scaled to `least_N`..`most_N`: low-passed without lag, at `rate_hz`.
 
-    Raises ValueError where the recording is shorter than `duration_s`, ModuleNotFoundError as `measured_pulse`.
+    Times begin at 0, EDGE_S into the recording. Raises ValueError where the recording, less EDGE_S at both ends, is
+    shorter than `duration_s`, and ModuleNotFoundError as `measured_pulse`.
     """
     raw = measured_pulse()
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=SOURCE_HZ, output="sos"), raw)

@@ -55,10 +55,12 @@ class IdealCarriages(Actuator):
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """Put the gap of the simulated device where `plan` wants it at `now_s`, and return duties of 0.
+        """Put the gap of the simulated device where `plan` wants it at `now_s`, set `reference` to it, and return
+        duties of 0.
 
-        It goes no further than the top speed reaches in `dt_s`; where that falls short, the result has the limit RATE.
-        `plan` None holds the gap within its ends. With a plan the gap opens once `is_over`, a force over the ceiling.
+        It goes no further than the top speed reaches in `dt_s`, above 0; where that falls short, the result has the
+        limit RATE. `plan` None holds the gap within its ends. With a plan the gap opens while `is_over`, a force over
+        the ceiling. What was measured plays no part.
         """
         before_mm = self._plant.gap_mm
         wanted_mm = min(max(before_mm, self._closed_mm), self._open_mm)

@@ -65,11 +65,11 @@ class WireLog:
         self._log.stop()
 
     def add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
-        """Log the frames that `data` completes, with the time `time_s`: of the device if `is_rx`, else of the host.
+        """Log the frames that `data` completes, each stamped with `time_s`: frames of the device if `is_rx`, else of
+        the host.
 
-        An incomplete frame waits for the next call of its direction. `time_s` is in seconds, from whatever start the
-        caller has. Counts the logged frames in `frames`, all else in `damaged`. Raises OSError where the file cannot be
-        written.
+        An incomplete frame waits for the next call of its direction. `time_s` is by the caller's clock, in seconds.
+        Counts the logged frames in `frames`, all else in `damaged`. Raises OSError where the file cannot be written.
         """
         for frame in self._decoders[is_rx].feed(data):
             if not 1 <= frame.function <= 0x7F:
@@ -170,7 +170,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Log until the session or a signal ends it, or with the way `viewer` return the formats for python-can's viewer.
 
-    Raises LabError for a file type that is not known, OSError for a file or port that cannot be used.
+    Returns the file, and how many frames were logged and damaged. Raises LabError for a file type that is not known,
+    OSError for a file or port that cannot be used.
     """
     if options.way == "viewer":
         formats = viewer_formats()

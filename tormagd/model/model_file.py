@@ -229,7 +229,10 @@ class ForceModel:
         return self.curve(displacement_mm, rate_mm_s, cip_percent).force_N(field_mT)
 
     def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
-        """dF/dB (n) at `features` (n x 4). Raises `DomainError` like `predict`."""
+        """Return the slope of the force over the field, dF/dB, N/mT (n), at `features` (n x 4, order of `FEATURES`).
+
+        Raises `DomainError` like `predict`.
+        """
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
         weight, bias, output, _ = self.physical

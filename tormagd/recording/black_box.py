@@ -95,7 +95,10 @@ class Shown(NamedTuple):
 
 
 class Derived:
-    """Derives the messages of `/ticks` and `/frames` from the parts of `/core`; `columns` name the values of a tick."""
+    """Derives the messages of `/ticks` and `/frames` from the parts of `/core`; `columns` name the values of a tick.
+
+    Goes on from part to part: `ticks` counts ticks so far, frames are numbered, and one offset times all frames.
+    """
 
     def __init__(self, columns: tuple[str, ...]) -> None:
         self._columns = columns
@@ -126,7 +129,8 @@ class Derived:
 def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> int:
     """Write a new black box of these parts, whole or not at all, and return how many ticks are in it.
 
-    `key` seals the file; an empty one seals it without a key. Raises FileExistsError where `path` exists, and OSError.
+    `header` needs `columns`: the names of a tick's values, a list in JSON. `key` seals the file; an empty one seals it
+    without a key. Raises FileExistsError where `path` exists, OSError, and ValueError or TypeError for odd entries.
     """
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
@@ -135,7 +139,10 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], k
 
 
 def _write(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes) -> int:
-    """Write the file in place, sealed, and return how many ticks are in it."""
+    """Write the black box to `path`, replacing what is there, sealed with `key`, and return how many ticks are in it.
+
+    Raises OSError, and as `Derived.of`.
+    """
     columns = tuple(json.loads(header["columns"]))
     derived = Derived(columns)
     with path.open("wb") as file:
@@ -185,7 +192,11 @@ NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC} or no h
 
 
 class _Reading:
-    """A black box while it is read: each message of `/ticks` and `/frames` is compared with what `/core` gives."""
+    """A black box while it is read: each message of `/ticks` and `/frames` is compared with what `/core` gives.
+
+    `header` and `entries` are what was read so far, `odd` names the first message that differs. Derived messages wait
+    for the file's own.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -212,9 +223,10 @@ class _Reading:
                 self.header.update(known.metadata)
 
     def message(self, sent: Sent) -> None:
-        """Take a message of `/core`, or compare one of `/ticks` or `/frames` with it.
+        """Take a message of `/core`, or compare one of `/ticks` or `/frames` with it; messages of other topics pass.
 
-        Raises RecordingError where no header came before, and UNREADABLE (ValueError among them) for a damaged part.
+        Once `odd` is set, nothing more is compared. Raises RecordingError where no header came before, and UNREADABLE
+        (ValueError among them) for a damaged part.
         """
         if not self.header:
             raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read

@@ -34,7 +34,11 @@ class Followed(msgspec.Struct, frozen=True):
 
 
 class Following:
-    """Sums up the error between measured and asked force, message by message, in bounded memory."""
+    """Sums up the error between measured and asked force, message by message, in bounded memory.
+
+    Holds sums of squares, as recorded and for each of DELAYS delays, and the asked forces of the last delays. It also
+    knows whether the force is followed now.
+    """
 
     def __init__(self) -> None:
         self._count, self._sum, self._lasted_ns = 0, 0.0, 0
@@ -46,7 +50,8 @@ class Following:
     def add(self, t_ns: int, asked_N: float | None, measured_N: float | None, message: Mapping[str, Any]) -> None:
         """Add the next message with its forces; following ends where either is None, or the setpoint does not rule.
 
-        Tries each of DELAYS delays once every STEP_NS. `message` gives `operating_state` and `limits`.
+        It begins at an error within NEAR_N, or APPROACH_NS after the setpoint began to rule. Tries each of DELAYS
+        delays once every STEP_NS. `message` gives `operating_state` and `limits`.
         """
         if asked_N is None or measured_N is None or not is_asked(message):
             self._is_due = self._is_following = False

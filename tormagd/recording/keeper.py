@@ -58,7 +58,11 @@ class Ring:
 
 
 class Keeper:
-    """Keeps the black box of the daemon at the other end of the socket `its`, and writes it to files."""
+    """Keeps the black box of the daemon at the other end of the socket `its`, and writes it to files.
+
+    Holds a ring of the newest parts, the folder and header that the daemon began with, files due, and the thread that
+    writes one.
+    """
 
     def __init__(self, its: socket.socket) -> None:
         self._socket = its
@@ -94,7 +98,8 @@ class Keeper:
     def _hear(self) -> bool:
         """Wait for one packet from the daemon and take it; False once the daemon has ended.
 
-        Where the socket closes without End, a file named DAEMON-DIED becomes due.
+        While files are due it waits LOOK_S at most, and returns True. Where the socket closes without End, and parts
+        are kept, a file named DAEMON-DIED becomes due. Raises msgspec.MsgspecError for a packet that does not decode.
         """
         ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
         if not ready:
@@ -113,7 +118,10 @@ class Keeper:
         return not isinstance(said, End)
 
     def _take(self, said: Said) -> None:
-        """Take a part, begin anew once all that is due is written, or queue a file; refuse one over MOST_DUE."""
+        """Take what the daemon said: add a part, begin anew once all that is due is written, or queue a file.
+
+        A file over MOST_DUE is refused by an answer. End changes nothing.
+        """
         match said:
             case Part():
                 self._ring.put(said)
@@ -126,8 +134,10 @@ class Keeper:
                 self._answer(Written(said.name, f"{said.name}: {MOST_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
-        """Write one black box, delete files beyond MOST_FILES, and answer the daemon; a failure is logged and
-        answered."""
+        """Write one black box, delete files beyond MOST_FILES, and answer the daemon; a failure is logged and answered.
+
+        Makes the folder where there is none, and makes this thread nicer. Without parts it fails.
+        """
         from tormagd.recording.black_box import write_black_box
 
         with contextlib.suppress(OSError):

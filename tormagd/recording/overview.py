@@ -170,7 +170,11 @@ def unpacked(data: bytes) -> Overview:
 
 
 class OverviewBuilder:
-    """Builds an overview message by message, in bounded memory."""
+    """Builds an overview message by message, in bounded memory.
+
+    Holds, for ticks and for snapshots apart, curves, spans of codes, following and a count; for both a histogram of
+    lateness and marks.
+    """
 
     def __init__(self) -> None:
         self._start_ns: int | None = None
@@ -185,7 +189,8 @@ class OverviewBuilder:
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
         """Add one message, a control tick or a snapshot, in the order of writing; `t_ns` is since 1970.
 
-        `lateness_us` goes into the histogram. A mark counts once, and not one set before the recording began.
+        `lateness_us` goes into the histogram. A mark counts once, not one set before the recording began, and
+        MOST_MARKS at most.
         """
         if self._start_ns is None:
             self._start_ns = self._end_ns = t_ns
@@ -207,7 +212,8 @@ class OverviewBuilder:
     def made(self) -> Overview:
         """Return the overview of what was added; times are 0 where nothing was.
 
-        Ends every open span, so it belongs after the last message.
+        Codes and following are those of the ticks, or of the snapshots where ticks have none. Ends every open span, so
+        it belongs after the last message.
         """
         width_ns = max(each.width_ns for each in self._stretches.values())
         for each in self._stretches.values():
@@ -337,7 +343,10 @@ def _joined(spans: list[list[int]]) -> list[list[int]]:
 
 
 class _Codes:
-    """The codes of one kind of message, and when each was present."""
+    """The codes of one kind of message, and when each was present.
+
+    Holds spans and total time of each code, the last message's codes and time, and the usual step between messages.
+    """
 
     def __init__(self) -> None:
         self._known: dict[str, dict[str, list[list[int]]]] = {kind: {} for kind in KINDS}

@@ -142,7 +142,8 @@ def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, 
 
 
 def _dress(axes: Axes, label: str, quantity: str) -> None:
-    """Style a panel and give it a legend; a panel without lines says that nothing was recorded."""
+    """Style a panel with `label` at its y axis, and give it a legend; without lines it says that no `quantity` was
+    recorded."""
     axes.set_ylabel(label)
     axes.grid(axis="both", color="#e6e6e6", linewidth=0.7)
     axes.set_axisbelow(True)
@@ -154,7 +155,11 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
 
 
 def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults: Spans) -> None:
-    """Draw one lane for the operating state and one for each limit and fault; limits with their share of the time."""
+    """Draw one lane for the operating state and one for each limit and fault, below each other, and name them.
+
+    A limit's name has its share of the time, %. Without faults one empty lane says so; without states there is no lane
+    of them. The longest span of each state bears its name.
+    """
     held_s = {name: codes.held_ns * 1e-9 for name, codes in overview.codes["limits"].items()}
     shares = {name: 100.0 * held_s[name] / max(overview.duration_s, 1e-3) for name in limits}
     rows: list[tuple[str, list[tuple[str, Spans, str]]]] = [

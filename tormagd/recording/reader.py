@@ -98,8 +98,8 @@ class Place(NamedTuple):
 class Contents:
     """Collects what a file's records tell: metadata, chunks, and each tick or snapshot, which it hands to `each`.
 
-    Messages are decoded as the type `wanted`, which may leave fields out. `take` and `message` raise UNREADABLE for
-    damage.
+    Holds the channels' topics, `metadata`, the chunks' `places`, and `is_complete`. Messages are decoded as the type
+    `wanted`, which may leave fields out. `take` and `message` raise UNREADABLE for damage.
     """
 
     def __init__(self, wanted: Any, each: Callable[[Seen], None]) -> None:
@@ -175,7 +175,7 @@ def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Con
 
 
 class RecordingFile:
-    """A recording on the disk, of any length: its overview, and any seconds of it.
+    """A recording on the disk, of any length: its `overview`, `metadata`, `is_complete`, and any seconds of it.
 
     A file whose recorder was killed, or is older, has no overview: it is made from all messages. With `is_scanned`
     False such a file is refused. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd.
@@ -199,7 +199,8 @@ class RecordingFile:
         self.is_complete = self._contents.is_complete
 
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
-        """Return the ticks and snapshots from `from_ns` to `to_ns`, both included, decoded as the type `wanted`.
+        """Return the ticks and snapshots from `from_ns` to `to_ns`, both included, in the file's order, decoded as
+        `wanted`.
 
         Times are ns since 1970. Raises RecordingError where the file is damaged, or has over MAX_SEEN messages in this
         time.
@@ -222,7 +223,10 @@ class RecordingFile:
 
 
 def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
-    """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview."""
+    """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview.
+
+    Messages are not read. Raises UNREADABLE for damage.
+    """
     at = file.seek(0, 2) - TAIL_BYTES
     file.seek(max(0, at))
     if at < 0 or not file.read().endswith(MAGIC):

@@ -149,7 +149,11 @@ def verified(path: Path, key: bytes = b"") -> Verdict:
 
 
 class _Check:
-    """Checks one file's seals, record by record."""
+    """Checks one file's seals, record by record.
+
+    Holds the hash of all bytes so far, what the file says of its seals, and the last seal. Also the summary's place and
+    CRC, and the first oddity.
+    """
 
     def __init__(self, key: bytes) -> None:
         self._key = key
@@ -237,7 +241,12 @@ class _Check:
         return Verdict(State.ALTERED, self._odd or why, self._follows, self._last)
 
     def verdict(self, size: int, *, ends: bool) -> Verdict:
-        """Return the verdict on a file of `size` bytes; `ends` says whether its last bytes are MCAP's closing magic."""
+        """Return the verdict on a file of `size` bytes; `ends` says whether its last bytes are MCAP's closing magic.
+
+        The first that holds: UNSEALED for a file without a word of seals; OTHER_KEY for keyed seals without the key.
+        ALTERED for an oddity, or an end that the seals do not explain. NO_KEY for plain seals where a key is
+        configured; UNFINISHED for a file cut short; else WHOLE.
+        """
         if not self._by and not self._seals and (self._is_over or not self._head):
             return Verdict(
                 State.UNSEALED, "nothing says whether it was changed: an older tormagd, or another program, wrote it"
@@ -260,7 +269,7 @@ class _Check:
 
 
 def _digest(known: "hashlib.blake2b", is_last: bool) -> bytes:
-    """Of all bytes so far, and of what the seal itself says."""
+    """Return the digest of all bytes so far, and of whether the seal is the last. Leaves the hash as it is."""
     here = known.copy()
     here.update(b"\1" if is_last else b"\0")
     return here.digest()

@@ -98,7 +98,11 @@ class RecordingWriter:
         self._begin(path, "")
 
     def _begin(self, path: Path, follows: str) -> None:
-        """Open a new file, and lock it against pruning; `follows` is the digest that ends the segment before."""
+        """Open a new file, lock it against pruning, and write its head; `follows` is the digest that ends the segment
+        before.
+
+        Raises FileExistsError, OSError.
+        """
         self.path = path
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks

@@ -25,8 +25,9 @@ from tormagd_client.endpoints import ConfigError
 def main(arguments: list[str] | None = None) -> int:
     """Replay the file that the arguments name, print one JSON object, and return the exit code.
 
-    0 is done, 1 is a stdout that cannot be written. 2 is a file or an option that cannot be used: one line on stderr
-    says why. With `--set` or `--fault` the simulated device takes the real one's place.
+    None takes the arguments of the process. 0 is done, 1 is a stdout that cannot be written. 2 is a file or a setting
+    that cannot be used: one line on stderr says why. Wrong usage raises SystemExit(2). With `--set` or `--fault` the
+    simulated device takes the real one's place.
     """
     parser = argparse.ArgumentParser(prog="python -m tormagd.replay", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("file", type=Path)
@@ -68,7 +69,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
-    """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it."""
+    """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it.
+
+    Returns plant, faults and settings, and what happened: `recorded`, `simulated`, and `instead`, None without
+    settings. Raises ReplayError for a setting, plant or fault that cannot be used, and as `script` and `rehearse`.
+    """
     todo = script(known.columns, box.entries)
     config = changed(known.config, options.settings)
     simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)

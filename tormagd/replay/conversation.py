@@ -55,7 +55,10 @@ class Damage(msgspec.Struct, frozen=True):
 
 
 class RecordedWire:
-    """A backend that reads what the file holds, and keeps what the connection writes for comparison."""
+    """A backend that reads what the file holds, and keeps what the connection writes for comparison.
+
+    Makes `connection`, whose port it is, opened at 0 s.
+    """
 
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
@@ -118,9 +121,10 @@ class Conversation:
         self.first_damage: Damage | None = None
 
     def begin(self, memory: Any) -> None:
-        """Replace the connection by one with the `memory` of a snapshot, plain data; None means no open port.
+        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; None means no open port.
 
-        Raises InexactError, TypeError or LookupError for a memory that no connection writes.
+        Raises InexactError, TypeError or LookupError for a memory that no connection writes: then there is no
+        connection.
         """
         self._wire = None
         if memory is not None:
@@ -149,7 +153,10 @@ class Conversation:
         return differing("measurement", plain(recorded), plain(self._wire.connection.measurement), self.frame)
 
     def read(self, entry: Any) -> None:
-        """Feed the connection a READ entry, count its frames, and keep the first damaged one in `first_damage`."""
+        """Feed the connection a READ entry, add to the counts of frames, damaged ones and resynchronisations.
+
+        The first damaged frame is kept in `first_damage`. Raises TypeError or ValueError for a malformed entry.
+        """
         wire = self._wire
         if wire is None:
             return

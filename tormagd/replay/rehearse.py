@@ -191,7 +191,7 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
 
 
 def _recorded(ticks: list[TickRecord]) -> Happened:
-    """Return the faults and limits that the recorded ticks show."""
+    """Return the faults and limits that the recorded ticks show; a tick's limits held since the tick before."""
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
     before_s = first_s
     for tick in ticks:
@@ -205,7 +205,10 @@ def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:
 
 
 def _hand(ticks: list[TickRecord]) -> RecordedHand:
-    """Return the handle's positions as its encoder measured them; without one the handle stays at 0 mm."""
+    """Return the handle's positions, mm, as its encoder measured them, in s from the first tick.
+
+    Without one the handle stays at 0 mm.
+    """
     places: dict[float, float] = {}
     for tick in ticks:
         if tick.sensed_s is not None and tick.device_handle_mm is not None:

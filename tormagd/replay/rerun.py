@@ -184,7 +184,11 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 
 
 class _Running:
-    """Core and conversation while they are replayed, entry by entry."""
+    """Core and conversation while they are replayed, entry by entry.
+
+    Holds the newest step's measurement and output, a plan's failure, whether the states are known, and counts of
+    snapshots and gaps.
+    """
 
     def __init__(self, core: Core, frame: int) -> None:
         self.conversation = Conversation(frame)
@@ -223,9 +227,12 @@ class _Running:
         return None
 
     def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
-        """Do what one entry tells: step, plan, learning, command or fault. Raises ValueError for an unknown entry.
+        """Do what one entry tells: step, plan, learning, command or fault; return how a command's outcome differs, else
+        None.
 
-        Of a plan that fails, the error is kept; it is a difference unless an AFRESH entry follows.
+        `record` holds a step's inputs. A difference in measurement or frames is kept for `compare`. Of a plan that
+        fails, the error is kept; it is a difference unless an AFRESH entry follows. Raises ValueError for an unknown
+        entry, and UNTAKEN.
         """
         match name:
             case journal.STEP:
@@ -296,7 +303,11 @@ class _Running:
 
     def _begin(self, entry: Any) -> Found | None:
         """Compare the states with a snapshot where they are known, then take the snapshot's; return the first
-        difference."""
+        difference.
+
+        Step and plan are compared, then the connection. Afterwards the states are known, and a failed plan is
+        forgotten. Raises InexactError, TypeError or LookupError for a snapshot that does not fit.
+        """
         differs, connection = None, entry[3]
         if self.is_known:
             self.snapshots += 1
@@ -313,7 +324,8 @@ class _Running:
 def measurement_of(record: TickRecord) -> Measurement | None:
     """Return the measurement that a tick's step was given; None where it had none.
 
-    Raises ValueError where only part of a measurement is recorded.
+    Raises ValueError where only part of a measurement is recorded, KeyError for an unknown mode, switch or device
+    fault.
     """
     if record.measurement is None:
         return None

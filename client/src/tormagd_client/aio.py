@@ -68,7 +68,12 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
     async def arm(
         self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None
     ) -> tuple[str, ...]:
-        """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know."""
+        """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know.
+
+        `told` hears each command as it is given; all are returned. Where the wait ends before, by `timeout_s`
+        (RefusedError, `timeout`) or by cancelling, the daemon is told to disable. Raises as `request`, and RefusedError
+        where arming failed.
+        """
         until_s, report = asyncio.get_running_loop().time() + timeout_s, ArmReport(given=(), is_over=False)
         await self.request("arm")
         try:
@@ -88,7 +93,10 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
     async def publish(
         self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any
     ) -> None:
-        """Ask for a force at the roller, with arguments and errors of `blocking.Client.publish`."""
+        """Ask for a force at the roller, with arguments and errors of `blocking.Client.publish`.
+
+        Waits up to `wait_s` until the daemon takes setpoints.
+        """
         setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
         while await setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
             self._is_taken = (await setpoints.recv()).startswith(SUBSCRIBED)

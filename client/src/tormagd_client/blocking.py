@@ -91,8 +91,9 @@ class Client(Connections["zmq.Socket[bytes]"]):
     def arm(self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None) -> tuple[str, ...]:
         """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know.
 
-        `told` hears each command as it is given; all are returned. Where the wait ends before, by `timeout_s` or an
-        interrupt, the daemon is told to disable. Raises as `request`.
+        `told` hears each command as it is given; all are returned. Where the wait ends before, by `timeout_s`
+        (RefusedError, `timeout`) or an interrupt, the daemon is told to disable. Raises as `request`, and RefusedError
+        where arming failed.
         """
         until_s, report = time.monotonic() + timeout_s, ArmReport(given=(), is_over=False)
         self.request("arm")
@@ -111,11 +112,11 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return armed(report)
 
     def publish(self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any) -> None:
-        """Ask for a force at the roller, meant at `stamp_ns`, CLOCK_REALTIME, now by default.
+        """Ask for a force at the roller, N, meant at `stamp_ns`, CLOCK_REALTIME; None means now.
 
         `fields` are those of `messages.Setpoint`; `contact` may be a mapping of its names. Waits until the daemon takes
-        setpoints: the first time, and after the daemon has gone. Raises ValueError naming what is not allowed, and
-        UnreachableError where nobody takes setpoints within `wait_s`.
+        setpoints: the first time, and after the daemon has gone. Raises ValueError naming what is not allowed,
+        TypeError for an unknown field, and UnreachableError where nobody takes setpoints within `wait_s`.
         """
         self.require_taken().send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 

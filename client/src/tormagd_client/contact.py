@@ -26,7 +26,8 @@ MOST_SHARE, MOST_MM = 0.2, 0.5
 class ContactEstimator:
     """Estimator of one wall, for samples with 20 mN and 0.2 mm of noise, some hundred a second.
 
-    A wall that has moved is learned anew. `friction_N` is learned before the wall.
+    Holds a running mean of place and force, the friction, and the sums of the wall's line. A wall that has moved is
+    learned anew. `friction_N` is learned before the wall.
     """
 
     def __init__(self) -> None:
@@ -39,7 +40,10 @@ class ContactEstimator:
 
     @property
     def contact(self) -> Contact | None:
-        """The wall; None while it is not known well enough: then send forces."""
+        """Return the wall; None while it is not known well enough: then send forces.
+
+        None is also a wall beyond MAX_PLACE_MM. Stiffness is MAX_STIFFNESS_N_MM at most, friction 0 at least.
+        """
         slope_N_mm, place_mm, slope_sd, place_sd_mm, _ = self._line()
         is_known = slope_sd <= MOST_SHARE * slope_N_mm and place_sd_mm <= MOST_MM
         if not (is_known and abs(place_mm) <= MAX_PLACE_MM):

@@ -83,7 +83,7 @@ def keys_of(curve: Curve | None) -> Keys | None:
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
-    """Connect `socket`, with the keys at `tcp://`, and at `ipc://` where they say so.
+    """Connect `socket`, with the `keys` at `tcp://`, and at `ipc://` where they say so; None: without keys.
 
     Raises SettingError for an address that ZeroMQ cannot use.
     """
@@ -161,7 +161,10 @@ def understood(result: dict[str, Any], kind: type[T]) -> T:
 
 
 def arm_report(status: dict[str, Any]) -> ArmReport:
-    """How far an `arm` has come, in an answer to `status`. Raises as `understood`."""
+    """Return how far an `arm` has come, from an answer to `status`. Raises as `understood`.
+
+    A daemon that knows of none was started anew: the report is over then, with an error.
+    """
     told = status.get("arm")
     if told is None:
         return ArmReport(given=(), is_over=True, error=Explained("gone", "the daemon was started anew", "arm again"))
@@ -169,14 +172,15 @@ def arm_report(status: dict[str, Any]) -> ArmReport:
 
 
 def armed(report: ArmReport) -> tuple[str, ...]:
-    """The commands that an `arm` has given. Raises RefusedError or InFaultError where the force does not follow."""
+    """Return the commands that an `arm` has given. Raises RefusedError or InFaultError where the force does not
+    follow."""
     if (error := report.error) is not None:
         raise refused("arm", error.code, error.cause, error.remedy)
     return report.given
 
 
 def refused(command: str, code: str, message: str, hint: str) -> RefusedError:
-    """What a client raises for this refusal."""
+    """Return what a client raises for this refusal: InFaultError for FAULT_CODES, else RefusedError."""
     kind = InFaultError if code in FAULT_CODES else RefusedError
     return kind(command, code, message, hint)
 
@@ -217,10 +221,10 @@ class Numbering:
         contact: Contact | Mapping[str, float] | None = None,
         **fields: Any,
     ) -> bytes:
-        """Return the next setpoint as bytes. `stamp_ns`: when the force is meant, None for now; others as
-        `messages.Setpoint`.
+        """Return the next setpoint as bytes; `stamp_ns` is when the force is meant, None for now.
 
-        Raises ValueError naming what is not allowed.
+        Other arguments are as in `messages.Setpoint`. Raises ValueError naming what is not allowed; no number is used
+        up then. Raises TypeError for a field that a setpoint does not have.
         """
         made = Setpoint(
             v=VERSION,

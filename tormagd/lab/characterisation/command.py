@@ -55,7 +55,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def compression(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the moduli from the evaluated cycle, and where the test differs from the standard."""
+    """Return the moduli from the evaluated cycle, as `moduli`, its number `cycle`, and `deviations` from the standard.
+
+    The options name the file, diameter and height, mm, cycle and terms. Raises LabError and DomainError.
+    """
     record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
     curve = evaluated_cycle(record, sample, options.cycle)
     return {"cycle": options.cycle, "deviations": deviations(record, sample), **moduli(curve, options.terms)}
@@ -76,7 +79,8 @@ def tension(options: argparse.Namespace) -> dict[str, Any]:
 def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
     """Return the shear moduli of three laws, kPa, and how well each fits, as R2.
 
-    The laws are neo-Hookean, Ogden's with up to `terms` terms, and Eq. 3 of the thesis as printed. Raises LabError and
+    The laws are neo-Hookean, Ogden's with up to `terms` terms, and Eq. 3 of the thesis as printed; the latter two also
+    with their own constants. Besides, `points` counts the curve's, and `stretch` is its range. Raises LabError and
     DomainError as the fits.
     """
     neo_hookean, ogden = fit_neo_hookean(*curve), fit_ogden(*curve, terms=terms)
@@ -101,9 +105,11 @@ def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
 
 
 def relaxation(options: argparse.Namespace) -> dict[str, Any]:
-    """Return fractions, time constants and quality of the fit of a relaxation record, with up to `options.branches`.
+    """Return the fit of the relaxation record in `options.file`, with up to `options.branches` time constants.
 
-    Raises LabError and DomainError as `read_columns` and `fit_relaxation`.
+    Keys: `fractions` and `times_s` of the series, the shortest time first; `scale_N`, the instant force per unit of
+    driving force; `r2`; `rms_N` of the residual. Raises LabError and DomainError as `read_columns` and
+    `fit_relaxation`.
     """
     record = RelaxationRecord(**read_columns(options.file, RelaxationRecord._fields))
     fit = fit_relaxation(record, options.branches)

@@ -39,7 +39,11 @@ KINDS = {
 
 
 def write_parquet(summaries: dict[str, Summary], url: str) -> None:
-    """Write one row for each recording, `file` and the fields of `Summary`, as Parquet to `url`. Raises OSError."""
+    """Write one row for each recording, `file` and the fields of `Summary`, as Parquet to `url`; a file there is
+    replaced.
+
+    Raises OSError; ValueError for an unknown kind of URL, ImportError where its package is missing.
+    """
     fields = msgspec.structs.fields(Summary)
     columns = [("file", pyarrow.string()), *((field.name, KINDS[field.type]) for field in fields)]
     rows = [{"file": name, **msgspec.structs.asdict(each)} for name, each in summaries.items()]
@@ -70,7 +74,10 @@ def _cells(console: Console) -> tuple[str, ...]:
 
 
 def _shown(drift: Drift | None, form: str) -> str:
-    """Return the first and newest value, with the change per day where it is known; `unknown` for None."""
+    """Return the first and newest value, with the change per day where it is known; `unknown` for None.
+
+    Two values that look alike in `form` are shown once, without a change.
+    """
     if drift is None:
         return "unknown"
     first, newest = f"{drift.first:{form}}", f"{drift.newest:{form}}"

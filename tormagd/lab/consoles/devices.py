@@ -73,7 +73,10 @@ def _console(group: list[Summary]) -> Console:
 
 
 def _pooled(errors: list[tuple[float, float]]) -> float | None:
-    """Return the RMS over all parts from (duration, RMS) of each; None without parts."""
+    """Return the RMS over all parts from (duration, RMS) of each, weighted by duration; None without parts.
+
+    Where all durations are 0, parts weigh alike.
+    """
     if not errors:
         return None
     weights, rms_N = np.array(errors).T

@@ -135,7 +135,8 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
     """Return the least coverage of the design, 0..1, where each dimension may be off by `share`, down, not at all, or
     up.
 
-    All combinations are tried. The result is 0 where the elastomer of one of them does not bear the field.
+    All combinations are tried. The result is 0 where the elastomer of one of them does not bear the field. Raises
+    `DomainError` for one that no brake can have.
     """
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
     made = [
@@ -146,7 +147,10 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
 
 
 def corner_cost(problem: Problem, design: Design) -> float:
-    """Return the thesis's cost, Eq. 39: sum of the squared corner distances, N and N/s taken as equal."""
+    """Return the thesis's cost, Eq. 39: sum of the squared distances of all four corners, N and N/s taken as equal.
+
+    Raises `DomainError` for an impossible design.
+    """
     offered, wanted = problem.portrait(design).trapezoid(), problem.region
     # the lower corners mirror the upper ones
     return 2.0 * (

@@ -78,7 +78,11 @@ def mean_relative_error(fit: RangeFit, inserts: Sequence[Insert]) -> float:
 
 
 def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
-    """Return each insert's relative error under the fit to all the others, by name."""
+    """Return each insert's relative error under the fit to all the others, by name.
+
+    `free_exponent` also fits the permeability exponent. Raises KeyError for an insert that is the only one of its
+    matrix.
+    """
     fit = fit_exponent if free_exponent else fit_friction
     return {
         left_out.name: fit([item for item in inserts if item is not left_out], field).relative_error(left_out)

@@ -37,11 +37,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Identify the motor from the log `options.log` and return its parameters; write the configuration and the plot
-    asked for.
+    """Identify the motor from the log `options.log` and return its parameters, as `identify`; write configuration and
+    plot if asked.
 
-    Raises LabError where the log cannot be used, or the new configuration not written; ConfigError where the present
-    one is refused.
+    Raises LabError where the log cannot be used, or the new configuration not written. Raises ConfigError where the
+    present one is refused, OSError where the plot cannot be written.
     """
     log = read_log(options.log)
     result = identify(log, options.gain if options.gain is not None else log.gain_N_V)
@@ -53,9 +53,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
-    """Write a new configuration file with the identified motor; gear ratio and lead are those of `config`.
+    """Write a new configuration file with the identified motor, to four digits; other values are those of `config`.
 
-    Raises LabError where the log cannot fill it, the file exists, or `tormagd` would refuse a value.
+    The inductance is written only where its interval is under VAGUE_SHARE of it. Raises LabError where the log cannot
+    fill it, the file exists, or `tormagd` would refuse a value.
     """
     found = result["motor"]
     if found is None:

@@ -101,7 +101,11 @@ class Fit(NamedTuple):
 
 
 def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
-    """Return position, speed and acceleration of a log. Raises LabError where it moves too little to show anything."""
+    """Return position, speed, acceleration and sign of the speed of a log, low-passed without lag.
+
+    `thinned_Hz` is the rate that `Motion.thin` goes to. Raises LabError where the log is too short, or does not move
+    both ways.
+    """
     smooth = _low_pass(log)
     position = smooth(log.position_m)
     speed = np.gradient(position, log.period_s)

@@ -15,10 +15,12 @@ BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 
 
 def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
-    """Identify a motor and return parameters, ratios, residuals and notes as plain data.
+    """Identify a motor and return parameters, ratios to the gain, the time constant, residuals and notes as plain data.
 
-    With `gain_N_V` the parameters are scaled from volts; with None they come from the log's current, or are None
-    without one. Raises LabError for a gain that is not allowed, or a log that does not move enough to show anything.
+    An estimate is its value and the half width of its 95% interval. With `gain_N_V` the parameters are scaled from
+    volts. With None they come from the log's current, which also gives `motor` and the gain; without one they are None.
+    `holdout_voltage_nrmse` is of the second half, by a fit of the first. Raises LabError for a gain that is not
+    allowed, or a log that does not move enough to show anything.
     """
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")

@@ -80,9 +80,11 @@ def measured() -> dict[str, Any]:
 
 
 def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) -> dict[str, Any]:
-    """Return what every number of neighbours decides on one shipped model.
+    """Return what every number of NEIGHBOURS decides on one shipped model: a row each, as `followed` without its
+    answers.
 
-    `other_answers` is the share of answers that differ from those of the most neighbours.
+    `other_answers` is the share of answers that differ from those of the most neighbours. Besides, the share of the
+    model's box where its force does not rise. Raises LabError as `contacts`.
     """
     model = load_model(model_path(model_name, scene_path("pulse").parent), element=element)
     low_mT, high_mT = range_mT

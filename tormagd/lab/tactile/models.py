@@ -160,7 +160,10 @@ def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, 
 
 
 def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
-    """Return dF/dB (n) of a worked pad at (displacement, rate, field) (n x 3), without relaxation."""
+    """Return dF/dB, N/mT (n), of a worked pad at (displacement, mm, rate, mm/s, field, mT) (n x 3), without relaxation.
+
+    It is a secant over 0.5 mT to either side, above 0 mT.
+    """
     pad = worked_pad(parameters)
     displacement, rate, field = places.T
     low, high = np.maximum(field - 0.5, 0.0), field + 0.5
@@ -170,5 +173,6 @@ def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
 
 
 def plant_force_N(pad: Any, places: Array) -> Array:
-    """Return the force (n) of a `TactilePad` at (displacement, rate, field) (n x 3), without relaxation."""
+    """Return the force, N (n), of a `TactilePad` at (displacement, mm, rate, mm/s, field, mT) (n x 3), without
+    relaxation."""
     return np.array([sum(pad.elastic_parts_N(*place)) for place in places.tolist()])

@@ -132,7 +132,8 @@ def holding_records(
 ) -> PadRecord:
     """Return relaxation tests, one at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely.
 
-    The thesis did not have these.
+    Each has `samples` rows, of a worked pad, with the sensor's noise `noise_N`, N, drawn by `seed`. The thesis did not
+    have these.
     """
     rise_s = FULL_INDENTATION_MM
     held_s = np.geomspace(0.05, HOLD_S, samples - RISE_SAMPLES)

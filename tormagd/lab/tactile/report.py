@@ -54,7 +54,7 @@ def sections(figures: Json) -> Iterator[str]:
 
 
 def _table_4_1(data: Json) -> str:
-    """Return the section on table 4.1; `data` is of `models.table_4_1`."""
+    """Return the Markdown section on table 4.1; `data` is of `models.table_4_1`."""
     chance, monotonicity = data["random"], data["monotonicity"]
     groups = [
         (
@@ -91,7 +91,7 @@ def _table_4_1(data: Json) -> str:
 
 
 def _pulse(pulse: Json) -> str:
-    """Return the section on the pulse experiment; `pulse` is of `experiment.contract`."""
+    """Return the Markdown section on the pulse experiment; `pulse` is of `experiment.contract`."""
     rows = []
     for noise, scores in pulse["by_noise"].items():
         named = [(label, scores[way]) for way, label in WAYS.items()]

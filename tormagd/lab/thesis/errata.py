@@ -34,8 +34,10 @@ def errata() -> list[dict[str, str]]:
 
 
 def table_2_4_errors() -> list[dict[str, object]]:
-    """Return the lines of table 2.4 whose printed error does not follow from the printed ranges, within their
-    rounding."""
+    """Return the lines of table 2.4 whose printed error does not follow from the printed ranges, within their rounding.
+
+    Each has the insert, and its error printed and recomputed, in N and in percent.
+    """
     wrong = []
     for name, (printed_N, printed_percent) in TABLE_2_4_ERRORS.items():
         ranges = INSERTS[name].force_range

@@ -44,7 +44,8 @@ def sections(result: Json) -> Iterator[str]:
 
 
 def _table_2_4(data: Json) -> str:
-    """Return the section on table 2.4, with every fit and every insert; `data` is of `reproduction.table_2_4`."""
+    """Return the Markdown section on table 2.4, with every fit and every insert; `data` is of
+    `reproduction.table_2_4`."""
     fits = [
         (
             name,
@@ -86,7 +87,7 @@ def _table_2_4(data: Json) -> str:
 
 
 def table_2_5(data: Json) -> str:
-    """Return the section on table 2.5, with both readings; `data` is of `table_2_5.table_2_5`."""
+    """Return the Markdown section on table 2.5, with both readings; `data` is of `table_2_5.table_2_5`."""
     low, high = data["implied_gap_resolution_mm"]
     return (
         f"## Table 2.5: inserts for tasks\n\n`tormag-lab reproduce-thesis --table-2-5` prints it alone. {data['note']} "
@@ -100,7 +101,7 @@ def table_2_5(data: Json) -> str:
 
 
 def _figure_2_5(data: Json) -> str:
-    """Return the section on figure 2.5; `data` is of `reproduction.figure_2_5`."""
+    """Return the Markdown section on figure 2.5; `data` is of `reproduction.figure_2_5`."""
     rows = [
         (
             name,
@@ -121,7 +122,7 @@ def _figure_2_5(data: Json) -> str:
 
 
 def _figure_2_7(data: Json) -> str:
-    """Return the section on figure 2.7; `data` is of `reproduction.figure_2_7`."""
+    """Return the Markdown section on figure 2.7; `data` is of `reproduction.figure_2_7`."""
     rows = [
         (
             row["insert"],
@@ -140,7 +141,8 @@ def _figure_2_7(data: Json) -> str:
 
 
 def _portrait(data: Json) -> str:
-    """Return the section on the phase portrait of the device as built; `data` is of `reproduction.phase_portrait`."""
+    """Return the Markdown section on the phase portrait of the device as built; `data` is of
+    `reproduction.phase_portrait`."""
     pulse, measures = data["pulse"], ("trapezoid", "true")
     rows = [
         (
@@ -170,7 +172,8 @@ def _portrait(data: Json) -> str:
 
 
 def _table_3_2(data: Json) -> str:
-    """Return the section on table 3.2, with optima and the thesis's designs; `data` is of `reproduction.table_3_2`."""
+    """Return the Markdown section on table 3.2, with optima and the thesis's designs; `data` is of
+    `reproduction.table_3_2`."""
     speeds = ", ".join(f"{name} {speed:.2f}" for name, speed in data["gap_speed_mm_s"].items())
     rows = []
     for row in data["best"]:
@@ -225,7 +228,7 @@ def _dimensions(design: Json) -> str:
 
 
 def table_4_1(data: Json) -> str:
-    """Return the section on table 4.1, thesis and ours side by side; `data` is of `models.table_4_1`."""
+    """Return the Markdown section on table 4.1, thesis and ours side by side; `data` is of `models.table_4_1`."""
     rows = []
     for row in data["rows"]:
         for name, printed in TABLE_4_1[row["class"]].items():
@@ -249,7 +252,7 @@ def table_4_1(data: Json) -> str:
 
 
 def pulse_experiment(pulse: Json) -> str:
-    """Return the section on the experiment of section 4.3, thesis and ours side by side.
+    """Return the Markdown section on the experiment of section 4.3, thesis and ours side by side.
 
     `pulse` is of `experiment.contract`.
     """

@@ -95,7 +95,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def chapter_4(is_quick: bool) -> Json:
-    """Return table 4.1 and the pulse. What was trained stays in this process: none of it is pickled."""
+    """Return table 4.1, the pulse and what relaxes, as `experiment.contract`; none of what was trained is pickled.
+
+    Raises ModuleNotFoundError where heartpy is not installed.
+    """
     from tormagd.lab.tactile.experiment import contract
     from tormagd.lab.tactile.models import FULL, QUICK
 
@@ -104,7 +107,8 @@ def chapter_4(is_quick: bool) -> Json:
 
 
 def table_2_3() -> Json:
-    """Return masses from volume fractions and densities, beside the printed ones."""
+    """Return each insert's masses, g in 100 cc, from volume fractions and densities, beside the printed ones, and the
+    greatest difference."""
     rows: list[Json] = []
     for item in INSERTS.values():
         printed = TABLE_2_3_MASSES_G[round(100 * item.cip_fraction)]
@@ -194,7 +198,10 @@ def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -
 
 
 def figure_2_5() -> Json:
-    """Return the least and greatest force over permeability and shear modulus, with mu_d = 0.2."""
+    """Return the least and greatest force, N, over permeability and shear modulus, with mu_d = 0.2, by both field laws.
+
+    For each law also the forces at the thesis's working point, and their errors.
+    """
     permeabilities = np.linspace(2.0, 4.0, 9)
     moduli_kPa = np.linspace(80.0, 280.0, 11)
     result: Json = {}
@@ -291,7 +298,11 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
 
 
 def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
-    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed, and the worst that it misses."""
+    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed, and the five fastest that it
+    misses.
+
+    Points are force and force rate. Raises ModuleNotFoundError where heartpy is not installed.
+    """
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
     rates_N_s = np.gradient(forces_N, times_s)
     brake = Brake.as_built(insert("MRE-50-40").elastomer)

@@ -46,7 +46,10 @@ class StepTest(NamedTuple):
 
 
 def step_test(fitted: Insert, seed: int) -> StepTest:
-    """Run one insert through all gaps in virtual time. Raises RuntimeError where the device faults."""
+    """Run one insert through all gaps in virtual time, HOLD_S each, and return the record.
+
+    Levels are means of the last SETTLED_S of each hold. Raises RuntimeError where the device faults, or does not arm.
+    """
     config, scene = load_config(None), load_scene("coronary")
     scene = msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N))
     plant = load_plant("sample_1")

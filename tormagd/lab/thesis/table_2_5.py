@@ -56,7 +56,12 @@ def table_2_5() -> Json:
 
 
 def _row(verdict: Verdict, task: ForceTask) -> Json:
-    """Return one insert's verdict as plain data, in both readings; a gap that the field law does not know is None."""
+    """Return one insert's verdict as plain data, in both readings: by its range alone, and from the task's least force
+    on.
+
+    `matched_share` is the measured range over the task's, 1 at most. `serves`, `served_share` and `reasons` are strict.
+    A gap that the field law does not know is None.
+    """
     measured_N = INSERTS[verdict.insert].force_range.measured_N
     return {
         "insert": verdict.insert,

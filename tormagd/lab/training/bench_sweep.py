@@ -157,7 +157,7 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
 
 
 def rows_of(ticks: Array, scene: Scene) -> Array:
-    """Return the training rows (n x 6) that are kept of all ticks (m x 4), in order of time.
+    """Return the training rows (n x 6) that are kept of all ticks (m x 4, 1 ms apart), in order of time.
 
     A tick is time_s, handle_mm, gap_mm and the force, N, with the sign of the handle's way. A row is time_s, the four
     features, and the force along the motion. Of the ticks of steady sliding one in EVERY is kept, of those due before
@@ -179,10 +179,11 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
 
 
 def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Array]:
-    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick (n).
+    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick (n) of 1 ms.
 
-    The way is NaN where no row is due. Rows are due after a turn, at one speed and a resting gap, every LOADED_STEP_MM
-    up to LOADED_MM.
+    `signed_N` is the force with the sign of the handle's last way; the rate, over the RATE_TICKS that follow, has a
+    sign, the way none. The way is NaN where no row is due. Rows are due after a turn, at one speed and a resting gap,
+    every LOADED_STEP_MM up to LOADED_MM.
     """
     gap_mm_s, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     is_resting &= np.abs(gap_mm_s) <= RESTING_GAP_MM_S
@@ -210,9 +211,10 @@ def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Ar
 
 
 def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
-    """Return the handle's rate, mm/s, at each tick (n), and a mask (n) of steady sliding at a steady gap.
+    """Return the handle's rate, mm/s with its sign, at each tick (n) of 1 ms, and a mask (n) of steady sliding.
 
-    Sliding counts after SETTLED_MM since rate or gap last changed, and MOBILISED_AFTER_MM since the handle turned.
+    Sliding counts at a steady gap, after SETTLED_MM since rate or gap last changed, and MOBILISED_AFTER_MM since the
+    handle turned.
     """
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
@@ -232,9 +234,10 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
 
 
 def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
-    """Return the rate at each tick over a window around it, mm/s (n), and a mask (n) of where it is even.
+    """Return the rate at each tick of 1 ms over a window around it, mm/s (n), and a mask (n) of where it is even.
 
-    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE.
+    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE. Beyond the ends
+    of the record the rate counts as 0.
     """
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)

@@ -111,10 +111,10 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
 
 
 def displacement(handle_mm: Array) -> Array:
-    """Return the displacement since the handle's last turn at each of its positions `handle_mm` (n, in order of time),
-    mm.
+    """Return the displacement at each of the handle's positions `handle_mm` (n, in order of time), mm.
 
-    NaN until the first turn, or until so much travel that an earlier turn no longer matters.
+    It is the distance from the last turn, without a sign, MOBILISED_MM at most. NaN until the first turn, or until so
+    much travel that an earlier turn no longer matters.
     """
     found = np.full_like(handle_mm, np.nan)
     start_mm = float(handle_mm[0])
@@ -164,7 +164,7 @@ def require_usable(data: Dataset) -> None:
 def noise_sd_N(data: Dataset) -> float:
     """Return the standard deviation of the force sensor's noise, N, from third differences of neighbouring rows.
 
-    Third differences hold hardly anything but noise. 0 where no rows are neighbours.
+    Third differences hold hardly anything but noise. 0 where no rows are neighbours. The data must have `time_s`.
     """
     assert data.time_s is not None  # training_rows sets it
     steps = np.diff(data.time_s)
@@ -251,8 +251,9 @@ def calibrate(
 ) -> dict[str, Any]:
     """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file).
 
-    Returns what was saved. Raises CalibrationError, LabError, DomainError and OSError. No model is written then, but
-    the training data may be.
+    Both replace files that are there. Returns their names, the insert, the date, the number of rows, the features'
+    ranges and the fit's metrics. Raises CalibrationError, LabError, DomainError and OSError. No model is written then,
+    but the training data may be.
     """
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     if training_csv is not None:
