@@ -74,7 +74,10 @@ class Sample(Value):
 
 
 class VirtualPort:
-    """Backend to the simulated device over serial bytes; `device` may be replaced by one that behaves badly."""
+    """Backend to the simulated device over serial bytes; `device` may be replaced by one that behaves badly.
+
+    Holds the time that it was last let run until, the codec, and the bytes that wait for their reader.
+    """
 
     def __init__(self, device: SerialDevice) -> None:
         self.now_s = 0.0
@@ -114,7 +117,10 @@ class VirtualPort:
 
 
 class VirtualBus:
-    """Backend to a simulated device on a CAN bus, with the real backend's codec of frames."""
+    """Backend to a simulated device on a CAN bus, with the real backend's codec of frames.
+
+    Holds the time that it was last let run until, the codec, and the frames that wait for their reader.
+    """
 
     def __init__(self, device: CanLine) -> None:
         self.now_s = 0.0
@@ -309,7 +315,8 @@ class ClosedLoop:
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
-        """Run ticks until `reached` is true of a measurement; `plan` is used in each.
+        """Run ticks until `reached` is true of a measurement; `plan` is used in each, or the planner's where that is
+        None.
 
         Raises RuntimeError after HOMING_S: the device did not `what`.
         """

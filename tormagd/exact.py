@@ -155,7 +155,10 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
 
 
 def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
-    """Yield path and value of each plain value in `data`, depth first; a type's name is no part of a path."""
+    """Yield path and value of each plain value in `data`, depth first; a type's name is no part of a path.
+
+    An empty map or array yields nothing.
+    """
     if not isinstance(data, dict | list | tuple):
         yield path, data
         return

@@ -164,7 +164,7 @@ def _line(text: str, message: str) -> str:
 def _key_in(message: str) -> list[str]:
     """Return the key that a refusal names, as its parts; empty where it names none.
 
-    Our own begin with it. Those of msgspec end with a place, and may name an unknown key in it.
+    A refusal of ours begins with the key. One of msgspec ends with a place, and may name an unknown key in it.
     """
     if ours := _OURS.match(message):
         return ours[1].split(".")

@@ -116,7 +116,8 @@ def require_sliding(ticks: Columns) -> None:
 
 
 def require_believed(status: Status) -> None:
-    """Raise CommandError (REFUSED) where the daemon doubts the force sensor: then nothing was learned."""
+    """Raise CommandError (REFUSED) where the daemon doubts the force sensor, by a limit of DOUBTS: then nothing was
+    learned."""
     doubt = next((limit for limit in status.limit_details if limit.code in DOUBTS), None)
     if doubt is not None:
         raise CommandError(

@@ -191,9 +191,10 @@ def reach(client: Client, scene_most_N: float) -> Range:
 def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: float) -> Iterator[Run]:
     """Home where needed, enable, and give a `Run`; at the end of the context disable, so that the gap opens.
 
-    Disables after an error, too. Raises CommandError as `home` does, for ticks of another version, and
-    `interrupted_run`; UnreachableError where no ticks of an enabled device come within `wait_s`. Raises ClientError
-    where the daemon refuses to enable.
+    Disables after an error, too. Within the context SIGINT and SIGTERM are only noted: the `Run` raises for them.
+    Raises CommandError as `home` does, for ticks of another version, and `interrupted_run`. Raises UnreachableError
+    where nobody takes setpoints, or no ticks of an enabled device come within `wait_s`; ClientError where the daemon
+    refuses to enable.
     """
     context = zmq.Context()
     try:

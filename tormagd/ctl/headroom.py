@@ -106,7 +106,11 @@ def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | N
 
 
 def rates(config: Config, found: Headroom) -> Iterator[Rate]:
-    """Judge, for both loops, every rate of RATES_HZ and the configured ones; inference never above the control rate."""
+    """Yield a verdict on every rate of RATES_HZ and the configured one, for control, then for inference, each rising.
+
+    Inference rates above the configured control rate are left out. A control rate is judged with inference no faster
+    than itself.
+    """
     control_hz, inference_hz = config.rates.control_hz, config.rates.inference_hz
     for hz in sorted({*RATES_HZ, control_hz}):
         yield _judged("control", hz, hz == control_hz, found, hz, min(inference_hz, hz))

@@ -42,9 +42,9 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
 
 
 def show_keys(path: Path) -> Outcome:
-    """Return the fingerprint of the key in a file, or of every `NAME.key` in a folder.
+    """Return the fingerprint of the key in a file, or of every `NAME.key` in a folder; a folder without any gives none.
 
-    Raises CommandError (USAGE) for a file that holds no key.
+    Raises CommandError (USAGE) for a file that holds no key, and a folder as `load_folder` refuses it.
     """
     with as_usage_error(ConfigError, hint="give a .key or .key_secret file, or a folder of them"):
         found = load_folder(path) if path.is_dir() else [(path.stem, load_public(path).decode())]

@@ -60,8 +60,10 @@ class Machine:
         return sum(int(last or first) - int(first) + 1 for first, last in ranges) or 1
 
     def taken(self) -> Taken:
-        """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi); zeros without such a
-        file."""
+        """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi).
+
+        Without such a file ticks are 0, and the time waited is None.
+        """
         first = (self.text("/proc/stat") or "").split("\n", 1)[0]
         fields = [int(field) for field in first.split()[1:9]]  # beyond: guests, who are counted as users already
         some = re.search(r"^some .*total=(\d+)$", self.text("/proc/pressure/cpu") or "", re.MULTILINE)

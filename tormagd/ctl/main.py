@@ -109,7 +109,7 @@ def _run(options: argparse.Namespace) -> Outcome:
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
-    """Return the configured endpoints and keys with the changes that options and environment make.
+    """Return the configured endpoints and keys with the changes that options, or else the environment, make.
 
     An endpoint `ipc://DIR/control` stands for all endpoints in DIR, under the daemon's own names. Raises CommandError
     (USAGE) for an address or keys that cannot be used.

@@ -75,7 +75,7 @@ class Scrape(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Yield `tormag_up`, and all other metrics while the daemon answers."""
+        """Yield `tormag_up`: 1 with all other metrics while the daemon answers, else 0 alone."""
         try:
             with Client(self._endpoints, self._wait_s) as client:
                 status = client.status()

@@ -33,7 +33,7 @@ class Exit(IntEnum):
 
 
 class CommandError(ClientError):
-    """A command that did not do what was asked, for a reason that `tormagctl` itself found."""
+    """A command that did not do what was asked, for a reason that `tormagctl` itself found; has the `exit_code`."""
 
     def __init__(self, exit_code: Exit, code: str, message: str, hint: str) -> None:
         super().__init__(code, message, hint)

@@ -139,7 +139,11 @@ def _is_up(machine: Machine, channel: str) -> bool | None:
 
 
 def _text(found: Ports, config: Config, colour: Colour) -> str:
-    """Return a line for each port, its holders below it, and a note on processes that cannot be looked into."""
+    """Return a line for each serial port, its holders below it, and each CAN channel; a configured port that is not
+    there, too.
+
+    A last line counts the processes that cannot be looked into.
+    """
     lines = []
     for entry in found.serial:
         marks = [

@@ -81,7 +81,11 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
 
 
 def _instead(result: dict[str, Any]) -> str:
-    """Compare in words what was recorded with what the simulator met, as configured then and with the settings."""
+    """Compare in words what was recorded with what the simulator met, as configured then and with the settings.
+
+    `result` is the report of `python -m tormagd.replay`. A recorded fault that did not come as configured then is
+    named.
+    """
     told = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
     if result["instead"] is not None:
         told[f"simulated with {', '.join(result['settings'])}"] = result["instead"]

@@ -12,7 +12,7 @@ from tormagd.recording.seal import verified
 
 
 def report(config: Config, sources: list[Path], target: Path) -> Outcome:
-    """Write an HTML page on one or two recordings to `target`.
+    """Write an HTML page on one or two recordings to `target`; a page there is replaced, whole or not at all.
 
     The outcome is REFUSED where one was altered, or sealed without the configured key. Raises CommandError (USAGE):
     more than two, one that cannot be read, or a page that cannot be written.

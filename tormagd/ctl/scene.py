@@ -114,7 +114,8 @@ def as_toml(tables: dict[str, Any]) -> str:
 
 
 def torque_range(scene: Scene) -> str:
-    """Return the scene's forces as torques at the handle's shaft, in words; empty for a pad, which has no shaft."""
+    """Return the scene's forces as torques at the handle's shaft, mNm, in words; empty for a pad, which has no
+    shaft."""
     radius_mm, force = scene.roller_radius_mm, scene.force
     if radius_mm is None:
         return ""

@@ -68,9 +68,9 @@ SHAPES = ("step", "sine", "ramp", "pulse")
 def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s: float) -> Waveform:
     """Return one of SHAPES between two forces, N.
 
-    step: `to_N` from half of the time on. ramp: a straight line. sine: begins at `from_N`, swings to `to_N` and back.
-    pulse: a synthetic arterial pulse, one beat per 1/`frequency_hz`. Raises WaveformError: an unknown name, a force
-    outside 0..MAX_FORCE_N, or a step or ramp without end.
+    step: `to_N` from half of the time on. ramp: a straight line over the whole time. sine: begins at `from_N`, swings
+    to `to_N` and back, once per 1/`frequency_hz`. pulse: a synthetic arterial pulse, one beat per 1/`frequency_hz`.
+    Raises WaveformError: an unknown name, a force outside 0..MAX_FORCE_N, or a step or ramp without end.
     """
     for label, value in (("from-N", from_N), ("to-N", to_N)):
         if not 0.0 <= value <= MAX_FORCE_N:

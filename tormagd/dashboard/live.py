@@ -75,7 +75,10 @@ class Live:
             self.browsers.discard(events)
 
     async def _listen(self) -> None:
-        """Keep each snapshot; what cannot be decoded is noted as the reason for silence."""
+        """Keep each snapshot, and when it came, without end; after one that cannot be decoded listen anew.
+
+        That one is noted as the reason for silence.
+        """
         while True:
             try:
                 async for snapshot in self._client.telemetry():
@@ -86,7 +89,8 @@ class Live:
                 self._why_silent = f"what comes is not understood: {printable(str(error))}"
 
     async def _tell(self) -> None:
-        """Publish new snapshots every FRAME_S, or how long nothing has been heard."""
+        """Publish new snapshots every FRAME_S, without end; after SILENT_S without any, for how long nothing has been
+        heard, and why."""
         while True:
             await asyncio.sleep(FRAME_S)
             silent_s = time.monotonic() - self._heard_s

@@ -45,7 +45,10 @@ class Moment(Glance, total=False):
 
 
 class Moments:
-    """Ticks or snapshots of a recording: times in seconds since its start, shape (n,), and quantities, shape (n, 8)."""
+    """Ticks or snapshots of a recording: times in seconds since its start, shape (n,), and quantities, shape (n, 8).
+
+    Quantities are NaN where not known; `messages` are the n messages themselves.
+    """
 
     def __init__(self, seen: Sequence[Seen], start_ns: int) -> None:
         self.messages = [each.message for each in seen]

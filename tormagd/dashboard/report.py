@@ -182,7 +182,7 @@ def _rows(columns: Sequence[Mapping[str, str]]) -> list[list[str]]:
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return an HTML table; "None." where it has no row."""
+    """Return an HTML table of these texts, escaped; "None." where it has no row."""
     lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
     if not lines:
         return "<p>None.</p>"

@@ -49,9 +49,10 @@ async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
 
 
 async def lateness(realtime: RealTime, rate_hz: int, seconds: float) -> Lateness:
-    """Measure for `seconds` how late a bare timer of `rate_hz` beats; WARM_UP_BEATS are left out.
+    """Measure for `seconds` how late a bare timer of `rate_hz` beats, us; WARM_UP_BEATS are left out.
 
-    The thread keeps the scheduling that is asked for here.
+    Returns also how many beats were missed, and what scheduling of `realtime` the kernel refused. The thread keeps what
+    it was granted.
     """
     not_granted = prepare(realtime)
     late_us: list[float] = []

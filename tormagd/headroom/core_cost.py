@@ -70,9 +70,9 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
-    """Repeat one plan and one step a beat until all are done, and return the processor time of each.
+    """Repeat one plan and one step a beat until all are done, and return the processor time of each, us.
 
-    There are as many plans as steps. The caller has asked for the thread's scheduling.
+    There are as many plans as steps. The caller has asked for the thread's scheduling. Raises what a call raises.
     """
     found = CoreCost([], [])
     ended = asyncio.Event()

@@ -13,7 +13,10 @@ class LabError(ValueError):
 
 
 def not_installed(module: str) -> str:
-    """Return one sentence that `module` is missing, with the command that installs it where tormagd is installed."""
+    """Return one sentence that `module` is missing, with the pip command that installs it.
+
+    That is the extra `lab`; for a packaged tormagd the one distribution, into the folder where tormagd is installed.
+    """
     package = PACKAGE_OF.get(module, module)
     library = Path(__file__).resolve().parents[2]
     if library.name == "tormagd" and not (library / "pyproject.toml").exists():  # a folder of its own, as packaged

@@ -28,7 +28,10 @@ def put_gap(plant: Plant, gap_mm: float) -> None:
 
 @final
 class IdealCarriages(Actuator):
-    """Actuator that moves the gap of one simulated device directly; the device's motors rest."""
+    """Actuator that moves the gap of one simulated device directly; the device's motors rest.
+
+    Holds the scene's gaps, the core's top speed, and `reference`: where the gap was put, and how fast it went there.
+    """
 
     def __init__(self, core: Core, plant: Plant) -> None:
         super().__init__()

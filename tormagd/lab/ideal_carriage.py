@@ -203,7 +203,10 @@ def drive_of(plant: PlantParameters) -> Drive:
 
 
 def brake_of(plant: PlantParameters) -> Brake:
-    """Return the brake of a device, between its switches. Raises `DomainError` outside the force law's domain."""
+    """Return the brake of a device, between its switches; that of a second plant is an approximation.
+
+    Raises `DomainError` outside the force law's domain.
+    """
     assumed = plant.assumed
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
@@ -304,10 +307,11 @@ def bound(
     is_held: bool = False,
     step_s: float = STEP_S,
 ) -> Bound:
-    """Return the bound for forces at rising times, linear in between, or held until the next.
+    """Return the bound for forces at rising times, linear in between, or with `is_held` held until the next.
 
-    `step_s` is the step of the result. Raises `DomainError` for under 2 or over MOST_STEPS steps and as `brake_of`, and
-    RuntimeError as `foresight_mm`.
+    Forces are clipped to the device's range and MOST_N; the handle slides at TURNED_MM_S. `step_s` is the step of the
+    result. Raises `DomainError` for under 2 or over MOST_STEPS steps and as `brake_of`, and RuntimeError as
+    `foresight_mm`.
     """
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MOST_STEPS:

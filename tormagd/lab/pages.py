@@ -35,9 +35,10 @@ def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Fi
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
-    """Write a page to `path`, and its pictures as PNG into `folder`, which is made where missing.
+    """Write a page to `path`, and its pictures as PNG into `folder`, which is made where missing; files there are
+    replaced.
 
-    Pictures are stamped with the rows of the page's tables.
+    Pictures are stamped with the rows of the page's tables. Raises OSError.
     """
     page = "\n".join(section.rstrip() + "\n" for section in sections)
     folder.mkdir(parents=True, exist_ok=True)

@@ -142,7 +142,10 @@ class Network:
 
 @final
 class NetworkCurve:
-    """The `ForceCurve` of a network, made by `Network.curve`."""
+    """The `ForceCurve` of a network at one state of the handle, made by `Network.curve`.
+
+    Holds the network and each hidden unit's share of that state. Fields are not checked.
+    """
 
     def __init__(
         self, network: Network, shift: list[float], displacement_mm: float, rate_mm_s: float, cip_percent: float
@@ -159,7 +162,7 @@ class NetworkCurve:
         return self._network.magnitude_N
 
     def force_N(self, field_mT: float) -> float:
-        """Return the force at one field."""
+        """Return the force, N, at one field, mT."""
         network, total_N = self._network, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -181,7 +184,7 @@ class NetworkCurve:
         return total_N + network.constant_N, slope
 
     def forces_N(self, fields_mT: Floats) -> Floats:
-        """Return the force at each field (n), in the precision of the fields."""
+        """Return the force, N, at each field (n), mT, in the precision of the fields."""
         network, kind = self._network, fields_mT.dtype
         hidden = np.multiply.outer(fields_mT, network.field_half.astype(kind, copy=False))
         hidden -= np.array(self._shift, dtype=kind) / 2

@@ -37,7 +37,10 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 class Ring:
     """The newest parts of a black box: none over `kept_s` older than the last, at most `most_bytes`, and always the
-    last."""
+    last.
+
+    `bytes` is the size of their entries.
+    """
 
     def __init__(self, kept_s: float = KEPT_S, most_bytes: int = MOST_BYTES) -> None:
         self._kept_s, self._most_bytes = kept_s, most_bytes

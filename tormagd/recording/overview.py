@@ -279,7 +279,7 @@ def _numbers(data: bytes) -> Floats:
 
 
 class _Stretches:
-    """The least and greatest values of one kind of message, stretch by stretch."""
+    """The least and greatest values of one kind of message, stretch by stretch; all stretches are `width_ns` wide."""
 
     def __init__(self) -> None:
         self.width_ns = FIRST_WIDTH_NS

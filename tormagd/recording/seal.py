@@ -50,7 +50,8 @@ def hasher(key: bytes) -> "hashlib.blake2b":
 
 
 class SealingFile:
-    """A binary file that an MCAP writer writes to, and that digests every byte for its seals."""
+    """A binary file that an MCAP writer writes to, and that digests every byte for its seals, with `key` unless
+    empty."""
 
     def __init__(self, file: BinaryIO, key: bytes) -> None:
         self._file, self._hash = file, hasher(key)

@@ -127,7 +127,10 @@ def record_at(file: BinaryIO, at: int) -> Record | None:
 
 
 class Unpacker:
-    """Unpacks the chunks of one file, with one bound on all of them together."""
+    """Unpacks the chunks of one file, with one bound on all of them together.
+
+    Holds what chunks took so far, packed and unpacked, and the count of schemas, channels and metadata.
+    """
 
     def __init__(self) -> None:
         self._packed = self._unpacked = self._texts = 0

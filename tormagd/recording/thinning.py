@@ -12,7 +12,10 @@ Tick = tuple[int, dict[str, Any]]
 
 
 class Thinning:
-    """Keeps one tick of `every`, and all within AROUND_S of a fault or a mark. With 1 all are kept and none waits."""
+    """Keeps one tick of `every`, and all within AROUND_S of a fault or a mark. With 1 all are kept and none waits.
+
+    Holds the ticks that wait, the last tick's faults, and until when all are kept.
+    """
 
     def __init__(self, every: int) -> None:
         self.every = every
@@ -28,7 +31,8 @@ class Thinning:
     def take(self, tick: Tick) -> list[Tick]:
         """Add a tick, and return the ticks that are to be written now, in their order; others wait for AROUND_S.
 
-        A new set of faults in the tick keeps all ticks around it.
+        A new set of faults in the tick, or a mark noted by `happened`, keeps all ticks around it: all that wait are
+        then returned.
         """
         if self.every == 1:
             return [tick]

@@ -174,7 +174,7 @@ class Conversation:
     def wrote(self, entry: Any, output: Duty) -> Found | None:
         """Send a step's `output` again, and return the first frame that differs from the WROTE entry.
 
-        None where none differs, or no port was open.
+        None where none differs, which adds to the count of frames, or where no port was open.
         """
         wire = self._wire
         if wire is None:

@@ -41,7 +41,8 @@ class Client(Connections["zmq.Socket[bytes]"]):
     """Blocking client of the daemon at `endpoints`: commands, setpoints, telemetry.
 
     A context manager; sockets open as they are needed. `wait_s` is the longest wait for the daemon. `source` names the
-    publisher. Not to be shared between threads.
+    publisher. Making one raises SettingError for keys that are no good, a call for an address that ZeroMQ cannot use.
+    Not to be shared between threads.
     """
 
     _made = zmq.Context
@@ -65,9 +66,10 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return pending
 
     def answer(self, pending: Pending, wait_s: float = 0.0) -> dict[str, Any] | None:
-        """Return the result of an asked command; None where no answer comes within `wait_s`. Raises as `request`.
+        """Return the result of an asked command; None where no answer comes within `wait_s`.
 
-        Late answers to other requests are dropped.
+        Raises RefusedError, InFaultError, and UnreachableError for an answer that is not understood. Late answers to
+        other requests are dropped.
         """
         deadline_s = time.monotonic() + wait_s
         left_s = wait_s
@@ -166,7 +168,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
         self.close()
 
     def _result(self, pending: Pending, wait_s: float) -> dict[str, Any]:
-        """Return the answer to `pending`. Raises UnreachableError where none comes within `wait_s`."""
+        """Return the answer to `pending`. Raises UnreachableError where none comes within `wait_s`, and as `answer`."""
         result = self.answer(pending, wait_s)
         if result is None:
             raise self._unanswered(wait_s)

@@ -71,7 +71,8 @@ def read_compression(path: Path) -> CompressionRecord:
 
 
 def loading_halves(record: CompressionRecord) -> list[slice]:
-    """Return the loading half of each cycle, from the smallest displacement before it to the largest in it.
+    """Return the loading half of each cycle, as a slice of rows, from the smallest displacement before it to the
+    largest in it.
 
     Raises `LabError` if the plates hardly moved.
     """
@@ -98,7 +99,7 @@ def loading_halves(record: CompressionRecord) -> list[slice]:
 def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCLES) -> StressStretch:
     """Return stress and stretch while loading in `cycle`, counted from 1; compression is negative.
 
-    Raises `LabError` if the record has no such cycle, or the plates reach the sample's height.
+    Raises `LabError` if the record has no such cycle, the plates hardly moved, or they reach the sample's height.
     """
     halves = loading_halves(record)
     if not 1 <= cycle <= len(halves):

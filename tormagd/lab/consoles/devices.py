@@ -51,7 +51,10 @@ def consoles(summaries: Iterable[Summary]) -> list[Console]:
 
 
 def _console(group: list[Summary]) -> Console:
-    """Return the console of a group of recordings in order of time."""
+    """Return the console of a group of recordings in order of time; what none of them says is None.
+
+    The error over all is weighted by the time ENABLED.
+    """
     enabled_s = sum(each.enabled_s for each in group)
     errors = [(each.enabled_s, each.tracking_rms_N) for each in group if each.tracking_rms_N is not None]
     limits_s: Counter[str] = Counter()

@@ -38,7 +38,10 @@ class RangeFit(NamedTuple):
 
 
 def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0) -> float:
-    """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N."""
+    """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N.
+
+    The field grows with the permeability to the power `exponent`; it is 1 in the thesis.
+    """
     mu_r = relative_permeability(insert.cip_fraction)
     elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
     # the force law takes b ~ (mu_r / 4) a: another exponent is another moment
@@ -48,7 +51,10 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
 
 
 def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
-    """Fit the friction of each matrix for the least mean relative error of range."""
+    """Fit the friction of each matrix for the least mean relative error of range; the fit has it by Shore 00 hardness.
+
+    The field grows with the permeability to the power `exponent`, which is not fitted.
+    """
     ratios: dict[int, list[float]] = {}
     for item in inserts:
         ratio = frictionless_range_N(item, field, exponent) / item.force_range.measured_N

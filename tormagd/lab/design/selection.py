@@ -41,6 +41,7 @@ class Verdict:
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
     """Judge one insert for a task, where the gap is placed in steps of `gap_resolution_mm`.
 
+    Returns its forces, the largest force step, the share of the task it serves, and the reasons why it does not serve.
     A passive brake never reaches 0 N. A least force that is missed by no more than the task's resolution counts as
     reached: the task could not tell the difference.
     """

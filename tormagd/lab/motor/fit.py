@@ -185,7 +185,10 @@ class Volts(NamedTuple):
         return measured[known], predicted[known]
 
     def over_time(self, log: Log) -> tuple[Array, Array, Array]:
-        """Return thinned times, s, applied and predicted voltage; NaN where the carriage stands."""
+        """Return thinned times, s, applied and predicted voltage, V; both NaN where the carriage stands.
+
+        Raises LabError as `motion`.
+        """
         seen = motion(log)
         values = np.array([self.mass.value, self.viscous.value, self.coulomb.value, self.offset.value])
         measured, _ = _voltage(log, seen, self.delay.value)

@@ -29,7 +29,7 @@ MODELS = {"pad": ("tactile_mre_c", "tactile", (0.0, 365.0)), "brake": ("torque_m
 
 
 def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float | None) -> list[tuple[float, float]]:
-    """Draw CONTACTS contacts from the model's box: displacement, mm, and rate, mm/s.
+    """Draw CONTACTS contacts from the model's box, the same each time: displacement, mm, and rate, mm/s.
 
     `shallow_mm` None: all count. With `shallow_mm` displacements end there, and only contacts at which the force falls
     somewhere in the fields `range_mT` are kept. Raises LabError where MOST_DRAWS do not give as many.

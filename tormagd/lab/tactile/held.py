@@ -90,7 +90,10 @@ def hold(case: Case) -> dict[str, Any]:
 
 
 class _Prepared:
-    """What both ways need: the core, the finger, the pad."""
+    """What both ways to hold need: configuration, core, finger, pad, and `begins_s`, when learning is over.
+
+    Raises PlantError for a plant that cannot be loaded or has no pad.
+    """
 
     def __init__(self, case: Case) -> None:
         stated = load_scene(SCENE)

@@ -70,7 +70,10 @@ def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
 
 
 class Program(NamedTuple):
-    """What is done to a pad, sample by sample: time, displacement, rate by the two-point difference, field."""
+    """What is done to a pad, sample by sample (n each): time, s, displacement, mm, its rate, mm/s, and field, mT.
+
+    The rate is the two-point difference.
+    """
 
     time_s: Array
     displacement_mm: Array

@@ -91,7 +91,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Record all sweeps, write the training CSV, and return the number of rows.
+    """Record all sweeps, write the training CSV `options.out`, and return the number of rows; a missing folder is made.
 
     Raises PlantError, ConfigError, DomainError, OSError, and RuntimeError where the device faults.
     """

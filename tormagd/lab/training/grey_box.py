@@ -41,7 +41,10 @@ class GreyBox:
 
 
 class GreyBoxMemory:
-    """Relaxation state of a pad while it is driven, in steps of `dt_s`, beginning at rest."""
+    """Relaxation state of a pad while it is driven, in steps of `dt_s`, beginning at rest.
+
+    Holds the model, and the state of both its parts: that without field, and what the field adds.
+    """
 
     def __init__(self, grey: GreyBox, dt_s: float) -> None:
         self._model = grey.model
