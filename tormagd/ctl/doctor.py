@@ -236,7 +236,7 @@ def others(found: Headroom) -> Finding:
 
 
 def core(found: Headroom) -> Finding:
-    """Report what the core's step and plan take of a processor; always OK."""
+    """Report the core's build, what its step and plan take of a processor, and the reference loop beside; always OK."""
     step, plan = found.step_us, found.plan_us
     return Finding(
         "core",

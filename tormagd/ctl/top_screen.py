@@ -108,7 +108,7 @@ def _head(seen: Seen, width: int) -> Text:
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
     """Return a row for each curve: name, newest value, sparkline of `rows` lines, and the ends of its scale.
 
-    The ends are left out below NARROW. `is_apart` puts an empty row between curves.
+    Curves of one scale share its ends, which are left out below NARROW. `is_apart` puts an empty row between curves.
     """
     ends_wide = ENDS if width >= NARROW else 0
     count = max(width - LABEL - VALUE - ends_wide - 3, 8)

@@ -101,7 +101,7 @@ class Live:
                 self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
 
     async def _every(self, period_s: float, look: Callable[[], Awaitable[None]]) -> None:
-        """Call `look` every `period_s` while the daemon is heard; a client's error is passed over.
+        """Call `look` every `period_s`, without end, while the daemon is heard; a client's error is passed over.
 
         Requests to a silent daemon would wait, and come at once.
         """

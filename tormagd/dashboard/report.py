@@ -60,7 +60,8 @@ def report(of: Sequence[Reported]) -> str:
 
 
 def _sealed(of: Reported) -> str:
-    """Say in HTML what the seals tell, and why a recording was cut or thinned."""
+    """Say in HTML what the seals tell, and why a recording was cut or thinned; one that is not sound is marked as
+    bad."""
     kind = "" if of.seal.is_sound else ' class="bad"'
     cut = of.file.metadata.get(CUT, "")
     notes = [cut and f"cut by: {cut}", of.file.metadata.get(THINNED, "") and f"thinned: {of.file.metadata[THINNED]}"]

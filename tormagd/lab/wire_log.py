@@ -101,8 +101,8 @@ class WireLog:
 def virtual_session(seconds: float, log: WireLog) -> None:
     """Run a session of the virtual device for `seconds` of virtual time, and log its frames in `log`.
 
-    The host connects, homes, enables and follows a swinging force; the seconds count from then on. Raises RuntimeError
-    if the device does not arm.
+    The host connects, homes, enables and follows a swinging force. All of that is logged, and the seconds count from
+    enabling on. Raises RuntimeError if the device does not arm.
     """
     config = load_config(None)
     core = build_core(config)

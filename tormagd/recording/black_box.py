@@ -211,7 +211,10 @@ class _Reading:
         self._size = self._parts = 0
 
     def take(self, record: Record) -> None:
-        """Take a record that is no message: channels and the header. Raises ValueError where `/core` is not msgpack."""
+        """Take a record that is no message: note a channel's topic, add to the header; others pass.
+
+        Raises ValueError where `/core` is not msgpack, and as `Record.read` for damage.
+        """
         if record.opcode == Opcode.CHANNEL:
             channel = record.read(Channel)
             if channel.topic == CORE_TOPIC and channel.message_encoding != "msgpack":

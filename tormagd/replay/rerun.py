@@ -167,8 +167,10 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
 
 
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
-    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first. Raises
-    ReplayError."""
+    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first.
+
+    Raises ReplayError where no snapshot has a tick after it.
+    """
     found: int | None = None
     waiting: int | None = None
     for place, entry in enumerate(entries):

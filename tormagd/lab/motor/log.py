@@ -62,7 +62,10 @@ def read_log(path: Path) -> Log:
 
 
 def _read_mat(path: Path) -> Log:
-    """Read an EMPS .mat file, with its gain. Raises LabError for one that is unreadable or no such file."""
+    """Read an EMPS .mat file, with its gain.
+
+    Raises LabError for a file that is unreadable, without t, vir, qm and gtau, or with columns of different lengths.
+    """
     try:
         require_regular(path, MOST_TABLE_BYTES)
         data = loadmat(path)

@@ -60,7 +60,11 @@ class Trained:
 
 
 def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
-    """Train both models on the training part of the random split of made cycles with sensor noise `noise_N`, N."""
+    """Train the network on made cycles of the three pads, and the relaxation-aware model on those of the pad in use.
+
+    The latter also learns from relaxation tests of its pad. Both learn from the training part of the random split;
+    `noise_N`, N, is the sensor's noise, drawn by `seed`.
+    """
     cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
     data = cycles.data
     known = ~random_split(len(data), SPLIT_SEED)

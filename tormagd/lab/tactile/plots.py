@@ -49,7 +49,8 @@ def _fit(trained: Trained) -> Figure:
 
 
 def _pulse(traces: dict[str, Array]) -> Figure:
-    """Draw the pulse experiment over time: force and displacement, the fields found, their errors."""
+    """Draw the pulse experiment over time: force and displacement, the fields found, their errors, and where those are
+    not scored."""
     time_s = traces["time_s"]
     figure, (inputs, fields, errors) = subplots((11.0, 9.0), 3, 1, sharex=True)
     inputs.plot(time_s, traces["force_N"], color="C3", lw=1, label="force, N")

@@ -72,9 +72,10 @@ class CalibrationError(ValueError):
 def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
     """Return the training rows of sweeps (n x 6, order of COLUMNS, sweep by sweep) in which the handle moves.
 
-    `cycle` is the sweep. `field_mT` is the field law's at the measured gap, in this insert. A rate or a displacement
-    that hardly varied is made constant, so that the network cannot learn from its noise. Raises CalibrationError where
-    the handle hardly moved in a sweep, LabError for too few rows, DomainError for a gap outside the field law.
+    Rows before a sweep's displacement is known are left out; rates have no sign. `cycle` is the sweep, `field_mT` the
+    field law's at the measured gap, in this insert. A rate or a displacement that hardly varied is made constant, so
+    that the network cannot learn from its noise. Raises CalibrationError where the handle hardly moved in a sweep,
+    LabError for too few rows, DomainError for a gap outside the field law.
     """
     _, sweep, _, handle_mm, rate_mm_s, _ = table.T
     rate_mm_s = np.abs(rate_mm_s)
