@@ -60,7 +60,8 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
 def write_answer(text: str, program: str) -> bool:
     """Write to stdout what `program` was asked for; False where that could not be, which stderr is told.
 
-    True also where stdout is closed, or its reader has gone: it meant to.
+    The text is escaped, and a line end added. True also where stdout is closed, or its reader has gone: it meant to.
+    Only an OSError is told: call `write_in_any_encoding` before.
     """
     lost = write_line(text, sys.stdout)
     # a reader that stopped reading meant to; a disk that is full did not

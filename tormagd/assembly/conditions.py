@@ -18,10 +18,11 @@ def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool
 
 
 def is_busy(measurement: Measurement | None, pending: DeviceRequest, stepper: Stepper, output: Duty | None) -> bool:
-    """Tell whether the device homes or opens, or was asked to and has not acknowledged it yet.
+    """Tell whether the device homes or opens, or has not acknowledged a request yet: home, retract or clear.
 
-    `output` is the newest step's, None before the first; `pending` is the unacknowledged request. A device that has
-    homed is busy until a step has taken its positions. Without a `measurement` (None) it is not busy.
+    `pending` is the unacknowledged request. One that is not in `output` yet, the newest step's, None before the first,
+    counts too. A device that has homed is busy until a step has taken its positions, unless it has to home again.
+    Without a `measurement` (None) it is not busy.
     """
     if measurement is None:
         return False

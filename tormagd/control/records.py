@@ -70,7 +70,7 @@ class TimedSetpoint(Value):
         self.wall: Final = wall
 
     def asked_N(self, travel: "Travel") -> float:
-        """Return the force, N, that is asked for a handle with this `travel`.
+        """Return the force, N, that is asked for a handle with this `travel`: its `is_pushing` decides, not its rate.
 
         A handle that withdraws is asked for `withdraw_N`. Where that is None, it is asked for the wall's friction, or
         for `force_N` without a wall: a brake cannot push the handle back.

@@ -81,8 +81,9 @@ class Running(NamedTuple):
 
 
 def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_s: float, measure: bool) -> Outcome:
-    """Check this machine, and with `measure` also which rates it holds; the outcome is REFUSED where a check failed.
+    """Check this machine, and with `measure` also which rates it holds; return the report as text and result.
 
+    The outcome is REFUSED where a check failed.
     Judges the configuration of the daemon that answers, else `config`, read from `config_file`; None means the
     defaults. A daemon that cannot be asked is a warning. Raises CommandError where the measurement fails.
     """

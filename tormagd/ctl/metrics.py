@@ -109,7 +109,10 @@ def _family(
 
 
 def _families(status: Status) -> Iterator[Metric]:
-    """Yield every metric of a status, in base units (s, N, m, T). An unknown value has no sample."""
+    """Yield the metrics of a status that are numbers, faults or limits, in base units (s, N, m, T).
+
+    One whose value is unknown is left out; of one with labels its head is yielded all the same.
+    """
     link, setpoints, rates, followed = status.link, status.setpoints, status.rates, status.following
     error_N, aligned_N, delay_ms = (None, None, None) if followed is None else msgspec.structs.astuple(followed)
     sources, trip_us = setpoints.by_source, status.link.round_trip_us

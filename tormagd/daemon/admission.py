@@ -284,7 +284,8 @@ class Admission:
     def _watch(self, known: _Connections) -> None:
         """Handle the waiting events of one endpoint's monitor, AT_ONCE at most: connected, closed, handshake failed.
 
-        Counts refused peers, and cuts off connections beyond the allowed number.
+        Cuts off connections beyond the allowed number. A peer counts as refused once its connection is closed; a
+        publisher that comes back at once to an open endpoint counts in `oversize`.
         """
         for _ in range(AT_ONCE):
             if not self._arrivals.has(known.monitor):
@@ -345,7 +346,10 @@ class Admission:
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
     def _count_oversize(self, name: str, address: str) -> None:
-        """Count a message that was too long where a publisher's address returns within RECONNECT_S of leaving."""
+        """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget that leaving.
+
+        Only for the endpoint `setpoint`. A program that quickly opens another socket counts, too.
+        """
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
         # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
         # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes

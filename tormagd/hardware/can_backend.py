@@ -248,7 +248,8 @@ DRIVER = Driver(CanOptions, open_can, check_can)
 def _of_the_interface(options: CanOptions) -> dict[str, Any]:
     """Return the arguments that `can.Bus` takes for this interface alone; none for one that is not named here.
 
-    With them `recv(0)` does not block; an interface that is not named here must not block by itself.
+    With them `recv(0)` does not block; an interface that is not named here must not block by itself. On socketcan only
+    frames of `options.node` are then received; udp_multicast does not leave this machine.
     """
     fitting: dict[str, dict[str, Any]] = {
         # other nodes' frames need not wake the daemon
@@ -282,7 +283,7 @@ def _hold(path: str) -> int:
 def _errno(error: BaseException | None) -> int | None:
     """Return the errno of the system's error behind one of python-can's; None where there is none.
 
-    It is the first above 0, from `error` on along its causes.
+    It is the first above 0, from `error` on along `__cause__`: an error raised without `from` is not looked behind.
     """
     while error is not None:
         number = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)

@@ -49,10 +49,10 @@ async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
 
 
 async def lateness(realtime: RealTime, rate_hz: int, seconds: float) -> Lateness:
-    """Measure for `seconds` how late a bare timer of `rate_hz` beats, us; WARM_UP_BEATS are left out.
+    """Measure for `seconds` how late a bare timer of `rate_hz` beats: return each beat's lateness, us.
 
-    Returns also how many beats were missed, and what scheduling of `realtime` the kernel refused. The thread keeps what
-    it was granted.
+    WARM_UP_BEATS are left out. Returns also how many beats were missed, and what scheduling of `realtime` the kernel
+    refused. The thread keeps what it was granted.
     """
     not_granted = prepare(realtime)
     late_us: list[float] = []

@@ -19,14 +19,15 @@ Batch = Callable[[ForceCurve], Floats]
 def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[np.float64]:
     """Return fields from least to greatest, mT, evenly spaced by `step_mT` or a little less, both ends included.
 
-    Raises `DomainError` on an empty or non-finite range, a step that is not positive, or more than 100,000 points.
+    Raises `DomainError` unless both ends are finite and the least is below the greatest. Also for a step that is not
+    above 0, is greater than the range, or makes more than 100,000 points.
     """
     low, high = field_range_mT
     require_number("field_range_mT", low)
     require_number("field_range_mT", high)
     require_that(low < high, "field_range_mT", field_range_mT, "a least field below the greatest")
     require_that(
-        0 < step_mT <= high - low and (high - low) / step_mT < MAX_GRID_POINTS,
+        0 < step_mT <= high - low and (high - low) / step_mT <= MAX_GRID_POINTS - 1,
         "step_mT",
         step_mT,
         f"above 0, at most the range ({high - low:g} mT), at most {MAX_GRID_POINTS} points",

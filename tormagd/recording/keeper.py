@@ -77,7 +77,9 @@ class Keeper:
     def run(self) -> None:
         """Keep and write black boxes until the daemon ends, then write all that is still due.
 
-        Each file is written in a thread of its own, one at a time.
+        Files are written one at a time, in a thread of their own. Those still due when the daemon begins anew or ends
+        are written at once, in this thread. A daemon that goes without End leaves a file named DAEMON-DIED, where parts
+        are kept. Raises msgspec.MsgspecError for a packet that does not decode.
         """
         while self._hear():
             if self._writing is not None and self._writing.is_alive():
@@ -137,9 +139,10 @@ class Keeper:
                 self._answer(Written(said.name, f"{said.name}: {MOST_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
-        """Write one black box, delete files beyond MOST_FILES, and answer the daemon; a failure is logged and answered.
+        """Write one black box, delete files beyond MOST_FILES, and answer the daemon.
 
-        Makes the folder where there is none, and makes this thread nicer. Without parts it fails.
+        Every failure is logged and answered, also that of deleting an old file once the new one is written. Makes the
+        folder where there is none, and makes this thread nicer. Without parts it fails.
         """
         from tormagd.recording.black_box import write_black_box
 
@@ -154,8 +157,8 @@ class Keeper:
             write_black_box(folder / write.name, details, parts, _key(begun.key))
             for old in sorted(folder.glob("*Z-*.mcap"))[:-MOST_FILES]:
                 old.unlink()
-        except OSError as error:
-            refusal = f"{folder / write.name}: {error.strerror}"
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            refusal = f"{folder / write.name}: {getattr(error, 'strerror', None) or error!r}"
             write_line(f"tormagd: no black box: {refusal}", sys.stderr)
         self._answer(Written(write.name, refusal))
 

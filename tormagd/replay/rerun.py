@@ -324,10 +324,10 @@ class _Running:
 
 
 def measurement_of(record: TickRecord) -> Measurement | None:
-    """Return the measurement that a tick's step was given; None where it had none.
+    """Return the measurement that a tick's step was given; None where the record has no number of one.
 
-    Raises ValueError where only part of a measurement is recorded, KeyError for an unknown mode, switch or device
-    fault.
+    Raises ValueError where there is a number and another part is missing, KeyError for an unknown mode, switch or
+    device fault.
     """
     if record.measurement is None:
         return None

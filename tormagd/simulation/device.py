@@ -292,8 +292,8 @@ class MessageDevice:
     def _sensors(self) -> Sensors:
         """Return what the electronics measure now, faults included.
 
-        Encoders count from the firmware's last boot. End switches follow the carriages' true places. Force is the
-        sensor's reading, the temperature the element's.
+        The carriages' encoders count from the firmware's last boot, the handle's from power-on. End switches follow the
+        carriages' true places. Force is the sensor's reading, the temperature the element's.
         """
         plant, struck = self.plant, self._struck
         left_m, right_m = plant.left.position_m, plant.right.position_m
@@ -324,8 +324,9 @@ class MessageDevice:
         return math.floor(self.plant.handle_mm * self._handle_counts_per_mm)
 
     def _reset(self, time_s: float) -> None:
-        """Boot the firmware again: mode, zero, clock and pending answers are lost, and encoders count from here.
+        """Boot the firmware again: mode, zero, clock and pending answers are lost.
 
+        The carriages' encoders count from here, the handle's goes on.
         Faults of the device, and messages on their way to it, stay.
         """
         self.firmware = self._boot(self.parameters)

@@ -176,6 +176,7 @@ def run(
 ) -> int:
     """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints in `mode` `back`.
 
+    Before a first motion has arrived no setpoint is sent, from then on one every period, for the motion sent last.
     Returns the number of setpoints that `client` published. A setpoint that arrives after a later one is dropped; its
     stamp is the time when it was sent. `is_over` is asked with seconds of `clock_s`; `wait` sleeps for seconds. Raises
     what `client` raises.

@@ -249,7 +249,7 @@ class Governor:
     def _foreseen(self, stamp_s: float, allowed_N: float, age_s: float) -> float:
         """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1.
 
-        0 without the term forecast, and for a setpoint older than MAX_STEP_S.
+        0 without the term forecast, and for a setpoint older than MAX_STEP_S, which the forecast takes all the same.
         """
         if not self._has_forecast:
             return 0.0

@@ -177,7 +177,9 @@ class Believe:
         """Learn from `measured`, where it is new, and return the belief at `now_s`.
 
         `measured` is None while the device is silent: nothing is learned. A device that is not homed teaches no force.
-        The element's memory follows the measured gap. Raises DomainError for a gap outside the field law's range.
+        While `learns` is False, fit, slow friction and zero stay. An old force, or one within MIN_DT_S of the last,
+        teaches only the watch on the encoder. The element's memory follows the gap of a homed device. Raises
+        DomainError for a gap outside the field law's range.
         """
         model_N: float | None = None
         if measured is not None:

@@ -59,7 +59,8 @@ class SlowFriction:
     def follow(self, model_N: float, handle_mm: float) -> None:
         """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`.
 
-        A fall is followed at once, a rise with the handle's travel since the last call, over REACH_MM.
+        A fall is followed at once, a rise by 1 - exp(-travel / REACH_MM), with the handle's travel since the last call.
+        The first call counts from 0 mm and 0 N.
         """
         rise_N = model_N - self.followed_N
         if rise_N > 0.0:

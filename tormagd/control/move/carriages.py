@@ -193,9 +193,10 @@ class Carriages(Actuator):
         self.acceleration_scale = min(max(scale, 1.0), MAX_ACCELERATION_SCALE)
 
     def _feed_forward(self, reference: Reference, pull: float) -> float:
-        """Return the duty for the reference's speed and acceleration, with friction and the magnets' `pull`, a duty.
+        """Return one carriage's duty, positive to open and not limited, at the nominal supply.
 
-        The pull counts only to open. The duty is 0 in a scene without the term `motor`.
+        It is for half the reference's speed and acceleration, with friction and the magnets' `pull`, a duty. The pull
+        counts only to open; both fade below COULOMB_SPEED_MM_S. The duty is 0 in a scene without the term `motor`.
         """
         if not self._has_motor:
             return 0.0

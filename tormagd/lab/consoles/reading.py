@@ -25,7 +25,10 @@ def files(url: str) -> dict[str, str]:
 
 
 def read(url: str) -> Summary | str:
-    """Read the recording at `url` and return its summary, or the reason, in words, why there is none."""
+    """Read the recording at `url` and return its summary, or the reason, in words, why there is none.
+
+    Raises ImportError for a kind of address whose package is missing.
+    """
     name = url.rpartition("/")[2]
     try:
         system, path = fsspec.core.url_to_fs(url)

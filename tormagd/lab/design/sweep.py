@@ -13,7 +13,7 @@ from tormagd.lab.executors import finished
 def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
     """Solve every run and return the outcomes in the order of the runs; equal runs are solved once.
 
-    Raises whatever a run raised; runs that have not begun are then cancelled.
+    Raises what the first run to fail, in time, raised; runs that have not begun are then cancelled.
     """
     wanted = list(dict.fromkeys(runs))
     outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}

@@ -40,9 +40,9 @@ def run(options: argparse.Namespace) -> Found:
     """Identify the motor from the log `options.log` and return its parameters, as `identify`; write configuration and
     plot if asked.
 
-    `options.gain` None takes the log's own, if any. Raises LabError where the log cannot be used, or the new
-    configuration not written. Raises ConfigError where the present one is refused, OSError where the plot cannot be
-    written.
+    `options.gain` None takes the log's own, if any. Raises LabError where the log cannot be used, and where a
+    configuration is asked for with a gain, from a log without current, or at a file that exists. Raises ConfigError
+    where the present one is refused, OSError where the plot cannot be written.
     """
     log = read_log(options.log)
     result = identify(log, options.gain if options.gain is not None else log.gain_N_V)

@@ -26,6 +26,7 @@ NOISES_N = (0.05, 0.5)
 def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]:
     """Run the experiment; return its figures as plain data, what table 4.1 was trained on, and the pulse's traces.
 
+    Table 4.1 is of the last of NOISES_N, the hold of the first.
     A quick effort takes fewer rows and epochs and holds for a minute: it shows that all runs, not how well. Limits
     torch to one thread. Raises ModuleNotFoundError where heartpy is not installed.
     """

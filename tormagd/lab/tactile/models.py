@@ -62,8 +62,9 @@ class Trained:
 def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
     """Train the network on made cycles of the three pads, and the relaxation-aware model on those of the pad in use.
 
-    The latter also learns from relaxation tests of its pad. Both learn from the training part of the random split;
-    `noise_N`, N, is the sensor's noise, drawn by `seed`.
+    The latter also learns from relaxation tests of its pad. Both learn from the training part of the random split.
+    `noise_N`, N, is the sensor's noise. `seed` draws that of the cycles only: the noise of the relaxation tests and the
+    split are the same for every `seed`. Returns the cycles and both models.
     """
     cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
     data = cycles.data

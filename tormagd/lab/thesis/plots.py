@@ -19,7 +19,7 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
     """Draw every picture of the page, from the `result` of `reproduction.run`, and return figures by the names of
-    files."""
+    files, without an ending. Raises ModuleNotFoundError without matplotlib."""
     return {
         "table_2_4": _table_2_4(result["table_2_4"]),
         "figure_2_5": _figure_2_5(result["figure_2_5"]),
