@@ -98,6 +98,7 @@ check: $(VENV)/.dev
 	$(BIN)/python -P -m ruff check .
 	$(BIN)/python -P -m ruff format --check .
 	$(BIN)/python -P -m mypy
+	$(BIN)/python -P tools/prose.py
 	$(SITE) --site-dir build/checked_site
 
 # the documentation as a site, in build/site

@@ -2,8 +2,8 @@
 
     publisher --ZeroMQ--> tormagd --serial, a pty--> virtual firmware --> plant
 
-Hardware is simulated. Each part is a process of its own, as it would be beside a console; `rendering/show.py` starts
-them and watches, `rendering/live_touch.py` has the hand, which decides nothing, this one judges the pulse and sums up.
+Hardware is simulated. Each part is a process of its own, as it would be beside a console. `rendering/show.py` starts
+them and watches. `rendering/live_touch.py` has the hand, which decides nothing. This one judges the pulse and sums up.
 What is called rendered is the plant's friction force at the roller, never the controller's prediction. A show that the
 host disturbed is told as that, and started again; the same pulse in virtual time needs no host. At the end the ordered
 loops are shown, for some seconds each: the search in torch, and the thesis's own; they decide nothing.
@@ -49,7 +49,7 @@ MARGIN = 0.1
 """The control loop may keep this much less of its periods than the worst bare timer: it computes, the timer does not.
 Measured: 0.4% less on a quiet machine, 3 to 9% less beside four busy loops, over 50% less with 2 ms more in a tick."""
 MOST_SPACING = 1.5
-"""Time between the fastest ticks, periods, above which the software itself is slow: a host takes at times, and between
+"""Time between the fastest ticks, periods, above which the software itself is slow. A host takes at times, and between
 them even software that starves keeps the period."""
 THESIS_GAP_SPEED_MM_S = 8.33
 SCENES = Path(__file__).parents[1] / "examples" / "scenes"

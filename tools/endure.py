@@ -1,7 +1,7 @@
 """What takes long and breaks things, one case at a time: does it hold?
 
-The tests run the same cases with smaller counts. A case in real time says what its host took meanwhile, and a fault
-that nobody asked for is held against the host where a bare timer stood still with it for half of what a device waits.
+The tests run the same cases with smaller counts. A case in real time says what its host took meanwhile. A fault that
+nobody asked for is held against the host where a bare timer stood still, too. That is for half of what a device waits.
 Exit status 0 if all held.
 """
 

@@ -3,12 +3,12 @@
     envelope.py [--quick] [--json] [--picture FILE.png]
     envelope.py --models [--json]
 
-Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this
-device brakes with its gap open at this speed; *arrived* is 0.2 s after an ideal carriage would have. Devices are the
-three samples and random draws around sample 1 (plant card). Sample 1 and draws 0 to 39 were looked at while constants
-were chosen; samples 2 and 3 and the draws from 40 on only judge. The second plant, of other structure, is told apart
-and keeps no bound. All devices are synthetic. `--models` asks only how near the model of each insert is to devices
-without a loop around it: samples 2 and 3 and draws 100 to 119.
+Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this device
+brakes with its gap open at this speed. *Arrived* is 0.2 s after an ideal carriage would have. Devices are the three
+samples and random draws around sample 1 (plant card). Sample 1 and draws 0 to 39 were looked at while constants were
+chosen. Samples 2 and 3 and the draws from 40 on only judge. The second plant, of other structure, is told apart and
+keeps no bound. All devices are synthetic. `--models` asks only how near the model of each insert is to devices without
+a loop around it. These are samples 2 and 3 and draws 100 to 119.
 """
 
 import argparse
@@ -49,8 +49,8 @@ STILL_MM_S = 1e-6
 GAP_MM_S, GAP_MM_S2, STROKE_MM = 38.0, 1600.0, 30.0
 "An ideal carriage takes the way from 0.7 to 2 N, the longest asked for at once, with the configured speed."
 BOUNDS = {"over_N": 0.25, "over_sample_1_N": 0.15, "peak_N": 2.6, "settled_N": 0.1, "low_hold_faults": 0}
-"""What has to hold: excess over what was asked on any device and on sample 1, the greatest force at all (1.25 times the
-scene's and 0.1 N), the error after SETTLED_S of sliding, and no fault below F_min."""
+"""What has to hold: bounds of the excess over what was asked, on any device and on sample 1. Then come the greatest
+force at all (1.25 times the scene's and 0.1 N), the error after SETTLED_S of sliding, and the faults below F_min."""
 LOW_HOLD_S, QUICK_LOW_HOLD_S = 600.0, 20.0
 LOW_N = (0.2, 0.5)
 "Forces under F_min."
@@ -85,10 +85,14 @@ class Case(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """Of one run. `over_N`: greatest excess over what was asked for more than OVER_S, arrived; `peak_N`: the greatest
-    force at all while the handle moves; `settled`: error by speed and force after SETTLED_S of sliding (mm/s, N, N);
-    `slow_N`: the same at slower handles; `steps_N`: of a steady hand, the error 1 s after the step to 2 N, the same
-    after the next such step, and the most that the first overshoots."""
+    """What one run showed.
+
+    over_N    the greatest excess over what was asked for more than OVER_S, arrived
+    peak_N    the greatest force at all while the handle moves
+    settled   error by speed and force after SETTLED_S of sliding: mm/s, N, N
+    slow_N    the same at slower handles
+    steps_N   of a steady hand: the error 1 s after the step to 2 N, after the next, and how far the first overshoots
+    """
 
     over_N: float
     under_N: float
@@ -253,7 +257,7 @@ def worst(found: list[tuple[Case, Figures]]) -> Json:
 
 
 def settled(found: list[tuple[Case, Figures]]) -> list[tuple[float, float, float]]:
-    """Speed, force and error of those that were asked for as it is: where a publisher says another motion than the
+    """Speed, force and error of those that were asked for as it is. Where a publisher says another motion than the
     handle's, it gets the force for that."""
     as_it_is = [figures for case, figures in found if case.displacement_mm is None and case.rate_mm_s is None]
     return [point for figures in as_it_is for point in figures.settled]
@@ -290,8 +294,8 @@ def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None
 
 
 def main() -> int:
-    """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted; of models, if none falls with
-    the field anywhere in its box."""
+    """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted. Of models it is 0 if none falls
+    with the field anywhere in its box."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a sample of it: two draws, short holds")
     parser.add_argument("--json", action="store_true", help="print JSON")

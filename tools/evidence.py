@@ -45,11 +45,11 @@ class Part(NamedTuple):
 PARTS = {
     "fuzz": Part(
         "tools/endure.py fuzz --json",
-        "{frames:,} damaged frames: {false_accepts} false accepts; {second_lost} of {runs_of_damage:,} runs of damage "
-        "not over after two frames; C and Python differ {languages_differ} times",
+        "{frames:,} damaged frames: {false_accepts} false accepts. {second_lost} of {runs_of_damage:,} runs of damage "
+        "not over after two frames. C and Python differ {languages_differ} times",
     ),
     "replug-serial": Part(
-        "tools/endure.py replug-serial --json", "{cycles} cycles; lost after {lost_after_ms} ms at most"
+        "tools/endure.py replug-serial --json", "{cycles} cycles. Lost after {lost_after_ms} ms at most"
     ),
     "replug-can": Part("tools/endure.py replug-can --json", "{cycles} cycles; lost after {lost_after_ms} ms at most"),
     "stalls": Part(
@@ -60,8 +60,8 @@ PARTS = {
     "faults": Part("tools/faults.py --json", "all cells: [the matrix](../fault-matrix.md)", is_kept=True),
     "numerics": Part(
         "tools/numerics.py --json",
-        "{cases:,} cases, {reference_cases:,} references; worst relative error float64 {worst_rel_error[float64]:.1e}, "
-        "float32 {worst_rel_error[float32]:.1e}, float32_soft {worst_rel_error[float32_soft]:.1e}; {stage_cases:,} "
+        "{cases:,} cases, {reference_cases:,} references. Worst relative error float64 {worst_rel_error[float64]:.1e}, "
+        "float32 {worst_rel_error[float32]:.1e}, float32_soft {worst_rel_error[float32_soft]:.1e}. {stage_cases:,} "
         "hostile steps of the core's stages: {travelled} numbers travelled",
     ),
     "inverse": Part(
@@ -73,7 +73,7 @@ PARTS = {
     ),
     "envelope": Part(
         "tools/envelope.py --json --picture docs/images/envelope.png",
-        "{cases} runs on samples and {draws} draws: over what was asked by {over_N:.3f} N at most, at most "
+        "{cases} runs on samples and {draws} draws. Over what was asked by {over_N:.3f} N at most, at most "
         "{peak_N:.2f} N at all, {settled_N:.3f} N off after 2 s of sliding, {low_hold_faults} faults below F_min",
     ),
     "models": Part(

@@ -1,10 +1,10 @@
-"""The fault matrix: each fault on a serial line and on a CAN bus, in virtual time: its name, how it ends safe, and what
-leads out of it.
+"""The fault matrix: each fault on a serial line and on a CAN bus, in virtual time. It shows its name, how it ends safe,
+and what leads out of it.
 
-Driven faults are injected at 1.8 N, and times count from then; the others are there from the beginning, and times count
-from the command `home`. What is safe is stated for each, and by when the reaction has to be on its way: what the table
-of codes says of the code that is named, or what the injection says itself. How fast the force is lost on the way is
-measured too: a force that vanishes at once is a hazard of its own.
+Driven faults are injected at 1.8 N, and times count from then. The others are there from the beginning, and times count
+from the command `home`. What is safe is stated for each, and by when the reaction has to be on its way. It is what the
+table of codes says of the code that is named, or what the injection says itself. How fast the force is lost on the way
+is measured too: a force that vanishes at once is a hazard of its own.
 """
 
 import argparse

@@ -2,13 +2,13 @@
 
     force_tracking.py [CASE ...] [--draws N] [--json]
 
-How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
-another, and of draws of the plant card; without draws, where an hour of `drift` of the force sensor leads. How well
-signals are followed: the `pulse` of `make run` on all of these, and in full on the `samples` and the second plant, 500
-setpoints a second, with a preview of 70 ms and live; recorded `signals` from the folder that TORMAG_DATA names, with
-400 ms, as a publisher can that plays a file, and live.
-Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does with carriages
-that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
+How soon a device is known: `steps`, `creep` and `speeds`, of samples, second plant (its structure is another) and draws
+of the plant card. Without draws it shows where an hour of `drift` of the force sensor leads. How well signals are
+followed: the `pulse` of `make run` on all of these, and in full on the `samples` and the second plant. There are 500
+setpoints a second, with a preview of 70 ms and live. Recorded `signals` from the folder that TORMAG_DATA names, with
+400 ms, as a publisher can that plays a file, and live. Beside them stands what ideal carriages miss (`bound.py`), and
+beside `samples` what the same core does with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the
+second plant only judge. All devices are synthetic.
 """
 
 import argparse

@@ -1,24 +1,23 @@
 """Numbers at their extremes: the force law against 50 digits, every stage of the core fed with what is no number,
 configurations at their ends.
 
-`stages` has a row for each stage of the core: `cases`, steps with NaN, infinities, denormals, zeros, largest floats,
-time that stands or goes back, tables that do not rise; of them `refused` by name; `stated`, those after which a limit
-or a fault was told; `nonfinite`, numbers that came out; `swallowed`, steps with NaN of which nothing was said;
-`unnamed`, errors that name nothing. Of a stage with a `border` the cases are those that pass that check.
-`configurations`: each end of what is accepted, alone and in pairs, is `refused`, or it `ran` for `--seconds` in virtual
-time, or a fault or a refusal to enable was `stated`.
-`travelled` is what must be 0: all `nonfinite`, `swallowed`,
-`unnamed` and `wrong`.
+`stages` has a row for each stage of the core. `cases` are steps with NaN, infinities, denormals, zeros, largest floats,
+time that stands or goes back, and tables that do not rise. Of them some are `refused` by name, and after those that are
+`stated` a limit or a fault was told. `nonfinite` are numbers that came out, `swallowed` steps with NaN of which nothing
+was said, `unnamed` errors that name nothing. Of a stage with a `border` the cases are those that pass that check.
+`configurations` has each end of what is accepted, alone and in pairs. It is `refused`, or it `ran` for `--seconds` in
+virtual time, or a fault or a refusal to enable was `stated`. `travelled` is what must be 0: all `nonfinite`,
+`swallowed`, `unnamed` and `wrong`.
 
-`--json` prints one object. `cases` inputs are evaluated as arrays in float64 and float32; `reference_cases` of them are
-computed in 50 digits from the formulas as printed, and compared with the arrays' float64 and with plain floats.
-float32 is compared with float64 at the same input, all cases.
+`--json` prints one object. `cases` inputs are evaluated as arrays in float64 and float32. `reference_cases` of them are
+computed in 50 digits from the formulas as printed, and compared with the arrays' float64 and with plain floats. float32
+is compared with float64 at the same input, all cases.
 
-Allowed relative error, for force, stretch, slope and the round trip gap -> force -> gap: float64 1e-12; float32
-1e-5 for lambda1 >= 0.7 and 3e-4 down to 0.05; in both 8 eps kappa where that is more, with kappa the condition number
-of the quantity there. Of the round trip, kappa is that of its worse half, since the radial moment between is rounded
-too: at the flat end of Eq. 7 the gap hardly shows in the force. `worst_rel_error` is over the cases where the plain
-bound holds.
+Allowed relative error, for force, stretch, slope and the round trip gap -> force -> gap: float64 1e-12. For float32 it
+is 1e-5 for lambda1 >= 0.7 and 3e-4 down to 0.05. In both it is 8 eps kappa where that is more, with kappa the condition
+number of the quantity there. Of the round trip, kappa is that of its worse half, since the radial moment between is
+rounded too: at the flat end of Eq. 7 the gap hardly shows in the force. `worst_rel_error` is over the cases where the
+plain bound holds.
 
 Exit status 0 if every error is allowed, nothing is NaN or infinite, nothing travelled, and the domain ends where it
 should; 1 otherwise.

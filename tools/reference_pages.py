@@ -67,8 +67,8 @@ def tables(kind: type[msgspec.Struct], path: str) -> Iterator[tuple[str, type[ms
 
 
 def keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str, str]]:
-    """The keys of one table, without the tables in it: name, default as TOML has it, what is allowed, and why, which is
-    empty where the source says nothing."""
+    """The keys of one table, without the tables in it. A row has name, default as TOML has it, what is allowed, and
+    why, which is empty where the source says nothing."""
     says = _field_docs(kind)
     hints = get_type_hints(kind, include_extras=True)
     return [

@@ -38,8 +38,8 @@ def page() -> str:
             [_row(name, known[name], file) for name in shipped_scenes() if name in known],
         ),
         "*RMS* is of the true force for the scene's own signal, mN, on the worst of samples 1 to 3 while the device is "
-        "learned; **bold** where the scene is not met. *Share* is processor time of all processes of the daemon over "
-        f"wall time, the median of {file.pairs} runs on the simulated device, beside a `machine_us` of "
+        "learned. **Bold** is where the scene is not met. *Share* is processor time of all processes of the daemon "
+        f"over wall time, the median of {file.pairs} runs on the simulated device, beside a `machine_us` of "
         f"{file.machine_us:g}. *Usual* is {file.scenes[0].usual.way}.",
         f"![error over the daemon's share](<{TRADE.as_posix()}>)",
         "A point is a scene served in one way: its error as a share of its tolerance, over what the daemon takes. The "

@@ -29,8 +29,8 @@ class Device(Strict, frozen=True):
     options: dict[str, Any] = msgspec.field(default_factory=dict)
     "The backend's own settings; what they are and may be is the backend's to say."
     profiles: str = ""
-    """Folder in which it is kept what each device has shown of itself; without one that of the service
-    ($STATE_DIRECTORY/profiles), and where there is none nothing is kept."""
+    """Folder for the profiles: what each device has shown of itself. Without one it is the service's,
+    $STATE_DIRECTORY/profiles. Where there is none nothing is kept."""
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0
@@ -121,8 +121,8 @@ class Motor(Strict, frozen=True):
     coulomb_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
     "Voltage that just overcomes the dry friction of gearbox and screw."
     pull_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
-    """Voltage that the magnets' pull takes besides at a gap of 45 mm, to open: 50 to 80 N through a screw with an
-    efficiency of 0.65, the gears and R / Ke come to 0.40 to 0.64 V."""
+    """Voltage that the magnets' pull takes besides at a gap of 45 mm, to open. A pull of 50 to 80 N, a screw with an
+    efficiency of 0.65, the gears and R / Ke make 0.40 to 0.64 V."""
 
 
 class Position(Strict, frozen=True):

@@ -110,7 +110,7 @@ def _number(path: Path, line: int, name: str, text: str, least: float, most: flo
     """Return `text` as a finite number from `least` to `most`.
 
     Raises ForceFileError for any other text, also for digits with underscores. Its message names the file at `path`,
-    the row `line` and the column `name`; for a number out of range also what is allowed, in `unit`.
+    the row `line` and the column `name`. For a number out of range it has also what is allowed, in `unit`.
     """
     try:
         value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else

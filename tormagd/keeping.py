@@ -10,7 +10,7 @@ READ, WROTE = "read", "wrote"
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
     """First message of the daemon: the folder for black boxes, the header of each, and the file of the key that seals
-    them; empty for none."""
+    them. Empty texts stand for none."""
 
     folder: str
     header: dict[str, str]

@@ -1,5 +1,5 @@
-"""Rings the terminal's bell for who looks at the patient and at no screen: once for a limit that comes, and every two
-seconds while the device is in FAULT or nothing is heard.
+"""Rings the terminal's bell for who looks at the patient and at no screen. It rings once for a limit that comes, and
+every two seconds while the device is in FAULT or nothing is heard.
 
     python cue.py FOLDER [LIMIT ...]     where the daemon's sockets are, and which limits are to be heard
 """

@@ -1,7 +1,7 @@
 """The workload of `benchmark inverse`: a plant, networks trained on it, a course of forces, the networks' own roots.
 
 Synthetic. The plant is the simulator's torque element at rest in memory: its force law, field law, pre-sliding and
-Stribeck friction, without hysteresis and relaxation, which no search could undo and which would hide the searches.
+Stribeck friction. Hysteresis and relaxation are left out, which no search could undo and which would hide the searches.
 """
 
 import datetime

@@ -1,8 +1,8 @@
 """`benchmark latency`: from a setpoint that is sent to the first drive frame that reflects it.
 
-Each setpoint has a force of its own, so that the recording shows the first control tick whose plan used it; the frame
+Each setpoint has a force of its own, so that the recording shows the first control tick whose plan used it. The frame
 of that tick has just been written when its row is stamped. A bare ZeroMQ hop of the same message is measured in the
-same run. Where the daemon has a real-time priority, the publisher and the far end of the hop have a lower one: what is
+same run. Where the daemon has a real-time priority, the publisher and the far end of the hop have a lower one. What is
 measured is the way, not how long a sender waits for a processor.
 
 At worst a setpoint just misses a beat: it waits for the next, which plans for it and writes.
@@ -37,8 +37,8 @@ SETTLE_NS = 500_000_000
 LOST_S = 10.0
 "For a message of the bare hop."
 ALLOWED_US = 400.0
-"""From a setpoint to its frame p99 is to take no longer than the bare hop's of the same run, a control period, which it
-may just have missed, and this: the beat, until it has written."""
+"""From a setpoint to its frame p99 is to take no longer than the bare hop's of the same run, a control period, and
+this. This is the beat, until it has written."""
 PERIOD_US = 1e6 / CONTROL_HZ
 BELOW = 10
 "The measurement's own processes are this far below the daemon's real-time priority."

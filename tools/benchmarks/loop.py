@@ -1,14 +1,16 @@
 """`benchmark loop`: how late the control loop is, beside a bare timer that carries the same clients.
 
 Daemon and stub run in alternating blocks, because a shared machine drifts: what counts is the ratio of a block to its
-neighbour. Both have the same heartbeat, event loop and scheduling, publish a row for each tick, and answer the same
-eight clients, each of which asks for status again as soon as it is answered; the stub has no controller and no device.
+neighbour. Both have the same heartbeat, event loop and scheduling, and publish a row for each tick. Both answer the
+same eight clients, each of which asks for status again as soon as it is answered. The stub has no controller and no
+device.
 
 Processor time is that of the daemon with its threads and children; wake-ups are voluntary switches of its threads. Each
 block has two halves: alone, then with the clients, and a subscriber that reads every tick (recording). A tick is fresh
 whose measurement came since the tick before it. With `--against` the daemon of another checkout takes its turn, on its
-own simulated device: the protocol changes, too. Where there is a C compiler, a host in C (`reference_host.c`) with
-nothing but wire, timer and two PIDs takes its turn on a device of its own: the limit of this wire on this machine.
+own simulated device: the protocol changes, too. Where there is a C compiler, a host in C (`reference_host.c`) takes its
+turn. It has a device of its own, and nothing but wire, timer and two PIDs. It shows the limit of this wire on this
+machine.
 """
 
 import argparse
@@ -92,8 +94,8 @@ class Pair(NamedTuple):
 
 
 class Stand(NamedTuple):
-    """What is measured: scheduling, how often setpoints come, of which checkout daemon and device are, the rates of
-    control and of plans, and the scene (empty: the default)."""
+    """What is measured: scheduling, how often setpoints come, of which checkout daemon and device are, and the rates of
+    control and of plans. An empty scene is the default."""
 
     realtime: RealTime
     setpoint_hz: int = SETPOINT_HZ
@@ -340,7 +342,10 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
 
 @contextlib.contextmanager
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
-    """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
+    """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0).
+
+    Raises RuntimeError where it does not reach its device.
+    """
     with contextlib.ExitStack() as stack:
         theirs = environment(stand.root, folder)
         start = partial(begun, stack, folder / LOG, environment=theirs)

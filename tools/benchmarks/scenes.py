@@ -1,10 +1,10 @@
 """`benchmark scenes`: how exactly, and at what cost of the daemon, each scene is served.
 
 Without options it prints what the package carries. `--live` measures scenes again: the ways to serve one are rates and
-searches. Screened on the scene's own signal and samples 1 to 3, the cheapest way has to do in every situation what the
-usual way does, on devices that decide, or is not chosen; others then judge. An error will do within TOLERATED of
-the scene's tolerance, or where it is at most WORSE of it over the usual way's. `--shares` measures what each way takes
-of a processor: daemons on simulated devices, in turns. `--store` writes the file that comes with the package.
+searches. Ways are screened on the scene's own signal and samples 1 to 3. The cheapest is chosen that does what the
+usual way does in every situation, on devices that decide. Others then judge. An error will do within TOLERATED of the
+scene's tolerance, or where it is at most WORSE of it over the usual way's. `--shares` measures what each way takes of a
+processor: daemons on simulated devices, in turns. `--store` writes the file that comes with the package.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """`benchmark step`: how fast and how exactly the gap follows, on the plant in virtual time.
 
-The device's physical limit comes from the plant itself: full voltage one way, then full voltage the other way, with the
-switch timed so that it comes to rest at the target.
+The device's physical limit comes from the plant itself. It is full voltage one way, then full voltage the other way,
+with the switch timed so that it comes to rest at the target.
 """
 
 import argparse
@@ -89,7 +89,7 @@ def settled_loop(config: Config, parameters: PlantParameters, left_out: tuple[st
 
 
 def step(loop: ClosedLoop, target_mm: float) -> Step:
-    """One step to a gap, from rest."""
+    """One step to a gap, from rest. Raises RuntimeError where nothing was measured yet."""
     before = loop.stepper.measured
     if before is None:
         raise RuntimeError("the loop has no measurement")
@@ -132,8 +132,8 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
 
 def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[Array, Array]:
     """Both carriages' mean position every tick from the start of a duty step, mm: as the encoders count it, and by
-    H(z). There it is the step less the Coulomb duty, and the motor's inertia over the gears' efficiency, because they
-    take their share of the torque that speeds it up.
+    H(z). There it is the step less the Coulomb duty. The motor's inertia is taken over the gears' efficiency, because
+    they take their share of the torque that speeds it up.
     """
     plant = Plant(_at_rest(parameters, MODEL_GAP_MM), SteadyHand())
     volts = duty * parameters.electronics.supply_V

@@ -1,10 +1,10 @@
 """`benchmark virtual-time`: how many times faster than real time the closed loop runs, and what limits it.
 
-The full plant with its firmware and protocol bytes, once under the whole core that follows 500 setpoints a second, once
-under the position loop alone. Each build of the core is a process of its own, and they take turns in stretches of some
-milliseconds: what a shared machine gives at a time, it gives to both.
-Processor time of one thread; the median over stretches, and of their ratios. `python -m cProfile` says where it goes,
-in the interpreted build (`TORMAG_COMPILED=0`).
+The full plant with its firmware and protocol bytes runs twice. Once it is under the whole core that follows 500
+setpoints a second, once under the position loop alone. Each build of the core is a process of its own, and they take
+turns in stretches of some milliseconds. What a shared machine gives at a time, it gives to both. Processor time of one
+thread; the median over stretches, and of their ratios. `python -m cProfile` says where it goes, in the interpreted
+build (`TORMAG_COMPILED=0`).
 """
 
 import argparse
@@ -96,7 +96,10 @@ Stretches = dict[str, dict[str, list[float]]]
 
 
 def compared(plant: str, ticks: int) -> Stretches:
-    """Every build there is, `interpreted` always, `compiled` where there is one, taking turns."""
+    """Every build there is, `interpreted` always, `compiled` where there is one, taking turns.
+
+    Raises RuntimeError where TORMAG_COMPILED=0 does not switch the compiled core off.
+    """
     with contextlib.ExitStack() as stack:
         builds = {"interpreted": stack.enter_context(build(plant, switch="0"))}
         if builds["interpreted"][0]:
@@ -121,7 +124,7 @@ def take_turns(builds: Mapping[str, Callable[[str, int], float]], ticks: int) ->
 
 
 def summary(found: Stretches, period_us: float) -> dict[str, Any]:
-    """The contract's object, null for a build that is not there; `ratio` is one build's factor over the other's, the
+    """The contract's object, null for a build that is not there. `ratio` is one build's factor over the other's, the
     median over stretches; `tick_us` is the median."""
     result: dict[str, Any] = dict.fromkeys(BUILDS)
     for name, loops in found.items():

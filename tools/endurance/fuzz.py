@@ -2,9 +2,10 @@
 
 Every damage starts from valid traffic. After each run of damaged serial frames come two clean ones; the second must
 arrive, or the decoder did not find back in time. A false accept is a message that was not sent, or given twice in a
-row; where the carrier was right, a payload taken for a message that is none. It is allowed as often as chance gives it
-at the odds of the CRC, one judgement in 2^16 or 2^8, and never where the odds are 0: a count that chance exceeds once
-in a million runs. `wrong_frames` had a right CRC-16 and were not sent. They are allowed likewise.
+row. Where the carrier was right, it is a payload taken for a message that is none. It is allowed as often as chance
+gives it at the odds of the CRC, one judgement in 2^16 or 2^8. It is never allowed where the odds are 0. The bound is a
+count that chance exceeds once in a million runs. `wrong_frames` had a right CRC-16 and were not sent. They are allowed
+likewise.
 
 Both languages hear all of it, the C99 under sanitizers, and must agree in every frame, count and verdict.
 """

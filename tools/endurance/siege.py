@@ -1,9 +1,9 @@
 """Who troubles the daemon gets nowhere, and `stop` is heard beside it.
 
-One attack after the other runs as a process of its own: a hundred clients that ask without pause; hostile messages,
-each a valid one with one thing done to it that has to be refused; strangers that show no key, a wrong one, one that is
-not listed or one for something else; 10^5 messages a second to one endpoint. Meanwhile force is held and stopped, over
-and over: nothing but the stop may latch, nothing hostile be taken, and what was refused or dropped is counted.
+One attack after the other runs as a process of its own. A hundred clients ask without pause. Hostile messages are each
+a valid one with one thing done to it that has to be refused. Strangers show no key, a wrong one, one that is not listed
+or one for something else. The last sends 10^5 messages a second to one endpoint. Meanwhile force is held and stopped,
+over and over. Nothing but the stop may latch, nothing hostile be taken, and what was refused or dropped is counted.
 """
 
 import contextlib
@@ -134,7 +134,7 @@ def flood(name: str, endpoints: Endpoints, _keys: Path, stop: Event, times: Any)
 
 
 def messages(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
-    """Hostile setpoints, and hostile requests one after the other. A request that is carried out ends it."""
+    """Hostile setpoints, and hostile requests one after the other. Raises RuntimeError at one that is carried out."""
     draw = random.Random(1)
     with zmq.Context() as context:
         publisher = _peer(context, zmq.XPUB, endpoints.setpoint)

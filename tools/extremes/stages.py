@@ -2,7 +2,7 @@
 travels.
 
 A stage is fed at its border. Where another check stands before it, that is named, and the stage gets whatever passes
-that check; else it gets NaN, infinities and the largest floats, too. In each episode a fresh stage has healthy inputs,
+that check. Else it gets NaN, infinities and the largest floats, too. In each episode a fresh stage has healthy inputs,
 then hostile ones, then healthy ones again. What is not finite afterwards, in what came out or in a field of the stage,
 has travelled. A stage that refused is made anew, as its owner does.
 """
@@ -97,9 +97,9 @@ class Stage(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What became of a stage: steps with hostile inputs; those that it refused by name; those after which a limit or a
-    fault was told; numbers that came out and were not finite; steps with NaN after which nothing was said; errors that
-    name nothing; and the first of the last three."""
+    """What became of a stage. It counts steps with hostile inputs, those that it refused by name, and those after which
+    a limit or a fault was told. Then come numbers that came out and were not finite, steps with NaN after which nothing
+    was said, and errors that name nothing. The last is the first of these three."""
 
     stage: str
     border: str

@@ -180,7 +180,7 @@ def stepper() -> Stepper:
 
 
 def step(stage: Stepper, draw: Draw) -> object:
-    """One tick; a fault that it latches is what it says."""
+    """One tick. Raises DomainError where it latches NOT_FINITE."""
     duty = stage.step(draw(draw.now_s), measurement(draw), plan(draw))
     faults = stage.safety.faults
     if Fault.NOT_FINITE in faults:

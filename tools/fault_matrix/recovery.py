@@ -1,7 +1,7 @@
 """What leads out of a fault: the commands that the daemon's own table names, before its cause has gone and after.
 
 An operator does no more than to say `arm`, beside a publisher that goes on. Before the cause has gone that must come to
-nothing, or the fault be named all the while; afterwards the force has to be followed again.
+nothing, or the fault be named all the while. Afterwards the force has to be followed again.
 """
 
 from fault_matrix.cases import Injection
@@ -72,8 +72,8 @@ def _follow(rig: Rig) -> tuple[bool, set[str]]:
 
 
 def armed(rig: Rig, patience_s: float) -> str:
-    """Says `arm`, again and again for so long; the commands that were taken and what came in the way of the last one,
-    empty where nothing did."""
+    """Says `arm`, again and again for so long. Returns the commands that were taken and what came in the way of the
+    last one, empty where nothing did."""
     until_s = rig.loop.now_s + patience_s
     while True:
         commands, arming = next_commands(rig.safety, rig.is_homed), Arming(rig.loop.now_s, rig.safety.faults)

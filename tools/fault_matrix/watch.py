@@ -28,11 +28,11 @@ class Cell(NamedTuple):
 
     `named`: one of the codes that it should have was told, and no other fault before. `safe`: it ended as stated, and
     `seconds` is when that began; for a force that is held, when it was named. `reacted_ms` is when the reaction was on
-    its way: the device began to open or let go, the limit was told, or the command was refused. `in_time`: that was by
+    its way. The device began to open or let go, the limit was told, or the command was refused. `in_time`: that was by
     `stated_ms`, which is null where nothing is to be told.
 
     The last four are of `fault_recovery`. `tried`: what the recovery came to before the cause had gone, empty where
-    there was nothing to try. `recovery`: the commands that led back once it had, `back_s` how long they took, and
+    there was nothing to try. `recovery`: the commands that led back once it had, `back_s` how long they took.
     `recovered`: they did, not before, and the force was followed again.
     """
 

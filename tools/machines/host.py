@@ -1,7 +1,7 @@
 """What the host takes from a real-time program while it runs, as the kernel and bare timers see it.
 
 Nothing here asks the program itself: a program that holds itself up must not be able to blame the host. Bare timers
-(`bare_timer.py`) stand on every processor, above the daemon's priority where that is allowed, so each of them misses
+(`bare_timer.py`) stand on every processor, above the daemon's priority where that is allowed. So each of them misses
 exactly what its processor did not give. `steal` is what the hypervisor gave to others, and a process has *waited* where
 it was ready to run and stood in a queue.
 """
@@ -34,13 +34,13 @@ MOST_WAITED = 0.1
 """Share of the time above which a process that waits for a processor has not been left enough. With FIFO the daemon
 waits for 3 to 8% of it, 30 to 80 us a wake-up; without, beside four busy loops, for a third."""
 MOST_WAIT_MS = 25.0
-"""Over what MOST_WAITED allows between two looks: who once waited for so much longer has lost half of the time after
+"""Over what MOST_WAITED allows between two looks. Who once waited for so much longer has lost half of the time after
 which a device opens by itself. Beside four busy loops, without FIFO, a device stood still for 110 ms while every bare
 timer, which sleeps more, kept its beats."""
 MOST_BLOCKED = 0.02
 """Share of the time above which waiting for disk or memory is taken for a hold-up. Once a device that writes its truth
-to a disk stood still for 38 ms while every bare timer kept its beats: the disk was why, or what carries a pty's bytes
-(`wire.py`), which was not known then; neither is shown."""
+to a disk stood still for 38 ms while every bare timer kept its beats. The disk was why, or what carries a pty's bytes
+(`wire.py`), which was not known then. Neither is shown."""
 
 
 class Stall(NamedTuple):

@@ -1,8 +1,8 @@
 """Runs a module as on a machine of its own: FIFO and locked memory, where the kernel grants them.
 
 `own.py PRIORITY [--waits] MODULE [ARGUMENT ...]`. What stands for another computer (the device, the robot that
-publishes) would otherwise wait for this one's processors, and for its pages: where the kernel takes idle ones back, a
-page that returns from a disk is later than the 50 ms after which a state is stale.
+publishes) would otherwise wait for this one's processors, and for its pages. Where the kernel takes idle ones back, a
+page that returns from a disk comes late. After 50 ms a state is stale.
 """
 
 import importlib

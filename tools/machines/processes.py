@@ -20,8 +20,8 @@ def begun(
     is_read: bool = True,
     environment: dict[str, str] | None = None,
 ) -> "subprocess.Popen[str]":
-    """A Python that ends with the stack; what it says on stderr is added to the log, and what it prints, unless that
-    `is_read`: a pipe that nobody reads is full some time."""
+    """A Python that ends with the stack. What it says on stderr is added to the log, and what it prints, unless that
+    `is_read`. A pipe that nobody reads is full some time."""
     with log.open("a") as said:
         stdout = subprocess.PIPE if is_read else said
         child = subprocess.Popen([sys.executable, *arguments], stdout=stdout, stderr=said, text=True, env=environment)

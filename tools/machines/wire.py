@@ -1,6 +1,6 @@
 """The wire of a pty: workers of the kernel carry its bytes, at ordinary priority, as those of a USB adapter too.
 
-With all processors busy they came up to 90 ms late while daemon and device kept every beat (Linux 6.18): the device's
+With all processors busy they came up to 90 ms late while daemon and device kept every beat (Linux 6.18). The device's
 states are stale then, whatever the daemon does. Where it is the daemon that is measured, and the kernel grants it, the
 workers get a real-time priority. New ones are made at any time, so they are looked for again and again.
 """

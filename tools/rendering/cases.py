@@ -175,8 +175,8 @@ def speeds(name: str) -> Json:
 
 
 def drift(name: str) -> Json:
-    """A force sensor that drifts, with a handle that turns back every TURN_S, and one that never does: the worst error
-    of a second's mean, and how far the force went from when OFFSET_UNKNOWN was first shown, to a second."""
+    """A force sensor that drifts, with a handle that turns back every TURN_S, and one that never does. It shows the
+    worst error of a second's mean, and how far the force went from when OFFSET_UNKNOWN was first shown, to a second."""
     plant, result = device(name), {}
     sensor = msgspec.structs.replace(plant.force_sensor, drift_mN_min=DRIFT_MN_MIN)
     plant = msgspec.structs.replace(plant, force_sensor=sensor)
@@ -255,8 +255,8 @@ def compared(found: Followed, best: Bound, start_s: float) -> Json:
 
 
 def samples(pool: Executor) -> Json:
-    """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S;
-    and the RMS error of the same core with carriages that lose no time."""
+    """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S.
+    Beside it is the RMS error of the same core with carriages that lose no time."""
     rows, played, names = [], pulse_signal(PULSE_S), judging(0)
     cases = [(name, preview_s) for name in names for preview_s in (PREVIEW_S, 0.0)]
     runs, bounds = (

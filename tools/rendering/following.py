@@ -64,9 +64,10 @@ def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
 
 
 class Followed(NamedTuple):
-    """What a run showed, a row for each control tick: time since its beginning, s; the force asked and the one truly
-    rendered, signed as the handle moves, N; where the handle is, mm and mm/s; whether a learned value stood at its
-    rail. And the share of time that each limit was held, the faults that ended it, what the device had shown by then.
+    """What a run showed, a row for each control tick. `time_s` is since its beginning, s. Forces are those asked and
+    truly rendered, signed as the handle moves, N. Then come where the handle is, mm and mm/s, and whether a learned
+    value stood at its rail. And the share of time that each limit was held, the faults that ended it, what the device
+    had shown by then.
     """
 
     time_s: Array

@@ -1,7 +1,7 @@
 """The first part of `make run`: a hand that feels the brake pushes into two walls, in real time.
 
 The hand is the simulated device's own. Behind a network of 100 ms round trip one patient has a soft wall, the next a
-stiff one, which it tells as a law once it is met. What carriages of this speed leave is from virtual time.
+stiff one. Each tells it as a law once it is met. What carriages of this speed leave is from virtual time.
 """
 
 import contextlib

@@ -1,8 +1,8 @@
 """One scene in one situation on the simulated device in virtual time: how far the true force is off.
 
-The situations are what a scene meets in use: its own signal, steps, a hold, a handle that reverses or creeps, a
-publisher that seldom sends, and a hand that pushes into a wall. What is asked begins after an approach; from LEARN_S
-on the error counts. A frozen run learns until then, and no more. Runs are spread over any
+The situations are what a scene meets in use. They are its own signal, steps, a hold, a handle that reverses or creeps,
+and a publisher that seldom sends. In the last a hand pushes into a wall. What is asked begins after an approach; from
+LEARN_S on the error counts. A frozen run learns until then, and no more. Runs are spread over any
 `concurrent.futures.Executor`.
 """
 
@@ -47,7 +47,7 @@ SITUATIONS = "signal", "steps", "hold", "seldom", *OF_A_HANDLE
 
 
 class Case(msgspec.Struct, frozen=True):
-    """One run. `search` takes the place of the scene's own where it is given; setpoints come `inference_hz` times a
+    """One run. `search` takes the place of the scene's own where it is given. Setpoints come `inference_hz` times a
     second, or as often as scene or situation say where that is less."""
 
     scene: str

@@ -1,7 +1,7 @@
 """The real-time part of `make run`: the processes, the live view, and what became of it.
 
 What stands for other machines (the device, the robot that publishes) gets FIFO below the daemon's where that is
-allowed: outside the demonstration they do not share the daemon's processors.
+allowed. Outside the demonstration they do not share the daemon's processors.
 """
 
 import contextlib
@@ -108,8 +108,8 @@ class ShowError(Exception):
 class Shown(NamedTuple):
     """What was asked and rendered, and how daemon and host kept time meanwhile.
 
-    `kept` is the share of control periods that began a tick of their own, `spacing_s` the time between
-    ticks that the fastest tenth of them keeps: what the software takes where nobody is in its way.
+    `kept` is the share of control periods that began a tick of their own. `spacing_s` the time between ticks that the
+    fastest tenth of them keeps: what the software takes where nobody is in its way.
     """
 
     time_s: Array
@@ -299,8 +299,8 @@ def between(known: list[Tick], start_s: float, end_s: float) -> Array:
 
 
 def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
-    """Of a show that ended early, by its recording: when the first fault was latched, for whoever saw it at `seen_s`
-    may have been late, and the time between ticks that the fastest tenth of them keeps; 0 where none were recorded."""
+    """When the first fault of a show that ended early was latched, by its recording; whoever saw it at `seen_s` may
+    have been late. Also the time between ticks that the fastest tenth of them keeps; 0 where none were recorded."""
     try:
         known = ticks()
     except RecordingError:

@@ -1,7 +1,7 @@
 """A hand that pushes into a wall and draws back, in virtual time, and what ideal carriages would make of it.
 
 The patient's tip is where the handle was half a round trip ago; what it feels comes back as late. The bound moves the
-gap by the device's own motors, which stop at once, along the device's true force over gap; it knows what the run's
+gap by the device's own motors, which stop at once, along the device's true force over gap. It knows what the run's
 controller knows: the newest message, and the handle's place and speed. *Infinite* is the same without motors.
 """
 
@@ -44,7 +44,7 @@ LEARNS, LEARNS_FOR_S = 0.6, 1.6
 "Of the greatest force: what is asked while the hand slides, so that the device is known."
 RESTS_S = 0.8
 ONSET_N, COUNTED_N = 0.2, 0.3
-"Over the waiting level: where a wall is felt, and what it has to reach in order to count."
+"Over the waiting level: where a wall is felt, and what it has to reach to count."
 HELD_N = EARLY_N = 0.1
 PULLS_N = 0.05
 GRID_MM = 0.05
@@ -69,8 +69,8 @@ class Case(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """A row for each tick from when the hand begins to push: time, s, the handle's place behind the wall's, mm, and
-    speed, mm/s; the kinetic force, the one on the handle and the hand's, N."""
+    """A row for each tick from when the hand begins to push. It has time, s, the handle's place behind the wall's, mm,
+    and speed, mm/s. Then come the kinetic force, the one on the handle and the hand's, N."""
 
     time_s: Array
     depth_mm: Array

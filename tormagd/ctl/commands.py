@@ -348,8 +348,8 @@ COMMANDS = {
             option(
                 "action",
                 choices=("list", "show", "check", "explain", "new", "use"),
-                help="check: does the daemon take it, and what does the device give of it; explain: how it may be "
-                "served, how exactly, at what cost; new: write one, asking for what the task needs; "
+                help="check: does the daemon take it, and what does the device give of it. explain: how it may be "
+                "served, how exactly, at what cost. new: write one, asking for what the task needs. "
                 "use: change to it, while disabled",
             ),
             option("name", nargs="?", metavar="NAME|FILE"),

@@ -1,8 +1,8 @@
 """The delay from the sensor on the patient's side to the force at the handle, in parts, against a budget.
 
-The parts: from the stamp, by the corrected clock of its source, to the first duty that follows it; from a Drive to its
-State, by the link; and the believed lag of the carriages. Delay before the stamp, as of the sensor's filters, cannot be
-seen here.
+The first part is from the stamp, by the corrected clock of its source, to the first duty that follows it. The second is
+from a Drive to its State, by the link. The third is the believed lag of the carriages. Delay before the stamp, as of
+the sensor's filters, cannot be seen here.
 """
 
 import math

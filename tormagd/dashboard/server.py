@@ -90,8 +90,7 @@ async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None])
 
 @web.middleware
 async def _only_this_machine(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Answer 403 to a request for a host name other than NAMES: a foreign page could reach the server by its own
-    name."""
+    """Raise HTTPForbidden for a host name other than NAMES: a foreign page could reach the server by its own name."""
     if request.url.host not in NAMES:
         raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
     return await handler(request)
@@ -106,7 +105,7 @@ def _json(value: object) -> web.Response:
 
 
 def _seconds(text: str) -> float:
-    """Parse the query's `at_s`; answers 400 where it is no finite number."""
+    """Parse the query's `at_s`. Raises HTTPBadRequest where it is no finite number."""
     try:
         seconds = float(text)
     except ValueError:

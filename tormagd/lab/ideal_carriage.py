@@ -1,17 +1,17 @@
 """The ideal carriages of a device, and the force that they render: the error that is left to them.
 
-The device is known exactly: its motors by their torque-speed line and current limit, friction of gearbox, screw and
-guide, the magnets' pull (the laws of the simulated axis, `tormagd/simulation/axis.py`, both carriages together), the
-field of its gap with the lag that remanence gives it, the relaxation of its insert, the friction of a handle that
-slides at one speed. Left out is what only holds carriages back: windings, backlash, the bristles of friction, sensors,
+The device is known exactly. Its drive: the motors' torque-speed line and current limit, the friction of gearbox, screw
+and guide, the magnets' pull. These are the laws of the simulated axis, `tormagd/simulation/axis.py`, both carriages
+together. Its force: the field of its gap with the lag of remanence, the relaxation of its insert, the friction of a
+handle at one speed. Left out is what only holds carriages back: windings, backlash, the bristles of friction, sensors,
 the exchange. So no controller drives this device's gap faster. The force asked is clipped to what the open gap brakes
-and to the scene's greatest; all of it in steps of a millisecond or less.
+and to the scene's greatest. Steps are of a millisecond or less.
 
 *Without delay*: a step knows the force asked at its end, and how fast it changes, but nothing of what follows. The
 carriages close up to it as fast as they can while they still can brake in time. For what repeats itself or is noise
-that is no bound: a forecast that is right misses less, down to what foresight does, and so may a gap that stands still.
+that is no bound. A forecast that is right misses less, down to what foresight does, and so may a gap that stands still.
 
-*With foresight* the whole signal is known, and the RMS error is the least that the drive allows; at what gap and speed
+*With foresight* the whole signal is known, and the RMS error is the least that the drive allows. At what gap and speed
 the carriages begin is free. The optimum is found by sequential quadratic programmes (Gauss-Newton, each solved by
 Clarabel), to 2 %: carried on, the rounds found nothing better than that. Without the field's lag a search of everything
 agrees to 0.4 % (`tests/lab/test_bound.py`).

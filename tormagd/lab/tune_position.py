@@ -1,8 +1,8 @@
 """From H(z) to the gains of the position loop: the stiffest that stay robust.
 
-Searches derivative time, filter and integral time on a grid; for each the largest proportional gain whose margins hold
-at every corner of +-30% in the motor's parameters and +-20% in the loop period. Stiffest means the largest integral
-gain: how fast a disturbance of the carriage (drag, the magnets' pull) is taken away.
+Searches derivative time, filter and integral time on a grid. For each it takes the largest proportional gain whose
+margins hold at every corner. Corners are +-30% in the motor's parameters and +-20% in the loop period. Stiffest means
+the largest integral gain: how fast a disturbance of the carriage (drag, the magnets' pull) is taken away.
 """
 
 import argparse

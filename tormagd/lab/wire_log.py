@@ -1,7 +1,7 @@
 """What was said on the wire, as a log that CAN tools read: candump (.log), Vector (.asc, .blf) and more.
 
 On CAN, `python -m can.logger` records the bus and nothing of ours is needed. A serial line has one owner, so `tap` goes
-between: it holds the device's port, offers the daemon a pseudo-terminal instead, passes every byte on and logs the
+between. It holds the device's port, offers the daemon a pseudo-terminal instead, passes every byte on and logs the
 frames. `virtual` logs a session in virtual time, synthetic from end to end. `viewer` prints what python-can's viewer
 needs to know of the messages.
 """

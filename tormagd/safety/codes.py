@@ -261,8 +261,8 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.OUT_OF_STROKE: Explanation(
-        "a homed carriage reads a position where none can be, or one far from its open switch while that is closed: "
-        "counts were lost, homing found a wrong zero, or the switch is stuck",
+        "a homed carriage reads an impossible position, or one far from the switch that it closes: counts were lost, "
+        "homing found a wrong zero, or a switch is stuck",
         "check switches and encoders, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,

@@ -60,6 +60,7 @@ class Signal(Strict, frozen=True):
     """The force that the task asks for over time: a recording, or `force`'s range up and down.
 
     Of the range, as much is asked as the device gives. A device whose carriages are too slow for the signal is refused.
+    Raises ValueError unless either `file` or `bandwidth_hz` is given, and for what shapes flanks beside `file`.
     """
 
     file: str = ""
@@ -115,18 +116,18 @@ class Budget(Strict, frozen=True):
 class Terms(Strict, frozen=True):
     """The parts of the controller's model. A part that is left out is not computed.
 
-    `rate`        the handle's rate and displacement are inputs of the learned model; without it the force over the
-                  gap is one table, that of a handle at the thesis's 42 mm/s, and there is no search
+    `rate`        the handle's rate and displacement are inputs of the learned model. Without it the force over the gap
+                  is one table, that of a handle at the thesis's 42 mm/s, and there is no search
     `creep`       the friction of a creeping handle beside that of a sliding one, static and Stribeck's, is learned
     `scale`       the device's force over the model's is learned: friction, modulus, field
     `offset`      the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds
                   back, beyond what its model expects
-    `memory`      the model follows, from where the gap has been, how much force the elastomer has relaxed away and
-                  how far its field lags behind the gap's
+    `memory`      from where the gap has been, the model follows how much force the elastomer has relaxed away. It
+                  follows how far the element's field lags behind the gap's, too
     `forecast`    setpoints are carried along their slope to now and ahead, and a force that repeats itself is foreseen
     `motor`       how late the carriages are is learned and made up for, and the duty that the reference takes is fed
-                  forward: for its speed and acceleration, the dry friction of gearbox and screw, and the magnets'
-                  pull, which limits the opening speed as well
+                  forward. It takes that for its speed, its acceleration, the dry friction of gearbox and screw, and the
+                  magnets' pull. The pull limits the opening speed as well
 
     A pad has no `creep`. What safety rests on is no term: the ceiling, the judgement of the sensor, the force law
     beside the search.
@@ -164,8 +165,8 @@ class Insert(Strict, frozen=True):
 
     name: str
     model: str
-    """A safetensors file (relative to the scene file), or the name of a shipped model; "auto": the shipped one of this
-    insert, or that of all inserts of its matrix."""
+    """A safetensors file (relative to the scene file), or the name of a shipped model. "auto" is the shipped one of
+    this insert, or that of all inserts of its matrix."""
     gap_closed_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 45.0
     gap_open_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 95.0
     inner_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 4.0
@@ -177,7 +178,10 @@ class Insert(Strict, frozen=True):
 
 
 class Solver(Strict, frozen=True):
-    """The field search. "auto": none where the rate is no term, else Newton's method, the cheapest and most exact."""
+    """The field search. "auto": none where the rate is no term, else Newton's method, the cheapest and most exact.
+
+    Raises ValueError for settings beside "auto".
+    """
 
     name: str = AUTO
     step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET

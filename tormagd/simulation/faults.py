@@ -36,7 +36,8 @@ KNOWN = {
     "clock": "the device's clock runs fast by VALUE percent, as in clock=+2%",
 }
 SIZED = ("drag_left", "backlash", "clock", "opening")
-FORMS = "NAME[=PERCENT%][@SECONDS] with NAME one of: " + "; ".join(f"{name}: {what}" for name, what in KNOWN.items())
+_KNOWN = ". ".join(f"{name}: {what}" for name, what in KNOWN.items())
+FORMS = f"NAME[=PERCENT%][@SECONDS] with NAME one of these. {_KNOWN}"
 _FORM = re.compile(r"(?P<name>\w+)(?:=(?P<percent>[+-]?[\d.]+)%)?(?:@(?P<at_s>[\d.]+))?")
 
 

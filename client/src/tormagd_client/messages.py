@@ -416,8 +416,8 @@ class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FollowingReport(msgspec.Struct, frozen=True, kw_only=True):
-    """How well the force was followed in the last seconds in which it could be: the RMS of measured less asked, as it
-    is, and with `delay_ms` taken out, the delay that explains most of it."""
+    """How well the force was followed in the last seconds in which it could be. That is the RMS of measured less asked:
+    as it is, and with `delay_ms` taken out, the delay that explains most of it."""
 
     rms_N: float
     aligned_rms_N: float

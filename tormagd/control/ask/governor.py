@@ -6,8 +6,8 @@ path      where forces ahead are known: those of the gap's path that misses them
           over the force there
 blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes
 decay     without a setpoint, or with one that is too old: to the device's least force at the scene's release rate
-passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none, as
-          before the first setpoint, while the gap was open or held, or after a silence
+passing   to a publisher's forces at the release rate, from another publisher's or from a force that followed none. That
+          is so before the first setpoint, while the gap was open or held, and after a silence
 """
 
 import math

@@ -2,7 +2,7 @@
 
 run      readings of one value, one after the other
 stale    the same value although the force has changed by STALE_N and two of the sensor's steps: it teaches nothing
-frozen   the same although it has changed by FROZEN_N and two steps; and of a sensor whose noise is resolved, for
+frozen   the same although it has changed by FROZEN_N and two steps. Where the sensor's noise is resolved, also for
          longer than FROZEN_RUNS of its mean runs
 """
 

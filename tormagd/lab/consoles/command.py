@@ -1,8 +1,8 @@
 """Recordings of many consoles at once: how well each followed, what held it back, and how its device drifts.
 
 Every `.mcap` in the folder, or under a URL that fsspec knows (`s3://bucket/recordings` takes the package s3fs), is read
-by one of the workers, and summed up as `summary.py` says; `--out` keeps one row of a recording. The table has one line
-for each device and insert. A file that cannot be read is named and left out.
+by one of the workers. It is summed up as `summary.py` says; `--out` keeps one row of a recording. The table has one
+line for each device and insert. A file that cannot be read is named and left out.
 """
 
 import argparse
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> Found:
 
     `options.out`, if given, gets one row for each recording, as Parquet. The exit code is 1 where a file was left out,
     and 2 where `out` could not be written. Both are told on stderr. Raises LabError where there are no recordings, for
-    an unknown kind of URL, and where its package is missing; OSError where the place cannot be reached.
+    an unknown kind of URL, and where its package is missing. Raises OSError where the place cannot be reached.
     """
     try:
         urls = files(options.recordings)

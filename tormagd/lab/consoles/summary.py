@@ -30,9 +30,9 @@ class Wanted(Glance, total=False):
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of one recording; what was not recorded is null, or an empty text.
 
-    `trim` is the device's force over its model's, `current_A` the RMS of the motor that needed more, `clock_drift_ppm`
-    by how much the device's clock runs fast: each over the time ENABLED. `tracking_rms_N` is that of while following,
-    with the sensor's noise in it. Of a trim, a clock and a temperature it is the median.
+    `trim` is the device's force over its model's, `current_A` the RMS of the motor that needed more. `clock_drift_ppm`
+    by how much the device's clock runs fast. Each is over the time ENABLED. `tracking_rms_N` is that of while
+    following, with the sensor's noise in it. Of a trim, a clock and a temperature it is the median.
     """
 
     serial_number: int | None

@@ -3,8 +3,8 @@
 A constant force is asked for; the finger presses, and the device is learned for some seconds. From then on the error of
 the pad's true force counts, as a share of the force asked, and frozen runs learn no more. It is the daemon's own loop
 with the whole device, at the scene's own rates. With --coarse the plans alone run, fifty a second, and the gap is where
-they lead, which takes a tenth of the time; the two differ by less than 0.1 % of the force, as a
-test holds. A hold that latches a fault ends there. All pads are synthetic.
+they lead, which takes a tenth of the time. The two differ by less than 0.1 % of the force, as a test holds. A hold that
+latches a fault ends there. All pads are synthetic.
 """
 
 import argparse

@@ -40,8 +40,8 @@ PADS = MappingProxyType(
         "MRE-C": PadParameters(45.0, 281.0, 592.0, 0.85),
     }
 )
-"""Moduli from section 4.2.3; the breakdown puts the force at 4.5 mm and 365 mT near 65, 141 and 186 N, the full
-scales that table 4.1 implies."""
+"""Moduli from section 4.2.3. The breakdown puts the force at 4.5 mm and 365 mT near 65, 141 and 186 N, the full scales
+that table 4.1 implies."""
 
 
 def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:

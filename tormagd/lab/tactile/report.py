@@ -83,9 +83,9 @@ def _table_4_1(data: Json) -> str:
         "left out (every third row, fewer epochs):\n\n"
         + table(("left out", "R2", "MAE, N", "MAE of each fold, N"), groups)
         + "\nThe ends are extrapolations: a class has to be measured before it is used.\n\n"
-        "An inverse needs a force that rises with the field. dF/dB <= 0 on this share of the training box, contents "
-        "between the classes included, and of the places where the pad itself rises by 0.03 N/mT or more: network "
-        f"{network}, relaxation-aware model {aware}. There the searches answer by continuity.\n\n"
+        "An inverse needs a force that rises with the field. It falls on this share of the training box, contents "
+        "between the classes included, and of the places where the pad itself rises by 0.03 N/mT or more. The network: "
+        f"{network}, the relaxation-aware model: {aware}. There the searches answer by continuity.\n\n"
         "![data and network](images/tactile_fit.png)\n"
     )
 

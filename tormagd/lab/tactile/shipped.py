@@ -1,7 +1,7 @@
 """Train the shipped tactile model: a pad is cycled and held on the bench, its relaxation-aware model becomes a file.
 
 The bench gives the plant's pad eleven fields, twelve cycles each at four rates, and an hour's hold at each of five
-fields; its force sensor has the noise of the plant's. Synthetic.
+fields. Its force sensor has the noise of the plant's. Synthetic.
 """
 
 import argparse

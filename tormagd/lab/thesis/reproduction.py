@@ -1,6 +1,6 @@
 """Recomputes the thesis's tables and figures: thesis value, ours, error, note.
 
-Runs without the laboratory: where the thesis measured, its printed measurements are the reference; the step test runs
+Runs without the laboratory: where the thesis measured, its printed measurements are the reference. The step test runs
 on the simulated device, and table 4.1 and the pulse on a simulated pad (synthetic).
 """
 
