@@ -25,7 +25,7 @@ from rendering.following import Case, Rehearsals, Tracking, rehearse
 from rendering.live_touch import FELT_N, PUSH_MM_S, ROUND_TRIP_MS, Wall, felt, figures, lateness
 from rendering.show import (
     LEAST_N,
-    MOST_N,
+    MAX_N,
     PULSE_START_S,
     RECORDING,
     RUN_DIR,
@@ -48,7 +48,7 @@ SHOWS = 3
 MARGIN = 0.1
 """The control loop may keep this much less of its periods than the worst bare timer: it computes, the timer does not.
 Measured: 0.4% less on a quiet machine, 3 to 9% less beside four busy loops, over 50% less with 2 ms more in a tick."""
-MOST_SPACING = 1.5
+MAX_SPACING = 1.5
 """Time between the fastest ticks, periods, above which the software itself is slow. A host takes at times, and between
 them even software that starves keeps the period."""
 THESIS_GAP_SPEED_MM_S = 8.33
@@ -126,7 +126,7 @@ def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
 
 def is_slow(scene: Scene, spacing_s: float) -> bool:
     """Whether even the fastest ticks come late."""
-    return spacing_s * scene.bandwidth.control_hz > MOST_SPACING
+    return spacing_s * scene.bandwidth.control_hz > MAX_SPACING
 
 
 def slow(spacing_s: float) -> str:
@@ -143,15 +143,15 @@ def checks(scene: Scene, shown: Shown) -> dict[str, bool]:
     inference, link = shown.status["rates"]["inference"], shown.status["link"]
     force, bandwidth = scene.force, scene.bandwidth
     share = shown.host.bare_kept - MARGIN
-    least_hz, least_plans_hz = bandwidth.control_hz * share, bandwidth.inference_hz * share
+    min_hz, min_plans_hz = bandwidth.control_hz * share, bandwidth.inference_hz * share
     return {
         f"RMS error <= {force.tolerance_rms_N:g} N": result.rms_N <= force.tolerance_rms_N,
         f"variance accounted for >= {force.least_variance_accounted_for:g}": result.variance_accounted_for
         >= force.least_variance_accounted_for,
-        f"control rate >= {least_hz:.0f} Hz, a bare timer's less {MARGIN:.0%}": (
+        f"control rate >= {min_hz:.0f} Hz, a bare timer's less {MARGIN:.0%}": (
             shown.kept >= share and not is_slow(scene, shown.spacing_s)
         ),
-        f"inference >= {least_plans_hz:.0f} Hz": inference["hz"] >= least_plans_hz,
+        f"inference >= {min_plans_hz:.0f} Hz": inference["hz"] >= min_plans_hz,
         "no frame lost": lost_frames(link) == 0,
         "every process ended in order": not any(shown.exit_codes.values()),
     }
@@ -283,7 +283,7 @@ def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:
     """What was asked, and the forces as a table."""
     deviations_mN = [found.since(PULSE_START_S).reference_sd_N * 1e3 for found in rehearsals.values()]
     deviation = f" (sd {deviations_mN[-1]:.0f} mN)" if deviations_mN else ""
-    print(f"\nforce asked {LEAST_N}..{MOST_N} N{deviation}, rendered by the plant:")
+    print(f"\nforce asked {LEAST_N}..{MAX_N} N{deviation}, rendered by the plant:")
     print("\n".join(force_table(shown, rehearsals)))
 
 

@@ -9,7 +9,7 @@ from rendering.scene_runs import ROOT
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
 from tormagd.lab.pages import stamp, subplots, table
-from tormagd.scenes.measured import TOLERATED, WORSE, Judged, Measured, MeasuredScene, Way, measured
+from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, Measurements, OperatingPoint, WorstDevice, measured
 from tormagd.scenes.scene import load_scene, scene_path, shipped_scenes
 from tormagd.scenes.signal import asked
 
@@ -86,7 +86,7 @@ def _head() -> str:
     )
 
 
-def _row(name: str, found: MeasuredScene, file: Measured) -> list[str]:
+def _row(name: str, found: MeasuredScene, file: Measurements) -> list[str]:
     force, reach = load_scene(name).force, core_of(name).portrait
     low_N, high_N = max(force.least_N, reach.min_N), min(force.most_N, reach.max_N)
     share = (high_N - low_N) / (force.most_N - force.least_N)
@@ -102,13 +102,13 @@ def _row(name: str, found: MeasuredScene, file: Measured) -> list[str]:
     ]
 
 
-def taken(file: Measured, way: Way) -> str:
+def taken(file: Measurements, way: OperatingPoint) -> str:
     """What a way takes of a processor, %."""
     share = file.share(way)
     return "?" if share is None else f"{100.0 * share.daemon:.0f} %"
 
 
-def _ways(file: Measured) -> str:
+def _ways(file: Measurements) -> str:
     rows = [
         [str(share.way), f"{100.0 * share.daemon:.1f}", f"{share.tick_us:.0f}", f"{share.plan_us:.0f}"]
         for share in file.shares
@@ -124,12 +124,12 @@ def _ways(file: Measured) -> str:
     )
 
 
-def _error(scene: MeasuredScene, way: Way) -> str:
+def _error(scene: MeasuredScene, way: OperatingPoint) -> str:
     tried = next((each for each in scene.tried if each.way == way), None)
     return "" if tried is None else f"{1e3 * tried.worst_N:.1f}"
 
 
-def _judged(file: Measured) -> str:
+def _judged(file: Measurements) -> str:
     heads = list(dict.fromkeys(_situation(item) for scene in file.scenes for item in scene.judged))
     rows = [
         [f"`{scene.name}`", *(cells.get(head, "") for head in heads)]
@@ -144,7 +144,7 @@ def _judged(file: Measured) -> str:
     )
 
 
-def _situation(item: Judged) -> str:
+def _situation(item: WorstDevice) -> str:
     group = "" if item.group == "deciding" else f", {item.group}"
     return item.signal + group + ("" if item.learning else ", frozen")
 
@@ -154,7 +154,7 @@ def core_of(name: str) -> Core:
     return build_core(Config(scene=name), load_scene(name))
 
 
-def draw_trade(path: Path, file: Measured) -> None:
+def draw_trade(path: Path, file: Measurements) -> None:
     """Errors as shares of the tolerance over the daemon's share, a colour for each way."""
     figure, axes = subplots((9.0, 4.5))
     middles = []

@@ -14,8 +14,8 @@ from tormagd.toml_file import checked as checked, convert_as, table_in as table_
 from tormagd_client.endpoints import Endpoints, Strict, require_usable
 from tormagd_client.printable import require
 
-LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
-MOST_LISTED = 8
+MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
+MAX_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
 
 
@@ -51,10 +51,10 @@ class Sources(Strict, frozen=True):
     def __post_init__(self) -> None:
         names = self.priority
         require(
-            len(set(names)) == len(names) <= MOST_LISTED and all(name.isprintable() for name in names),
+            len(set(names)) == len(names) <= MAX_LISTED and all(name.isprintable() for name in names),
             "sources.priority",
             names,
-            f"at most {MOST_LISTED} different printable names",
+            f"at most {MAX_LISTED} different printable names",
         )
 
 
@@ -71,9 +71,9 @@ class Handle(Strict, frozen=True):
 class Rates(Strict, frozen=True):
     """How often each rate group runs, Hz."""
 
-    control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
+    control_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 1_000
     "Ticks: the position loop's gains are for it, and a serial line and a CAN bus carry it."
-    inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 500
+    inference_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 500
     "Plans that are made at the least; a setpoint is planned for in the next tick. Below 83 the thesis was faster."
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
     "Messages: as often as an eye sees, and no load."

@@ -20,7 +20,7 @@ ALLOWED = {
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
 }
 "Least, most and unit of each column; those of a setpoint's fields are the messages'."
-LEAST_ROWS = 2
+MIN_ROWS = 2
 MAX_FILE_BYTES = 16_000_000
 "Enough for over a quarter of an hour at 1 kHz."
 
@@ -42,7 +42,7 @@ def read_table(path: Path, allowed: Allowed, optional: tuple[str, ...] = ()) -> 
 
     `allowed` names the columns with their least, most and unit. `t_s` is one of them, and rises from row to row. A file
     may lack the `optional` ones. Raises ForceFileError also for an unreadable file, over MAX_FILE_BYTES, or under
-    LEAST_ROWS.
+    MIN_ROWS.
     """
     try:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
@@ -61,8 +61,8 @@ def read_table(path: Path, allowed: Allowed, optional: tuple[str, ...] = ()) -> 
         raise ForceFileError(f"{path}: not UTF-8 text (byte {error.start})") from error
     except csv.Error as error:
         raise ForceFileError(f"{path}: not CSV: {error}") from error
-    if len(table["t_s"]) < LEAST_ROWS:
-        raise ForceFileError(f"{path}: {len(table['t_s'])} rows: allowed is at least {LEAST_ROWS}")
+    if len(table["t_s"]) < MIN_ROWS:
+        raise ForceFileError(f"{path}: {len(table['t_s'])} rows: allowed is at least {MIN_ROWS}")
     return table
 
 

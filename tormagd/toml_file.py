@@ -22,9 +22,9 @@ MOST_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
 LONGEST_LINE = 8_192
 "Characters in a line: the parser's time grows as the square of a key's parts, to a minute."
-MOST_GUESSES = 16
+MAX_GUESSES = 16
 "Lines with a key's name that are tried for the one that gives it: a file may be full of them."
-MOST_LINES = 8
+MAX_LINES = 8
 "Lines of one value whose key's line is found."
 
 T = TypeVar("T")
@@ -195,19 +195,19 @@ def _at(table: Any, key: Sequence[str]) -> Any:
 def line_of(text: str, key: Sequence[str]) -> int | None:
     """Return the number of the line of `text`, which is TOML, that gives `key`, a path through its tables.
 
-    None where no line does, or where none of the first MOST_GUESSES lines that contain its name does. The parser keeps
+    None where no line does, or where none of the first MAX_GUESSES lines that contain its name does. The parser keeps
     no lines. So the text up to each of those lines is parsed, until the key is known.
     """
     lines = text.splitlines()
     guesses = (number for number, line in enumerate(lines, start=1) if key and key[-1] in line)
-    return next((number for number in islice(guesses, MOST_GUESSES) if _is_known(lines, number, key)), None)
+    return next((number for number in islice(guesses, MAX_GUESSES) if _is_known(lines, number, key)), None)
 
 
 def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
-    """Tell whether `key` is known after this line, or after up to MOST_LINES more that its value may go on in."""
+    """Tell whether `key` is known after this line, or after up to MAX_LINES more that its value may go on in."""
     import tomllib
 
-    for end in range(number, min(number + MOST_LINES, len(lines)) + 1):  # a value may go on in the lines below
+    for end in range(number, min(number + MAX_LINES, len(lines)) + 1):  # a value may go on in the lines below
         try:
             return _at(tomllib.loads("\n".join(lines[:end])), key) is not _NOTHING
         except ValueError:

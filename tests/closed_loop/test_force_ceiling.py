@@ -20,9 +20,9 @@ from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.hand import RecordedHand, ReversingHand
 
 CONFIG = Config(scene="coronary")
-ASKED_N, MOST_N = 1.5, 2.0
+ASKED_N, MAX_N = 1.5, 2.0
 NAMED = {Limit.SENSOR, Limit.DEVICE_OR_SENSOR}
-CEILING_N = 1.25 * MOST_N + 0.1
+CEILING_N = 1.25 * MAX_N + 0.1
 WEAKEST_AND_STRONGEST = ("sample_2", "sample_3")
 
 
@@ -160,7 +160,7 @@ def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
 @pytest.fixture(scope="session")
 def open_core(core: Core) -> Core:
     """Of a scene in which a hundred times the force is none too great: no ceiling acts."""
-    force = msgspec.structs.replace(core.scene.force, most_N=100.0 * MOST_N)
+    force = msgspec.structs.replace(core.scene.force, most_N=100.0 * MAX_N)
     return core._replace(scene=msgspec.structs.replace(core.scene, force=force))
 
 
@@ -170,7 +170,7 @@ def test_the_governed_force_holds_alone(make, render, core: Core, open_core: Cor
     loop.planner.governor = core.planner().governor
     loop.arm()
     samples = render(loop, 1_000.0, 2.5)
-    assert worst_N(samples) < MOST_N + 0.15
+    assert worst_N(samples) < MAX_N + 0.15
     assert Limit.RANGE in samples[-1].plan.limits
 
 
@@ -191,7 +191,7 @@ def test_the_gap_holds_alone(make, render, core: Core, open_core: Core, sample: 
     loop.arm()
     samples = render(loop, 1.0, 3.0)
     assert samples[-1].plan.governed_N == 6.0
-    assert MOST_N < worst_N(samples) < CEILING_N
+    assert MAX_N < worst_N(samples) < CEILING_N
     assert Limit.CEILING in samples[-1].plan.limits
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
 
@@ -216,7 +216,7 @@ def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) 
 @pytest.mark.parametrize("sample", WEAKEST_AND_STRONGEST)
 def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     """Static friction is up to 1.25 times the kinetic one."""
-    samples = render(arm(sample, ReversingHand(2.0)), MOST_N, 4.5)
+    samples = render(arm(sample, ReversingHand(2.0)), MAX_N, 4.5)
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert worst_N(samples) < CEILING_N
 
@@ -241,6 +241,6 @@ def test_a_profile_that_lies_never_presses_over_the_ceiling(
     fit = DeviceFit(scale, offset_N, draw.choice((1e-6, 1e-2)), 0.0, 1e-4)
     loop.planner.teach(Learned(fit, draw.uniform(0.7, 1.2), 1.0, draw.uniform(-0.3, 0.3)))
     loop.arm()
-    samples = render(loop, MOST_N, 6.0)
-    assert max(abs(sample.truth.force_N) for sample in samples) < 1.25 * MOST_N + 0.1
+    samples = render(loop, MAX_N, 6.0)
+    assert max(abs(sample.truth.force_N) for sample in samples) < 1.25 * MAX_N + 0.1
     assert set(samples[-1].safety.faults) <= {Fault.SENSOR}

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import LEAST_INFERENCE_HZ, Config, Rates, load_config
+from tormagd.config import MIN_INFERENCE_HZ, Config, Rates, load_config
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
 from tormagd_client.endpoints import ConfigError
@@ -228,7 +228,7 @@ def test_whatever_stands_in_the_file_is_taken_or_refused_as_a_configuration(writ
     except ConfigError as error:
         assert "tormagd.toml" in str(error)  # noqa: PT017
     else:
-        assert rates.control_hz >= rates.inference_hz >= LEAST_INFERENCE_HZ
+        assert rates.control_hz >= rates.inference_hz >= MIN_INFERENCE_HZ
 
 
 def _toml(value: object) -> str:

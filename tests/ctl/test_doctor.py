@@ -9,7 +9,7 @@ import pytest
 from firmware_protocol.build import COST, REMEDY, Build
 from tormagd.config import Config, Device, RealTime
 from tormagd.ctl import doctor as checks, headroom
-from tormagd.ctl.doctor import Verdict, examine, judged
+from tormagd.ctl.doctor import Severity, examine, judged
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.main import main
 from tormagd_client.endpoints import Endpoints, in_folder
@@ -57,7 +57,7 @@ REALTIME = Config(realtime=RealTime(fifo_priority=50, lock_memory=True))
 
 def test_a_good_machine_has_nothing_to_remedy(good):
     findings = examine(REALTIME, Machine(good))
-    assert [(f.name, f.found) for f in findings if f.verdict is not Verdict.OK] == []
+    assert [(f.name, f.found) for f in findings if f.verdict is not Severity.OK] == []
     assert len({f.name for f in findings}) == len(checks.CHECKS)
     assert judged(REALTIME, Machine(good)).exit_code == 0
 
@@ -208,12 +208,12 @@ def test_it_reads_what_the_service_reads(run_dir, tmp_path, monkeypatch, ctl):
 
 
 def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_to_do(good, monkeypatch):
-    assert checks.build(REALTIME, Machine(good)) == checks.Finding("build", Verdict.OK, "compiled")
+    assert checks.build(REALTIME, Machine(good)) == checks.Finding("build", Severity.OK, "compiled")
     monkeypatch.setattr(checks, "settle", lambda: Build(False, "no C compiler (cc) when it was installed"))
     finding = checks.build(REALTIME, Machine(good))
     assert (finding.found, finding.verdict, finding.remedy) == (
         f"interpreted: no C compiler (cc) when it was installed; {COST}",
-        Verdict.WARN,
+        Severity.WARN,
         REMEDY,
     )
 
@@ -228,9 +228,9 @@ def test_port_missing_taken_or_not_ours(good):
     (good / "proc/4242/fd/3").symlink_to("/dev/ttyUSB0")
     write(good, "proc/4242/comm", "minicom\n")
     finding = checks.port_holder(Config(), Machine(good))
-    assert (finding.verdict, finding.found) == (Verdict.FAIL, "minicom (process 4242)")
+    assert (finding.verdict, finding.found) == (Severity.FAIL, "minicom (process 4242)")
     write(good, "proc/4242/comm", "tormagd\n")
-    assert checks.port_holder(Config(), Machine(good)).verdict is Verdict.OK
+    assert checks.port_holder(Config(), Machine(good)).verdict is Severity.OK
 
 
 def test_who_made_a_pseudo_terminal_is_not_its_holder(good):
@@ -239,7 +239,7 @@ def test_who_made_a_pseudo_terminal_is_not_its_holder(good):
     (good / "proc/4242/fd").mkdir(parents=True)
     (good / "proc/4242/fd/3").symlink_to("/dev/pts/3")
     write(good, "proc/4242/comm", "python\n")
-    assert checks.port_holder(config, Machine(good)).verdict is Verdict.OK
+    assert checks.port_holder(config, Machine(good)).verdict is Severity.OK
     status = (good / "dev/pts/3").stat()
     inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     write(good, "proc/locks", f"1: FLOCK  ADVISORY  WRITE 4242 {inode} 0 EOF\n")

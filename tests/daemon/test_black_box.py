@@ -12,7 +12,7 @@ import pytest
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Hello
 from tormagd.assembly.build import Core
-from tormagd.assembly.journal import MOST_ENTRIES, Journal
+from tormagd.assembly.journal import MAX_ENTRIES, Journal
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
@@ -185,10 +185,10 @@ def test_a_process_that_does_not_start_is_no_reason_not_to_run() -> None:
 
 def test_a_journal_that_nobody_takes_is_bounded_and_says_so() -> None:
     journal = Journal()
-    for _ in range(3 * MOST_ENTRIES + 5):
+    for _ in range(3 * MAX_ENTRIES + 5):
         journal.stepped()
     entries = journal.take()
-    assert (entries[0], len(entries) < MOST_ENTRIES) == (("missing",), True)
+    assert (entries[0], len(entries) < MAX_ENTRIES) == (("missing",), True)
 
 
 def test_without_what_writes_the_files_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

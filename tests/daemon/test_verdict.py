@@ -8,12 +8,12 @@ import pytest
 from tormagd.assembly.build import Core
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Outside, Plan
-from tormagd.daemon.verdict import ARRIVES, CANNOT, FIELD, RENDERED, Carriages, Judged, judged
+from tormagd.daemon.verdict import ARRIVES, CANNOT, FIELD, RENDERED, GapMotion, Judged, judged
 from tormagd.model.features import FEATURES
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import OperatingState
 
-CARRIAGES = Carriages(gap_speed_mm_s=40.0, lag_s=0.01, tolerance_N=0.05, release_N_s=2.0)
+CARRIAGES = GapMotion(gap_speed_mm_s=40.0, lag_s=0.01, tolerance_N=0.05, release_N_s=2.0)
 STRONG = DeviceFit(scale=1.25)
 NOTHING: tuple[Limit, ...] = ()
 

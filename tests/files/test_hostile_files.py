@@ -34,7 +34,7 @@ from tormagd_client.regular_file import require_regular
 
 TERABYTE = 1 << 40
 WITHIN_S, MEMORY_MB = 1.0, 100.0
-MOST_CHARACTERS = 600
+MAX_CHARACTERS = 600
 
 
 def _write(content: bytes) -> Callable[[Path], object]:
@@ -128,8 +128,8 @@ def refusal(name: str, kind: str, folder: Path) -> str:
         READERS[kind](path)
     except REFUSALS as error:
         said = printable(str(error))
-        if not said.isprintable() or len(said) >= MOST_CHARACTERS:
-            return f"{name} as {kind}: {said[:MOST_CHARACTERS]!r}"
+        if not said.isprintable() or len(said) >= MAX_CHARACTERS:
+            return f"{name} as {kind}: {said[:MAX_CHARACTERS]!r}"
         spent_s = time.process_time() - start_s
         grown_MB = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kB) / 1024.0
         is_late = spent_s > WITHIN_S or grown_MB > MEMORY_MB

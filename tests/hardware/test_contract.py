@@ -24,8 +24,8 @@ import numpy as np
 import pytest
 from extremes.stages import leaves
 from fault_matrix.bad_lines import (
-    MakeWay,
-    Way,
+    MakeTransfer,
+    Transfer,
     damaging,
     delaying,
     doubling,
@@ -68,7 +68,7 @@ CLOSED_MM, OPEN_MM = 46.9, 95.1
 "The stops of the gap, and a little."
 SETTLED_TICKS = 200
 "At the end of a case; on a good line the gap has long arrived by then, and nothing is saturated."
-LEAST_NUMBERS = 30
+MIN_NUMBERS = 30
 "One sample holds more in its nested values, even of a device that is not there."
 COASTING_MM = 8.0
 "How far the carriages may still close after a fault on a late line: what was on its way, and their own speed."
@@ -82,7 +82,7 @@ def descriptor(backend: Any) -> int:
     return int(backend._fd)
 
 
-def in_bursts(period_s: float) -> Way:
+def in_bursts(period_s: float) -> Transfer:
     """Nothing for so long, then all of it at once."""
     waiting: list[bytes] = []
     periods = 0
@@ -101,7 +101,7 @@ def in_bursts(period_s: float) -> Way:
 class Case(NamedTuple):
     """A kind of line and what has to come of it."""
 
-    way: MakeWay = whole
+    way: MakeTransfer = whole
     tolerance_N: float = math.inf
     "The force is rendered so well, in the end, where no fault appears."
     faults: frozenset[Fault] = frozenset()
@@ -434,7 +434,7 @@ def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
         assert CLOSED_MM < sample.truth.gap_mm < OPEN_MM
         if number % 20 == 0:
             found = [number for _, number in leaves([sample, loop.stepper])]
-            assert len(found) > LEAST_NUMBERS
+            assert len(found) > MIN_NUMBERS
             assert not any(map(math.isnan, found))
         yield sample
 

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings, strategies as st
 
 from tormagd.hardware.link_quality import LOOKED_S, LOOKS, LOSES, SETTLING_LOOKS, Counts, LinkQuality, LinkWatch
 from tormagd.hardware.link_statistics import (
-    LEAST_WINDOWS,
+    MIN_WINDOWS,
     ROUND_TRIPS,
     WINDOW_S,
     WINDOWS,
@@ -131,7 +131,7 @@ def test_memory_is_bounded_and_the_fit_follows_the_last_half_minute() -> None:
 
 
 def test_nothing_is_claimed_before_there_is_enough() -> None:
-    assert heard(lambda now_s: now_s, round((LEAST_WINDOWS - 1) * WINDOW_S / PERIOD_S)).fit() is None
+    assert heard(lambda now_s: now_s, round((MIN_WINDOWS - 1) * WINDOW_S / PERIOD_S)).fit() is None
 
 
 @pytest.mark.parametrize("step_s", [-5.0, -0.1, 0.1])

@@ -193,7 +193,7 @@ STUFFABLE_BITS, FIXED_BITS = 34, 13
 "Start, identifier, control and CRC of a classical base frame; delimiters, acknowledge, end and gap to the next."
 
 
-def most_bits(length: int) -> int:
+def max_bits(length: int) -> int:
     """Of a frame with as many stuff bits as its data can need (Davis et al., Real-Time Systems 35, 2007)."""
     stuffable = STUFFABLE_BITS + 8 * length
     return stuffable + (stuffable - 1) // 4 + FIXED_BITS
@@ -205,6 +205,6 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
     each_tick = {message.name for message in database.messages if message.cycle_time == 1}
     layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
     assert len(layouts) == len(each_tick) == 3
-    most = [most_bits(struct.calcsize(layout.format)) for layout in layouts]
+    most = [max_bits(struct.calcsize(layout.format)) for layout in layouts]
     assert sum(most) == EXCHANGE_BITS
     assert EXCHANGE_BITS == 395, "as firmware_protocol/README.md says"

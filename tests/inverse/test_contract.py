@@ -20,7 +20,7 @@ from tormagd.config import Config
 from tormagd.inverse import choice, ordered
 from tormagd.inverse.choice import RUNTIME_SOLVERS, build, mean_error_N, named
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
-from tormagd.inverse.newton import ACCURACY_MT, MOST_EVALUATIONS, RisingSearch
+from tormagd.inverse.newton import ACCURACY_MT, MAX_EVALUATIONS, RisingSearch
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.model.features import LARGEST, UNITS, Element, Scaling
 from tormagd.model.force_curve import ForceCurve, Known, Network
@@ -395,7 +395,7 @@ def solved(curve: ForceCurve, force_N: float, last_field_mT: float | None) -> Fi
         curve.force_N(solution.field_mT),
         curve.confidence(solution.field_mT, force_N - solution.predicted_force_N),
     )
-    assert 1 <= solution.iterations < MOST_EVALUATIONS
+    assert 1 <= solution.iterations < MAX_EVALUATIONS
     return solution
 
 

@@ -33,7 +33,7 @@ from tormagd.lab.ideal_carriage import (
 from tormagd.lab.main import main
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.element import Element
+from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.plant import Plant
@@ -162,7 +162,7 @@ def test_the_force_of_the_gap_is_that_of_the_devices_element() -> None:
     assert wanted.force_N == pytest.approx(np.minimum(force_N, 1.5), abs=1e-4)
     gap_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
     rendered_N = wanted.rendered_N(brake, gap_mm)
-    element, kinetic, felt = Element(plant, brake.rested_mm, STEP_S), [], []
+    element, kinetic, felt = TorqueElement(plant, brake.rested_mm, STEP_S), [], []
     for before_mm in (brake.gap_mm[0], brake.gap_mm[-1]):
         element.advance(0.0, float(before_mm), 0.0)
     for index, gap in enumerate(gap_mm.tolist()):

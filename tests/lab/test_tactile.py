@@ -208,7 +208,7 @@ def test_neighbours_decide_on_the_pad_and_nothing_on_the_brake(monkeypatch: pyte
 
 
 def test_a_model_whose_force_rises_everywhere_has_no_contact_where_it_falls(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(branches, "MOST_DRAWS", 50)
+    monkeypatch.setattr(branches, "MAX_DRAWS", 50)
     name, element, range_mT = branches.MODELS["brake"]
     model = load_model(model_path(name, Path()), element=element)
     with pytest.raises(LabError, match="at 0 of 50 contacts: needed are 60"):

@@ -153,13 +153,13 @@ def test_splitting_a_step_changes_nothing(start_N: float, end_N: float, dt_s: fl
 def test_superposition_and_the_bound_of_the_response(pairs: list[tuple[float, float]], dt_s: float) -> None:
     update = SERIES.discretise(dt_s)
     one, two, both = SERIES.relaxed(0.0), SERIES.relaxed(0.0), SERIES.relaxed(0.0)
-    largest_N = max(abs(first) for first, _ in pairs)
+    max_N = max(abs(first) for first, _ in pairs)
     for first, second in pairs:
         force_one, one = update.advance(one, first)
         force_two, two = update.advance(two, second)
         force_both, both = update.advance(both, first + second)
         assert force_both == pytest.approx(force_one + force_two, abs=1e-12)
-        assert abs(force_one) <= (1.0 + sum(SERIES.fractions)) * largest_N + 1e-12
+        assert abs(force_one) <= (1.0 + sum(SERIES.fractions)) * max_N + 1e-12
 
 
 def test_a_rested_element_carries_the_equilibrium_share_and_may_undershoot() -> None:

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.simulation.element import Element
+from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import (
     FeltHand,
     HandError,
@@ -70,7 +70,7 @@ def energies_mJ(rows: np.ndarray, impedance: Impedance) -> np.ndarray:
 def finely(name: str, impedance: Impedance, intended: RecordedHand, dt_s: float = STEP_S / 20.0) -> np.ndarray:
     """The same equations by another, explicit method, in 20 times finer steps: rows as of `at_brake`."""
     parameters = at_gap(name)
-    element = (SecondElement if parameters.second else Element)(parameters, GAP_MM, dt_s)
+    element = (SecondElement if parameters.second else TorqueElement)(parameters, GAP_MM, dt_s)
     meant_mm = np.interp(dt_s * np.arange(round(END_S / dt_s) + 1), intended.times_s, intended.positions_mm).tolist()
     place_mm = speed_mm_s = 0.0
     rows = []

@@ -138,12 +138,12 @@ def test_homing_that_fails_opens_where_it_can_and_does_not_press_shut(fault: str
     host = Bench([fault])
     before = host.device.truth
     host.command(Home)
-    smallest_mm = before.gap_mm
+    min_mm = before.gap_mm
     is_reversed = "reversed" in fault
     while host.status.mode is not DeviceMode.LATCHED:
         host.pass_time(0.01, Beat.OFF)
         assert host.now_s < (2.0 if is_reversed else 20.0)
-        smallest_mm = min(smallest_mm, host.device.truth.gap_mm)
+        min_mm = min(min_mm, host.device.truth.gap_mm)
     host.pass_time(3.0, Beat.OFF)
     assert (host.status.mode, host.status.faults) == (DeviceMode.LATCHED, DeviceFault.HOMING_FAILED)
     assert Switches.HOMED not in host.status.switches
@@ -152,7 +152,7 @@ def test_homing_that_fails_opens_where_it_can_and_does_not_press_shut(fault: str
         assert abs(host.device.truth.left_mm - before.left_mm) < 2.0
     else:
         assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
-        assert smallest_mm > 78.0
+        assert min_mm > 78.0
 
 
 def test_duties_are_applied_in_steps_of_ten_bits() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tormagd.simulation.patient import FORCE, LAW, WAY, Delay, Felt, Patient, main, run, setpoint_of
+from tormagd.simulation.patient import FORCE, LAW, WAY, Felt, NetworkDelay, Patient, main, run, setpoint_of
 from tormagd_client.messages import Motion
 
 STEP_S = 2e-3
@@ -73,7 +73,7 @@ def test_what_a_setpoint_says_in_each_mode() -> None:
     assert setpoint_of(withdrawing._replace(contact_mm=None, wall_N=0.0), LAW) == {"servo_cf": 0.1}
 
 
-def arrivals(delay: Delay[int], messages: int = 20_000) -> list[tuple[float, float, int]]:
+def arrivals(delay: NetworkDelay[int], messages: int = 20_000) -> list[tuple[float, float, int]]:
     """When what arrived: the time, when it was sent, its number."""
     found = []
     for number in range(messages):
@@ -83,23 +83,23 @@ def arrivals(delay: Delay[int], messages: int = 20_000) -> list[tuple[float, flo
 
 
 def test_a_network_delays_jitters_and_overtakes() -> None:
-    found = arrivals(Delay(0.05, 0.01, seed=3))
+    found = arrivals(NetworkDelay(0.05, 0.01, seed=3))
     late_s = np.array([arrived_s - sent_s for arrived_s, sent_s, _ in found])
     assert 0.05 <= late_s.min() < 0.052
     assert 0.059 < late_s.max() < 0.0612
     numbers = [number for *_, number in found]
     assert numbers != sorted(numbers)
     assert set(range(19_900)) <= set(numbers)
-    assert found == arrivals(Delay(0.05, 0.01, seed=3)) != arrivals(Delay(0.05, 0.01, seed=4))
+    assert found == arrivals(NetworkDelay(0.05, 0.01, seed=3)) != arrivals(NetworkDelay(0.05, 0.01, seed=4))
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.1, 1.0), (0.1, 5.0), (0.3, 20.0)])
 def test_messages_are_lost_in_bursts_and_in_an_outage(loss: float, burst: float) -> None:
-    kept = np.array([number for *_, number in arrivals(Delay(loss=loss, burst=burst), 100_000)])
+    kept = np.array([number for *_, number in arrivals(NetworkDelay(loss=loss, burst=burst), 100_000)])
     gaps = np.diff(kept) - 1
     assert 1.0 - len(kept) / 100_000 == pytest.approx(loss, rel=0.1)
     assert gaps[gaps > 0].mean() == pytest.approx(burst if burst > 1.0 else 1.0, rel=0.15)
-    silent = [number for *_, number in arrivals(Delay(outage_s=(0.1, 0.3)), 400)]
+    silent = [number for *_, number in arrivals(NetworkDelay(outage_s=(0.1, 0.3)), 400)]
     assert silent == [*range(100), *range(300, 400)]
 
 
@@ -108,8 +108,8 @@ def test_messages_are_lost_in_bursts_and_in_an_outage(loss: float, burst: float)
     [
         (lambda: Patient(stiffness_N_mm=0.0), r"stiffness_N_mm = 0\.0"),
         (lambda: Patient(friction_N=2.0, buckling_N=1.0), r"buckling_N = 1\.0"),
-        (lambda: Delay(loss=0.9), r"loss = 0\.9"),
-        (lambda: Delay(burst=math.nan), "burst = nan"),
+        (lambda: NetworkDelay(loss=0.9), r"loss = 0\.9"),
+        (lambda: NetworkDelay(burst=math.nan), "burst = nan"),
         (lambda: Patient(lag_s=math.nan), "lag_s = nan"),
     ],
 )
@@ -146,7 +146,14 @@ def test_the_process_feels_where_the_handle_was_and_says_it_later() -> None:
     patient = Patient(wall_mm=10.0, stiffness_N_mm=0.5)
     over = lambda now_s: now_s >= 1.5  # noqa: E731
     count = run(
-        daemon, patient, LAW, Delay(*network, seed=1), Delay(*network, seed=2), over, daemon.clock_s, daemon.wait
+        daemon,
+        patient,
+        LAW,
+        NetworkDelay(*network, seed=1),
+        NetworkDelay(*network, seed=2),
+        over,
+        daemon.clock_s,
+        daemon.wait,
     )
     assert count == len(daemon.published) > 100
     stamps = [stamp_ns for _, _, stamp_ns, _ in daemon.published]

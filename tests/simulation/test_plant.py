@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.simulation.axis import Axis
-from tormagd.simulation.element import Element
+from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import PressingHand, ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant
 from tormagd.simulation.plant import SUBSTEP_S, Plant
@@ -254,7 +254,7 @@ def without_memory(plant: PlantParameters) -> PlantParameters:
 @pytest.mark.parametrize("gap_mm", [45.0, 60.0, 94.9])
 def test_without_memory_the_force_is_the_constitutive_law_at_the_true_gap(name: str, gap_mm: float) -> None:
     plant = without_memory(load_plant(name))
-    element = Element(plant, gap_mm, STEP_S)
+    element = TorqueElement(plant, gap_mm, STEP_S)
     for step in range(400):
         element.advance(step * STEP_S, gap_mm, SPEED_MM_S)
     of = plant.elastomer
@@ -275,7 +275,7 @@ def test_the_joined_field_law_is_smooth_and_falls() -> None:
 @pytest.mark.parametrize("steps", [10, 1000])
 def test_hysteresis_lags_and_does_not_depend_on_the_rate(steps: int) -> None:
     quiet = without_memory(SAMPLE_1)
-    element = Element(changed(quiet, "field", hysteresis_percent=1.0), 60.0, STEP_S)
+    element = TorqueElement(changed(quiet, "field", hysteresis_percent=1.0), 60.0, STEP_S)
 
     def sweep(start_mm: float, end_mm: float) -> float:
         for step in range(1, steps + 1):
@@ -289,11 +289,11 @@ def test_hysteresis_lags_and_does_not_depend_on_the_rate(steps: int) -> None:
     assert opening_N > closing_N
     # 1% of the largest moment to either side, with F about proportional to the square of the moment
     assert opening_N / closing_N - 1.0 == pytest.approx(4 * 0.01 * (60.0 / 45.0) ** 1.3, rel=0.1)
-    assert (opening_N + closing_N) / 2.0 == pytest.approx(Element(quiet, 60.0, STEP_S).kinetic_N, rel=0.01)
+    assert (opening_N + closing_N) / 2.0 == pytest.approx(TorqueElement(quiet, 60.0, STEP_S).kinetic_N, rel=0.01)
 
 
 def test_force_relaxes_after_a_field_step_by_the_stated_share() -> None:
-    element = Element(changed(SAMPLE_1, "thermal", drift_K_h=0.0), 94.0, 0.1)
+    element = TorqueElement(changed(SAMPLE_1, "thermal", drift_K_h=0.0), 94.0, 0.1)
     before_N = element.kinetic_N
     element.advance(0.0, 50.0, SPEED_MM_S)
     step_N = element.kinetic_N - before_N
@@ -306,8 +306,8 @@ def test_force_relaxes_after_a_field_step_by_the_stated_share() -> None:
 
 
 def test_warming_weakens_the_force_and_levels_off() -> None:
-    element = Element(without_memory(SAMPLE_1), 50.0, STEP_S)
-    warm = Element(msgspec.structs.replace(without_memory(SAMPLE_1), thermal=SAMPLE_1.thermal), 50.0, STEP_S)
+    element = TorqueElement(without_memory(SAMPLE_1), 50.0, STEP_S)
+    warm = TorqueElement(msgspec.structs.replace(without_memory(SAMPLE_1), thermal=SAMPLE_1.thermal), 50.0, STEP_S)
     for one in (element, warm):
         one.advance(3600.0, 50.0, SPEED_MM_S)
     assert warm.temperature_C == pytest.approx(25.97, abs=0.01)

@@ -20,9 +20,9 @@ from firmware_protocol.c.build import BuildError
 from tormagd.assembly.build import build_core
 from tormagd.config import Config, RealTime, load_config
 from tormagd.lab.told import lines
-from tormagd.lab.tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, corner_margins
+from tormagd.lab.tune_position import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG, corner_margins
 from tormagd.scenes.scene import shipped_scenes
-from tormagd.simulation.element import Element
+from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.parameters import load_plant
 
 # -- inverse, its quick run --------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_the_plant_of_the_workload_is_the_plant():
         thermal=msgspec.structs.replace(plant.thermal, force_percent_K=0.0),
     )
     gap, speed, travel, dt = 60.0, 20.0, 1.8, 1e-4
-    element = Element(still, gap, dt)
+    element = TorqueElement(still, gap, dt)
     for tick in range(20_000):
         element.advance(tick * dt, gap, -speed)
     for tick in range(round(travel / speed / dt)):
@@ -179,8 +179,8 @@ def test_a_wrong_motor_is_noticed_in_the_comparison():
 
 def test_the_shipped_gains_are_robust():
     corners = corner_margins(Config())
-    assert corners["gain_margin_dB"] >= LEAST_GAIN_MARGIN_DB
-    assert corners["phase_margin_deg"] >= LEAST_PHASE_MARGIN_DEG
+    assert corners["gain_margin_dB"] >= MIN_GAIN_MARGIN_DB
+    assert corners["phase_margin_deg"] >= MIN_PHASE_MARGIN_DEG
 
 
 # -- timing, on made-up measurements -----------------------------------------------------------------------------------

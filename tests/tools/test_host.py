@@ -65,4 +65,4 @@ def test_a_timer_on_every_processor_and_a_process_that_waits(tmp_path: Path):
     assert 0.0 <= found.steal <= 1.0
     assert 0.0 <= found.bare_kept <= 1.0
     assert (set(found.waited), (tmp_path / "log").read_text()) == ({"test"}, "")
-    assert len(watched._stalls) == min(len(os.sched_getaffinity(0)), host.MOST_TIMERS)
+    assert len(watched._stalls) == min(len(os.sched_getaffinity(0)), host.MAX_TIMERS)

@@ -12,8 +12,8 @@ from benchmarks.scenes import RATES_HZ, case_of, measured_scene
 from rendering import scene_runs
 from rendering.scene_runs import Case, Play, run, run_all
 
-from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, Way, allowed_N, measured
-from tormagd.scenes.scene import LEAST_CONTROL_HZ, load_scene, shipped_scenes
+from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, OperatingPoint, allowed_N, measured
+from tormagd.scenes.scene import MIN_CONTROL_HZ, load_scene, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
 STORED = measured()
@@ -27,8 +27,8 @@ def test_what_is_stored_follows_from_its_own_numbers_and_acts(scene: MeasuredSce
         scene.chosen.control_hz,
         scene.chosen.inference_hz,
     )
-    assert scene.chosen.control_hz >= LEAST_CONTROL_HZ
-    assert scene.usual.way == Way(*RATES_HZ[0], scene.chosen.search)
+    assert scene.chosen.control_hz >= MIN_CONTROL_HZ
+    assert scene.usual.way == OperatingPoint(*RATES_HZ[0], scene.chosen.search)
     decided = [item for item in scene.judged if item.group == "deciding"]
     if scene.chosen != scene.usual.way:
         assert all(item.rms_N <= allowed_N(item.usual_N, scene.tolerance_N) for item in decided)

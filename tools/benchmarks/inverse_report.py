@@ -23,7 +23,7 @@ COLUMNS = {
     "memory kB": "{memory_kB:.1f}",
     "Pareto": "{pareto}",
 }
-LEAST_SHOWN_MT = 1e-6
+MIN_SHOWN_MT = 1e-6
 "Newton comes to 1e-11 mT, which would squeeze what matters; the page says so."
 MARKERS = {
     "thesis-linear": "v",
@@ -100,7 +100,7 @@ def plot(result: dict[str, Any], figures: list[str]) -> None:
 def _scatter(axes: Axes, rows: list[dict[str, Any]], error: str) -> None:
     for solver, marker in MARKERS.items():
         found = [row for row in rows if row["solver"] == solver]
-        errors_mT = [max(row[error], LEAST_SHOWN_MT) for row in found]
+        errors_mT = [max(row[error], MIN_SHOWN_MT) for row in found]
         axes.scatter([row["p50_us"] for row in found], errors_mT, marker=marker, s=40, alpha=0.8, label=solver)
     axes.set(xscale="log", yscale="log", xlabel="time of a solve, us (p50)")
     axes.grid(alpha=0.3)

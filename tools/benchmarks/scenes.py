@@ -28,12 +28,12 @@ from tormagd.lab import executors
 from tormagd.lab.arrays import Json
 from tormagd.scenes.measured import (
     FILE,
-    Judged,
-    Measured,
     MeasuredScene,
+    Measurements,
+    OperatingPoint,
     Share,
     Tried,
-    Way,
+    WorstDevice,
     allowed_N,
     measured,
 )
@@ -47,7 +47,7 @@ RATES_HZ = (1_000, 500), (1_000, 83), (500, 500), (500, 83)
 "Of control and of plans: the usual ones, and what may be chosen in their place."
 SEARCHES = "newton", "nearest"
 "Those that need no torch."
-THESIS = Way(500, 83, "thesis")
+THESIS = OperatingPoint(500, 83, "thesis")
 "The thesis's own loop."
 FIRST_DECIDING, FIRST_JUDGING = 80, 100
 "Of the draws of the plant card; twice as many judge as decide."
@@ -74,7 +74,7 @@ def measure(options: argparse.Namespace) -> Json:
     """`{scenes: [...], measured_machine_us}`: each scene's figures."""
     file = measured()
     if options.shares:
-        ways = [*(Way(*hz, search) for hz in RATES_HZ for search in SEARCHES), THESIS]
+        ways = [*(OperatingPoint(*hz, search) for hz in RATES_HZ for search in SEARCHES), THESIS]
         shares = tuple(shares_of(ways, options.pairs, options.seconds))
         file = msgspec.structs.replace(file, shares=shares, pairs=options.pairs, machine_us=round(machine_us(), 1))
         store(file, options.store)
@@ -92,13 +92,13 @@ def measure(options: argparse.Namespace) -> Json:
     return {"scenes": [figures(scene, file) for scene in file.scenes], "measured_machine_us": file.machine_us}
 
 
-def store(file: Measured, is_wanted: bool) -> None:
+def store(file: Measurements, is_wanted: bool) -> None:
     """Write the file that comes with the package, where that is wanted."""
     if is_wanted:
         STORED.write_bytes(msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n")
 
 
-def figures(scene: MeasuredScene, file: Measured) -> Json:
+def figures(scene: MeasuredScene, file: Measurements) -> Json:
     """One scene's choice as numbers. `full` is the usual way."""
     chosen, usual = file.share(scene.chosen), file.share(scene.usual.way)
     return {
@@ -127,7 +127,7 @@ def measured_scene(name: str, runs: Runs, draws: int = DRAWS) -> MeasuredScene:
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
     own = choose_solver(scene).solver
-    ways = [Way(*hz, own) for hz in RATES_HZ]
+    ways = [OperatingPoint(*hz, own) for hz in RATES_HZ]
     tried = [tried_way(name, way, runs) for way in ways]
     tolerance_N = scene.force.tolerance_rms_N
     usual, *others = tried
@@ -141,20 +141,22 @@ def measured_scene(name: str, runs: Runs, draws: int = DRAWS) -> MeasuredScene:
             chosen, judged = other.way, found
             break
     hz = chosen.control_hz, chosen.inference_hz
-    tried += [tried_way(name, Way(*hz, search), runs) for search in SEARCHES if search != own]
+    tried += [tried_way(name, OperatingPoint(*hz, search), runs) for search in SEARCHES if search != own]
     if scene.element == "torque":
         tried.append(tried_way(name, THESIS, runs))
     return MeasuredScene(scene.name, scene.fingerprint, tolerance_N, chosen, tuple(tried), judged)
 
 
-def tried_way(name: str, way: Way, runs: Runs) -> Tried:
+def tried_way(name: str, way: OperatingPoint, runs: Runs) -> Tried:
     """The scene's own signal on the samples."""
     cases = [case_of(name, way, device, "signal", is_learning=True) for device in SAMPLES]
     found = runs(cases)
     return Tried(way, tuple(found[case] for case in cases))
 
 
-def judge(name: str, scene: Scene, way: Way, usual: Way, runs: Runs, draws: int) -> tuple[Judged, ...]:
+def judge(
+    name: str, scene: Scene, way: OperatingPoint, usual: OperatingPoint, runs: Runs, draws: int
+) -> tuple[WorstDevice, ...]:
     """The worst device of each group in each situation, beside the usual way."""
     tolerance_N = scene.force.tolerance_rms_N
     worst = []
@@ -162,7 +164,7 @@ def judge(name: str, scene: Scene, way: Way, usual: Way, runs: Runs, draws: int)
         ours, theirs = ([case_of(name, each, device, situation, learns) for device in devices] for each in (way, usual))
         found = runs([*ours, *theirs])
         outcomes = [
-            Judged(group, one.device, situation, learns, found[one], found[other])
+            WorstDevice(group, one.device, situation, learns, found[one], found[other])
             for one, other in zip(ours, theirs, strict=True)
         ]
         worst.append(max(outcomes, key=lambda item: item.rms_N - allowed_N(item.usual_N, tolerance_N)))
@@ -189,14 +191,14 @@ def groups(scene: Scene, draws: int) -> list[tuple[str, str, tuple[str, ...], bo
     ]
 
 
-def case_of(name: str, way: Way, device: str, situation: str, is_learning: bool) -> Case:
+def case_of(name: str, way: OperatingPoint, device: str, situation: str, is_learning: bool) -> Case:
     """The run of a scene served in this way."""
     return Case(name, device, situation, way.search, is_learning, way.control_hz, way.inference_hz)
 
 
-def shares_of(ways: list[Way], pairs: int, seconds: float) -> list[Share]:
+def shares_of(ways: list[OperatingPoint], pairs: int, seconds: float) -> list[Share]:
     """What each way takes, in the median of turns over all of them."""
-    found: dict[Way, list[Share]] = {way: [] for way in ways}
+    found: dict[OperatingPoint, list[Share]] = {way: [] for way in ways}
     for turn in range(pairs):
         for way in ways if turn % 2 == 0 else ways[::-1]:
             found[way].append(share_of(way, seconds))
@@ -206,7 +208,7 @@ def shares_of(ways: list[Way], pairs: int, seconds: float) -> list[Share]:
     ]
 
 
-def share_of(way: Way, seconds: float) -> Share:
+def share_of(way: OperatingPoint, seconds: float) -> Share:
     """One run of a daemon that serves SHARED_SCENE in this way, with setpoints as often as plans."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
         scene = Path(folder) / "scene.toml"
@@ -217,7 +219,7 @@ def share_of(way: Way, seconds: float) -> Share:
         return _share_of(way, stand, Path(folder), seconds)
 
 
-def _share_of(way: Way, stand: loop.Stand, folder: Path, seconds: float) -> Share:
+def _share_of(way: OperatingPoint, stand: loop.Stand, folder: Path, seconds: float) -> Share:
     with loop.daemon(stand, folder) as (config, pid):
         time.sleep(SETTLES_S)
         _, daemon, _ = loop.spent(pid, partial(time.sleep, seconds))

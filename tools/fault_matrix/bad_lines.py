@@ -16,23 +16,23 @@ DELIMITER = b"\x00"
 SEED = 7
 
 
-Way = Callable[[float, list[bytes]], list[bytes]]
+Transfer = Callable[[float, list[bytes]], list[bytes]]
 """One direction of a line: what comes out of it now, of these units, frames as bytes, and earlier ones."""
-MakeWay = Callable[[], Way]
+MakeTransfer = Callable[[], Transfer]
 
 
-def whole() -> Way:
+def whole() -> Transfer:
     """Brings every unit at once."""
     return lambda _now_s, units: units
 
 
-def losing(share: float) -> Way:
+def losing(share: float) -> Transfer:
     """Loses a share of the units."""
     draw = random.Random(SEED)
     return lambda _now_s, units: [unit for unit in units if draw.random() >= share]
 
 
-def damaging(share: float) -> Way:
+def damaging(share: float) -> Transfer:
     """Flips a bit in a share of the units."""
     draw = random.Random(SEED)
 
@@ -43,12 +43,12 @@ def damaging(share: float) -> Way:
     return lambda _now_s, units: [flipped(unit) if draw.random() < share else unit for unit in units]
 
 
-def doubling() -> Way:
+def doubling() -> Transfer:
     """Every unit comes twice."""
     return lambda _now_s, units: [unit for unit in units for _ in range(2)]
 
 
-def reordering(share: float) -> Way:
+def reordering(share: float) -> Transfer:
     """A share of the units is overtaken by the next."""
     draw, waiting = random.Random(SEED), list[bytes]()
 
@@ -65,7 +65,7 @@ def reordering(share: float) -> Way:
     return carry
 
 
-def delaying(delay_s: float) -> Way:
+def delaying(delay_s: float) -> Transfer:
     """Every unit comes so much later."""
     waiting: list[tuple[float, bytes]] = []
 
@@ -96,7 +96,7 @@ class _Spoilt(Generic[DeviceT]):
     def truth(self) -> Truth:
         return self._device.truth
 
-    def spoil(self, way: MakeWay) -> None:
+    def spoil(self, way: MakeTransfer) -> None:
         """From now on."""
         self._up, self._down = way(), way()
 

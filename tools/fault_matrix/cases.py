@@ -3,7 +3,7 @@
 from functools import partial
 from typing import NamedTuple
 
-from fault_matrix.bad_lines import MakeWay, damaging, delaying, doubling, losing, reordering, whole
+from fault_matrix.bad_lines import MakeTransfer, damaging, delaying, doubling, losing, reordering, whole
 
 OPENS = "opens"
 "The gap is open and the force below 1 N."
@@ -15,7 +15,7 @@ LIMITED = "limited"
 "The force stays within the scene's range, and no fault opens the gap."
 HELD_OR_OPENS = "held or opens"
 STAYS = "stays"
-"Nothing can open the gap, or nothing has been driven: it closes by no more than MOST_CLOSED_MM."
+"Nothing can open the gap, or nothing has been driven: it closes by no more than MAX_CLOSED_MM."
 
 SERIAL, CAN = "serial", "can"
 DRIVEN = "1.8 ± 0.1 N at 1 Hz, handle at 42 mm/s"
@@ -37,7 +37,7 @@ class Injection(NamedTuple):
     device: str | None = None
     host: str | None = None
     stall_ms: int = 0
-    way: MakeWay = whole
+    way: MakeTransfer = whole
     fill_frames_ms: float = 0.0
     sensor: str | None = None
     publisher: str | None = None

@@ -6,7 +6,7 @@ nothing, or the fault be named all the while. Afterwards the force has to be fol
 
 from fault_matrix.cases import Injection
 from fault_matrix.rig import Rig
-from fault_matrix.watch import MOST_OFF_N, MOST_OVER_N, Cell
+from fault_matrix.watch import MAX_OFF_N, MAX_OVER_N, Cell
 from tormagd.daemon.arming import Arming
 from tormagd.safety.operating_state import OperatingState, next_commands
 
@@ -67,7 +67,7 @@ def _follow(rig: Rig) -> tuple[bool, set[str]]:
         off_N.append(rig.off_N)
         if sample is not None:
             told.update(map(str, (*sample.plan.limits, *sample.output.limits)))
-    is_held = abs(sum(off_N) / len(off_N)) < MOST_OFF_N and max(off_N) < MOST_OVER_N
+    is_held = abs(sum(off_N) / len(off_N)) < MAX_OFF_N and max(off_N) < MAX_OVER_N
     return rig.safety.operating_state is OperatingState.ENABLED and is_held, told
 
 

@@ -13,11 +13,11 @@ SAFE_N = 1.0
 OPEN_MM = 94.0
 LOSS_MS = 50
 "A loss of force is what a hand feels of it: the greatest over so long."
-MOST_OFF_N = 0.15
+MAX_OFF_N = 0.15
 "A force that is held is off by no more, in the mean of the last second,"
-MOST_OVER_N = 0.3
+MAX_OVER_N = 0.3
 "and never too great by more."
-MOST_CLOSED_MM = 3.0
+MAX_CLOSED_MM = 3.0
 "What is not driven, or homed, closes by no more than a few mm."
 REFUSED_MS = 100.0
 "A command is refused by then: at once."
@@ -187,15 +187,15 @@ class Watch:
     def _ended(self, safe: str, noticed_ms: float | None) -> tuple[bool, float | None]:
         """Whether it ended as stated, and since when."""
         has_opened = {"open", "below"} <= set(self._since_s)
-        last_second, is_not_over = self._off_N[-1000:], max(self._off_N) < MOST_OVER_N
-        is_held = abs(sum(last_second) / len(last_second)) < MOST_OFF_N and is_not_over
+        last_second, is_not_over = self._off_N[-1000:], max(self._off_N) < MAX_OVER_N
+        is_held = abs(sum(last_second) / len(last_second)) < MAX_OFF_N and is_not_over
         if safe == STAYS:
-            is_still = "resting" in self._since_s and min(self._gaps_mm) > self._gaps_mm[0] - MOST_CLOSED_MM
+            is_still = "resting" in self._since_s and min(self._gaps_mm) > self._gaps_mm[0] - MAX_CLOSED_MM
             return is_still, self._since("resting")
         if safe == LIMITED:
-            return not self._host and max(self._forces_N) < self._rig.most_N + MOST_OVER_N, noticed_ms
+            return not self._host and max(self._forces_N) < self._rig.most_N + MAX_OVER_N, noticed_ms
         if safe == FOLLOWED:
-            is_there = abs(self._forces_N[-1] - OTHER_N) < MOST_OFF_N and is_not_over
+            is_there = abs(self._forces_N[-1] - OTHER_N) < MAX_OFF_N and is_not_over
             return is_there and not self._host, self._since("below")
         if has_opened and safe in (OPENS, HELD_OR_OPENS):
             return True, self._since("open")

@@ -20,7 +20,7 @@ from typing import IO, NamedTuple
 
 PERIOD_NS = 1_000_000
 "Between the beats of a bare timer."
-MOST_TIMERS = 8
+MAX_TIMERS = 8
 "Processors that are watched at most; a timer costs 2% of one."
 LOOK_S = 0.2
 "How often the kernel's counters are read."
@@ -28,16 +28,16 @@ STALL_MS = 10.0
 "A bare timer that stood still so long has found a stall: a fifth of the time after which a device opens by itself."
 HOST_SHARE = 0.5
 "Of the time that a device waits for a command: a processor that stood still for less is not why something was late."
-LEAST_KEPT = 0.99
+MIN_KEPT = 0.99
 "Share of its beats below which a bare timer says that the host does not leave enough."
-MOST_WAITED = 0.1
+MAX_WAITED = 0.1
 """Share of the time above which a process that waits for a processor has not been left enough. With FIFO the daemon
 waits for 3 to 8% of it, 30 to 80 us a wake-up; without, beside four busy loops, for a third."""
-MOST_WAIT_MS = 25.0
-"""Over what MOST_WAITED allows between two looks. Who once waited for so much longer has lost half of the time after
+MAX_WAIT_MS = 25.0
+"""Over what MAX_WAITED allows between two looks. Who once waited for so much longer has lost half of the time after
 which a device opens by itself. Beside four busy loops, without FIFO, a device stood still for 110 ms while every bare
 timer, which sleeps more, kept its beats."""
-MOST_BLOCKED = 0.02
+MAX_BLOCKED = 0.02
 """Share of the time above which waiting for disk or memory is taken for a hold-up. Once a device that writes its truth
 to a disk stood still for 38 ms while every bare timer kept its beats. The disk was why, or what carries a pty's bytes
 (`wire.py`), which was not known then. Neither is shown."""
@@ -70,26 +70,26 @@ class Host(NamedTuple):
     waited: dict[str, float]
     blocked: float = 0.0
     waited_worst_ms: float = 0.0
-    "The most that a process has waited between two looks, less MOST_WAITED of that time."
+    "The most that a process has waited between two looks, less MAX_WAITED of that time."
 
     @property
     def took_much(self) -> bool:
         """Whether a real-time program could not have kept its time."""
         return (
             self.bare_worst_ms >= STALL_MS
-            or self.bare_kept < LEAST_KEPT
-            or max(self.waited.values(), default=0.0) > MOST_WAITED
-            or self.waited_worst_ms > MOST_WAIT_MS
-            or self.blocked > MOST_BLOCKED
+            or self.bare_kept < MIN_KEPT
+            or max(self.waited.values(), default=0.0) > MAX_WAITED
+            or self.waited_worst_ms > MAX_WAIT_MS
+            or self.blocked > MAX_BLOCKED
         )
 
     def __str__(self) -> str:
         """One clause for a sentence."""
         name, share = max(self.waited.items(), key=lambda item: item[1], default=("", 0.0))
         waited = ""
-        if share > MOST_WAITED:
+        if share > MAX_WAITED:
             waited = f", and the {name} waited for a processor for {share:.0%} of the time"
-        elif self.waited_worst_ms > MOST_WAIT_MS:
+        elif self.waited_worst_ms > MAX_WAIT_MS:
             waited = f", and a process waited for a processor for some {self.waited_worst_ms:.0f} ms together"
         return (
             f"a bare timer stood still for up to {self.bare_worst_ms:.0f} ms and kept {self.bare_kept:.1%} of its "
@@ -107,7 +107,7 @@ class HostWatch:
         command = [sys.executable, str(Path(__file__).parents[1] / "bare_timer.py"), "--fifo", str(fifo_priority)]
         self._timers = [
             subprocess.Popen([*command, "--cpu", str(cpu)], stdout=subprocess.PIPE, stderr=log, text=True)
-            for cpu in sorted(os.sched_getaffinity(0))[:MOST_TIMERS]
+            for cpu in sorted(os.sched_getaffinity(0))[:MAX_TIMERS]
         ]
         self._stalls: list[list[Stall]] = []
         self._pids: dict[str, int] = {}
@@ -167,9 +167,9 @@ class HostWatch:
 
 
 def waited_over_s(before: Counters, after: Counters) -> float:
-    """The most that a process, which both looks saw, has waited between them, less MOST_WAITED of that time."""
+    """The most that a process, which both looks saw, has waited between them, less MAX_WAITED of that time."""
     waits_s = [after.waited_s[name] - waited_s for name, waited_s in before.waited_s.items() if name in after.waited_s]
-    return max(max(waits_s, default=0.0) - MOST_WAITED * (after.time_s - before.time_s), 0.0)
+    return max(max(waits_s, default=0.0) - MAX_WAITED * (after.time_s - before.time_s), 0.0)
 
 
 def kept(stalls: list[Stall], start_s: float, end_s: float) -> float:

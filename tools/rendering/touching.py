@@ -27,14 +27,14 @@ from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import FeltHand, Impedance
 from tormagd.simulation.parameters import with_insert
-from tormagd.simulation.patient import Delay
+from tormagd.simulation.patient import NetworkDelay
 from tormagd.simulation.plant import Plant, Truth
 
 PERIOD_S = 1e-3
 SETPOINT_TICKS = 2
 BURST = 25.0
 "Setpoints that are lost in a row, in the mean: 50 ms."
-MOST_N = 2.0
+MAX_N = 2.0
 "What hand and wall come to rest at."
 FREE_MM = 20.0
 "From where the hand begins to push to the wall."
@@ -65,7 +65,7 @@ class Case(NamedTuple):
     jitter_ms: float = 0.0
     loss: float = 0.0
     is_known: bool = True
-    most_N: float = MOST_N
+    most_N: float = MAX_N
 
 
 class Touch(NamedTuple):
@@ -96,8 +96,8 @@ class Link:
 
     def __init__(self, case: Case, wall: Wall, withdraw_N: float) -> None:
         one_way_s, jitter_s = 5e-4 * case.round_trip_ms, 1e-3 * case.jitter_ms
-        self._there: Delay[float] = Delay(one_way_s, jitter_s, case.loss, BURST, seed=1)
-        self._back: Delay[TimedSetpoint] = Delay(one_way_s, jitter_s, case.loss, BURST, seed=2)
+        self._there: NetworkDelay[float] = NetworkDelay(one_way_s, jitter_s, case.loss, BURST, seed=1)
+        self._back: NetworkDelay[TimedSetpoint] = NetworkDelay(one_way_s, jitter_s, case.loss, BURST, seed=2)
         self._wall, self._withdraw_N, self._mode = wall, withdraw_N, case.mode
         self._is_known = case.is_known
         self._tip: tuple[float, float] | None = None

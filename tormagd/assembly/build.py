@@ -33,12 +33,12 @@ from tormagd.physics.errors import DomainError, require
 from tormagd.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
 from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Finger, Scene, load_scene, scene_path
+from tormagd.scenes.scene import AUTO, MIN_CONTROL_HZ, Finger, Scene, load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
-LEAST_PHASE_MARGIN_DEG = 30.0
-LEAST_GAIN_MARGIN_DB = 4.0
+MIN_PHASE_MARGIN_DEG = 30.0
+MIN_GAIN_MARGIN_DB = 4.0
 SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
 SOURCES += ("tormagd/hardware", "tormagd/control", "tormagd/assembly")
 SENSED_N = 0.001
@@ -230,11 +230,11 @@ def _known_fields_mT(
 def _refuse_unstable(config: Config) -> Margins:
     """Return the position loop's stability margins. Raises ConfigError where the phase or gain margin is too small."""
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
-    if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
+    if stability.phase_margin_deg < MIN_PHASE_MARGIN_DEG or stability.gain_margin_dB < MIN_GAIN_MARGIN_DB:
         raise ConfigError(
             f"position: these gains leave a phase margin of {stability.phase_margin_deg:.0f} degrees and a gain margin "
-            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {LEAST_PHASE_MARGIN_DEG:g} and "
-            f"{LEAST_GAIN_MARGIN_DB:g}"
+            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {MIN_PHASE_MARGIN_DEG:g} and "
+            f"{MIN_GAIN_MARGIN_DB:g}"
         )
     return stability
 
@@ -243,11 +243,11 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
     """Raise ConfigError where half of the allowed voltage cannot open the scene's closed gap against the magnets."""
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
     needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
-    most_V = config.position.duty_limit * motor.supply_V / 2.0
-    if needed_V > most_V:
+    max_V = config.position.duty_limit * motor.supply_V / 2.0
+    if needed_V > max_V:
         raise ConfigError(
             f"motor: coulomb_V = {motor.coulomb_V:g} and pull_V = {motor.pull_V:g} take {needed_V:.2f} V to open the "
-            f"gap from {closed_mm:g} mm: allowed is {most_V:g} V, half of position.duty_limit times motor.supply_V"
+            f"gap from {closed_mm:g} mm: allowed is {max_V:g} V, half of position.duty_limit times motor.supply_V"
         )
 
 
@@ -271,12 +271,12 @@ def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
 def at_rates_of(scene: Scene, config: Config) -> Config:
     """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`.
 
-    The control rate is LEAST_CONTROL_HZ at least. Raises ConfigError for rates that a configuration may not have.
+    The control rate is MIN_CONTROL_HZ at least. Raises ConfigError for rates that a configuration may not have.
     """
     if not config.rates.of_scene:
         return config
     needed = scene.bandwidth
-    control_hz = max(needed.control_hz, LEAST_CONTROL_HZ)
+    control_hz = max(needed.control_hz, MIN_CONTROL_HZ)
     rates = msgspec.structs.replace(config.rates, control_hz=control_hz, inference_hz=needed.inference_hz)
     try:
         return msgspec.structs.replace(config, rates=rates)

@@ -45,7 +45,7 @@ COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
 "A conversation began or ended. READ and WROTE, its other entries, are in `keeping`, for the black box's process."
 STATE, MISSING = "state", "missing"
-MOST_ENTRIES = 4_096
+MAX_ENTRIES = 4_096
 "So many entries that nobody took are dropped, and MISSING stands in their place."
 
 _LENGTH = struct.Struct(">I")
@@ -137,10 +137,10 @@ class Journal:
         return entries
 
     def _add(self, entry: Entry) -> None:
-        """Add an entry if the journal is kept; MOST_ENTRIES that nobody took are first replaced by MISSING."""
+        """Add an entry if the journal is kept; MAX_ENTRIES that nobody took are first replaced by MISSING."""
         if not self.is_kept:
             return
-        if len(self._entries) >= MOST_ENTRIES:
+        if len(self._entries) >= MAX_ENTRIES:
             self._entries = [(MISSING,)]
         self._entries.append(entry)
 

@@ -8,9 +8,9 @@ from tormagd.physics.errors import DomainError
 
 STRETCHES: Final = 1024
 "Number of equal stretches that a rising list is divided into, to find a place fast: few points share one."
-LEAST_SPAN: Final = 1e-9
+MIN_SPAN: Final = 1e-9
 "A list that spans less counts as spanning this much: no division by 0."
-LEAST_STEP: Final = 1e-200
+MIN_STEP: Final = 1e-200
 "Between neighbours that differ by less there is no finite slope."
 
 
@@ -19,16 +19,16 @@ class Rising:
     """A list (n) of finite numbers that rises, with a fast search for a value's place. The order is not checked.
 
     Raises DomainError for a number that is not finite or too large, and for neighbours that differ by less than
-    LEAST_STEP. Equal neighbours are allowed.
+    MIN_STEP. Equal neighbours are allowed.
     """
 
     def __init__(self, values: list[float]) -> None:
         for place, value in enumerate(values):
             require_number("values", value)
-            if place and 0.0 < abs(value - values[place - 1]) < LEAST_STEP:
-                raise DomainError("values", value, f"{values[place - 1]:g}, or {LEAST_STEP:g} from there")
+            if place and 0.0 < abs(value - values[place - 1]) < MIN_STEP:
+                raise DomainError("values", value, f"{values[place - 1]:g}, or {MIN_STEP:g} from there")
         self.values: Final = values
-        self._per_unit: Final = STRETCHES / max(values[-1] - values[0], LEAST_SPAN)
+        self._per_unit: Final = STRETCHES / max(values[-1] - values[0], MIN_SPAN)
         # how many points lie before each stretch, and last, before what is beyond them; values find theirs alike
         points_in = [0] * (STRETCHES + 1)
         for value in values:

@@ -30,7 +30,7 @@ STEP_SHARES = (1.0, 0.0, 0.5, 1.0, 0.25, 0.75)
 STEP_S = 2.0
 ARRIVED_S = 1.0
 "Time at the start of every step that is left to the carriages and the fit."
-LEAST_SLIDING = 0.3
+MIN_SLIDING = 0.3
 "A handle that moves for less than this share of the time has taught little."
 KEPT_WITHIN_S = 5.0
 DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
@@ -109,9 +109,9 @@ def judged(steps: Columns, waveform: Waveform, zero_N: float) -> dict[str, Any]:
 
 
 def require_sliding(ticks: Columns) -> None:
-    """Raise CommandError (REFUSED) where the handle moved for less than LEAST_SLIDING of the ticks."""
+    """Raise CommandError (REFUSED) where the handle moved for less than MIN_SLIDING of the ticks."""
     share = float(_sliding(ticks).mean()) if ticks["handle_rate_mm_s"].size else 0.0
-    if share < LEAST_SLIDING:
+    if share < MIN_SLIDING:
         raise _still(share)
 
 
@@ -134,7 +134,7 @@ def _still(share: float) -> CommandError:
     return CommandError(
         Exit.REFUSED,
         "handle_still",
-        f"the handle moved in {share:.0%} of the time: needed are {LEAST_SLIDING:.0%}, at {MOVING_MM_S:g} mm/s",
+        f"the handle moved in {share:.0%} of the time: needed are {MIN_SLIDING:.0%}, at {MOVING_MM_S:g} mm/s",
         "turn it to and fro until the gap opens",
     )
 

@@ -42,7 +42,7 @@ JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.0
 JUMP_S = 0.6
 ROUNDS = 2
 "The whole is done twice: one half is fitted, the other judges."
-LEAST_HZ = 900.0
+MIN_HZ = 900.0
 "Least control rate. A log of 500 Hz gets a motor's delay wrong, and the rest two to three times less exact."
 LONGEST_HOLE_S = 0.02
 "A longer silence of the device is not bridged."
@@ -65,13 +65,13 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
     """Drive both carriages through `excitation`, and write the log of one to the new file `path`.
 
     The gap opens in the end. Raises as `reach`, `armed` and `Run.play`. Raises CommandError (REFUSED) for a control
-    rate under LEAST_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this shows only
+    rate under MIN_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this shows only
     after the drive.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         waveform = excitation(reach(client, scene_most_N))
         hz = client.status().rates["control"].hz
-        if hz < LEAST_HZ:
+        if hz < MIN_HZ:
             raise CommandError(
                 Exit.REFUSED,
                 "slow_control",

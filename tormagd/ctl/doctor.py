@@ -18,7 +18,7 @@ import msgspec
 
 from firmware_protocol.build import COST, REMEDY, settle
 from tormagd.config import Config
-from tormagd.ctl.headroom import MOST_STOLEN, MOST_USED, MOST_WAITED, Headroom, Rate, measured, rates
+from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rate, measured, rates
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd.ctl.status import refused
@@ -55,7 +55,7 @@ ASKED = (
 "What a daemon may ask the kernel for: the finding, the key of `realtime`, its usual value, and what helps."
 
 
-class Verdict(StrEnum):
+class Severity(StrEnum):
     """How much a finding matters."""
 
     OK = "ok"
@@ -67,7 +67,7 @@ class Finding(msgspec.Struct, frozen=True):
     """One line of the report: what was found, and what to do about it; an empty `remedy` where all is well."""
 
     name: str
-    verdict: Verdict
+    verdict: Severity
     found: str
     remedy: str = ""
 
@@ -127,7 +127,7 @@ def judged(
         findings = (*nobody(known), *examine(config, machine))
     if found is not None:
         findings += examine_headroom(config, found)
-    count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
+    count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Severity}
     result = {
         "checks": [msgspec.to_builtins(finding) for finding in findings],
         **{str(verdict): number for verdict, number in count.items()},
@@ -137,12 +137,12 @@ def judged(
         table = tuple(rates(config, found))
         result["measured"] = msgspec.to_builtins(found) | {"rates": [msgspec.to_builtins(row) for row in table]}
         text += "\n" + _table(table)
-    return Outcome(result, folded(text), Exit.REFUSED if count[Verdict.FAIL] else Exit.DONE)
+    return Outcome(result, folded(text), Exit.REFUSED if count[Severity.FAIL] else Exit.DONE)
 
 
-def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Verdict = Verdict.WARN) -> Finding:
+def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Severity = Severity.WARN) -> Finding:
     """Return an OK finding without a remedy, or one with `remedy` and the verdict `otherwise`."""
-    return Finding(name, Verdict.OK, found) if is_good else Finding(name, otherwise, found, remedy)
+    return Finding(name, Severity.OK, found) if is_good else Finding(name, otherwise, found, remedy)
 
 
 def examine(config: Config, machine: Machine) -> tuple[Finding, ...]:
@@ -155,7 +155,7 @@ def nobody(why: ClientError | None) -> tuple[Finding, ...]:
     if why is None:
         return ()
     found = f"none was asked ({why.message}); what it would be granted is judged by who calls this"
-    return (Finding("daemon", Verdict.WARN, found, why.hint),)
+    return (Finding("daemon", Severity.WARN, found, why.hint),)
 
 
 def of_daemon(known: Running) -> tuple[Finding, ...]:
@@ -168,22 +168,22 @@ def of_daemon(known: Running) -> tuple[Finding, ...]:
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
     findings = [
-        Finding("daemon", Verdict.OK, f"tormagd {status.version} runs by {known.file or 'its defaults'}"),
+        Finding("daemon", Severity.OK, f"tormagd {status.version} runs by {known.file or 'its defaults'}"),
         _finding("build", status.build == "compiled", status.build or "not told by a daemon this old", REMEDY),
     ]
     for name, key, usual, remedy in ASKED:
         if (why := lacking.get(f"realtime.{key}")) is not None:
-            findings.append(Finding(name, Verdict.FAIL, f"refused: {why}", remedy))
+            findings.append(Finding(name, Severity.FAIL, f"refused: {why}", remedy))
         elif value := getattr(realtime, key):
             findings.append(
-                Finding(name, Verdict.OK, f"granted: realtime.{key} = {msgspec.json.encode(value).decode()}")
+                Finding(name, Severity.OK, f"granted: realtime.{key} = {msgspec.json.encode(value).decode()}")
             )
         elif usual:
             to_do = f"set realtime.{key} = {usual} in {file} and start it again"
-            findings.append(Finding(name, Verdict.WARN, f"realtime.{key} is not set", to_do))
+            findings.append(Finding(name, Severity.WARN, f"realtime.{key} is not set", to_do))
     device = f"{link.port}: {link.state}{link.cause and f': {link.cause}'}"
     is_there = link.state == "RUNNING"
-    findings.append(_finding("device port", is_there, device, link.remedy or "tormagctl firmware", Verdict.FAIL))
+    findings.append(_finding("device port", is_there, device, link.remedy or "tormagctl firmware", Severity.FAIL))
     return tuple(findings)
 
 
@@ -227,10 +227,10 @@ def others(found: Headroom) -> Finding:
     WARN above MOST_STOLEN or MOST_WAITED; a wait that is not known passes.
     """
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
-    is_stolen = found.steal > MOST_STOLEN
+    is_stolen = found.steal > MAX_STOLEN
     return _finding(
         "others",
-        not is_stolen and (found.waited or 0.0) <= MOST_WAITED,
+        not is_stolen and (found.waited or 0.0) <= MAX_WAITED,
         f"stolen {found.steal:.1%}; something waited for a processor: {waited}",
         "ask whoever runs the host for processors that are not shared" if is_stolen else STOP_OTHERS,
     )
@@ -241,7 +241,7 @@ def core(found: Headroom) -> Finding:
     step, plan = found.step_us, found.plan_us
     return Finding(
         "core",
-        Verdict.OK,
+        Severity.OK,
         f"{found.build}: a step p50 {step.p50:.0f} p99 {step.p99:.0f} us, a plan p50 {plan.p50:.0f} "
         f"p99 {plan.p99:.0f} us; reference loop {found.machine_us:.0f} us",
     )
@@ -249,7 +249,7 @@ def core(found: Headroom) -> Finding:
 
 def configured_rate(row: Rate) -> Finding:
     """Judge one configured rate: OK with margin, WARN without, FAIL where it takes more than there is."""
-    verdict = Verdict.OK if row.holds else Verdict.WARN if row.used <= 1.0 else Verdict.FAIL
+    verdict = Severity.OK if row.holds else Severity.WARN if row.used <= 1.0 else Severity.FAIL
     return Finding(f"{row.loop} rate", verdict, f"{row.hz} Hz takes {row.used:.0%} of what there is", row.change)
 
 
@@ -300,7 +300,7 @@ def scheduling(config: Config, machine: Machine) -> Finding:
         f"{BY_UNIT}'@tormag - rtprio 90' to /etc/security/limits.d/tormag.conf"
         if allowed < max(wanted, 1)
         else "set realtime.fifo_priority = 50 in the configuration",
-        Verdict.FAIL if allowed < wanted else Verdict.WARN,
+        Severity.FAIL if allowed < wanted else Severity.WARN,
     )
 
 
@@ -312,7 +312,7 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
         limit >= MEMORY_TO_LOCK_BYTES,
         "unlimited" if limit == float("inf") else f"{limit / 1e6:.0f} MB",
         f"{BY_UNIT}'@tormag - memlock unlimited' to /etc/security/limits.d/tormag.conf",
-        Verdict.FAIL if config.realtime.lock_memory else Verdict.WARN,
+        Severity.FAIL if config.realtime.lock_memory else Severity.WARN,
     )
 
 
@@ -324,7 +324,7 @@ def cores(config: Config, machine: Machine) -> Finding:
     if impossible:
         return Finding(
             "cores",
-            Verdict.FAIL,
+            Severity.FAIL,
             f"{count} online, realtime.cpus asks for {impossible}",
             f"name cores 0..{count - 1}",
         )
@@ -336,7 +336,7 @@ def load(config: Config, machine: Machine) -> Finding:
     one."""
     fields = (machine.text("/proc/loadavg") or "").split()
     if not fields:
-        return Finding("load", Verdict.WARN, "not known", "mount /proc")
+        return Finding("load", Severity.WARN, "not known", "mount /proc")
     average, count = float(fields[0]), machine.cores()
     return _finding("load", average <= 0.8 * count, f"{average:.2f} over one minute on {count} cores", STOP_OTHERS)
 
@@ -357,7 +357,7 @@ def swap(config: Config, machine: Machine) -> Finding:
     memory."""
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
-        return Finding("swap", Verdict.OK, "off")
+        return Finding("swap", Severity.OK, "off")
     is_locked = config.realtime.lock_memory
     found = f"on ({lines[0].split()[0]}){', but realtime.lock_memory keeps the daemon in' if is_locked else ''}"
     return _finding("swap", is_locked, found, "see memlock above, or sudo swapoff -a")
@@ -380,13 +380,13 @@ def run_directory(config: Config, machine: Machine) -> Finding:
     path."""
     address = config.endpoints.control
     if not address.startswith("ipc:///"):
-        return Finding("run directory", Verdict.OK, f"none needed for {address}")
+        return Finding("run directory", Severity.OK, f"none needed for {address}")
     directory = os.path.dirname(address.removeprefix("ipc://"))  # noqa: PTH120
     path = machine.path(directory)
     if not path.is_dir():
         return Finding(
             "run directory",
-            Verdict.FAIL,
+            Severity.FAIL,
             f"{directory} does not exist",
             "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own",
         )
@@ -396,7 +396,7 @@ def run_directory(config: Config, machine: Machine) -> Finding:
         is_open,
         f"{directory} is {'writable' if is_open else 'not writable for you'}",
         "join the group tormag (sudo usermod -aG tormag $USER), log in again",
-        Verdict.FAIL,
+        Severity.FAIL,
     )
 
 
@@ -416,7 +416,7 @@ def port(config: Config, machine: Machine) -> Finding:
     if not path.exists():
         return Finding(
             "device port",
-            Verdict.FAIL,
+            Severity.FAIL,
             f"{shown} does not exist",
             "plug the device in and switch it on; install systemd/udev/60-tormag.rules for the name /dev/tormag",
         )
@@ -426,7 +426,7 @@ def port(config: Config, machine: Machine) -> Finding:
         is_open,
         shown if is_open else f"{shown} is not readable and writable for you",
         "join the group that owns it (ls -l shows it; dialout or tormag), log in again",
-        Verdict.FAIL,
+        Severity.FAIL,
     )
 
 
@@ -441,9 +441,9 @@ def port_holder(config: Config, machine: Machine) -> Finding:
         others = [(pid, comm) for pid, comm in others if pid in locking]
     strangers = [f"{comm} (process {pid})" for pid, comm in others if not comm.startswith("tormagd")]
     if strangers:
-        return Finding("port holder", Verdict.FAIL, ", ".join(strangers), "end it, or give tormagd another port")
+        return Finding("port holder", Severity.FAIL, ", ".join(strangers), "end it, or give tormagd another port")
     found = f"tormagd (process {others[0][0]})" if others else "nobody that this user may see"
-    return Finding("port holder", Verdict.OK, found)
+    return Finding("port holder", Severity.OK, found)
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:
@@ -487,7 +487,7 @@ CHECKS = (*OF_CALLER, *OF_MACHINE)
 def _table(table: tuple[Rate, ...]) -> str:
     """Return the table of all rates, a row each: its use, whether it is held with margin, and what would hold it."""
     lines = [
-        f"\nrates (at most {MOST_USED:.0%} used is held with margin; * is configured):",
+        f"\nrates (at most {MAX_USED:.0%} used is held with margin; * is configured):",
         "  loop          Hz    used  held  to hold it",
         *(
             f"{'*' if row.configured else ' '} {row.loop:<10}{row.hz:>6}{row.used:>8.0%}  "
@@ -501,7 +501,7 @@ def _table(table: tuple[Rate, ...]) -> str:
 def _text(findings: tuple[Finding, ...]) -> str:
     """Return a line for each finding, with the remedy on the next line."""
     colour = Colour(sys.stdout)
-    paint = {Verdict.OK: colour.green, Verdict.WARN: colour.yellow, Verdict.FAIL: colour.red}
+    paint = {Severity.OK: colour.green, Severity.WARN: colour.yellow, Severity.FAIL: colour.red}
     return "\n".join(
         f"{paint[finding.verdict](f'{finding.verdict:<4}')}  {finding.name:<14}  {finding.found}"
         + (f"\n{'':20}  next: {finding.remedy}" if finding.remedy else "")

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from firmware_protocol.build import REMEDY
-from tormagd.config import LEAST_INFERENCE_HZ, Config
+from tormagd.config import MIN_INFERENCE_HZ, Config
 from tormagd.ctl.machine import Machine, Taken
 from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.ctl.process import answer_of
@@ -19,14 +19,14 @@ from tormagd_client.messages import ExecReport
 
 LONGEST_S = 120.0
 "Longest wait; the measurement takes 6 s on an idle machine, half of them to load libraries."
-RATES_HZ = (LEAST_INFERENCE_HZ, 125, 250, 500, 1_000, 2_000, 4_000)
+RATES_HZ = (MIN_INFERENCE_HZ, 125, 250, 500, 1_000, 2_000, 4_000)
 TICK_OVER_STEP = 1.25
 "What a control tick takes over its step alone: the link and the write besides. Measured on the interpreted daemon."
 PERIOD_OVER_STEP = 3.5
 "What a period takes of the processor over the step, plans apart: reading, record, telemetry, ZeroMQ. Measured alike."
-MOST_USED = 0.7
+MAX_USED = 0.7
 "Share of a period or a processor. The rest is for clients that ask, and for hours when the machine gives less."
-MOST_STOLEN, MOST_WAITED = 0.01, 0.1
+MAX_STOLEN, MAX_WAITED = 0.01, 0.1
 "Shares of the time above which what others take is worth a warning."
 
 
@@ -133,7 +133,7 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         in_time = (late_us.p50 + TICK_OVER_STEP * step.p50 + plan.p50) * period
     busy = PERIOD_OVER_STEP * step.mean * period + plan.mean * 1e-6 * inference_hz
     used = max(in_time, busy)
-    if used <= MOST_USED:
+    if used <= MAX_USED:
         change = ""
     elif loop == "control" and late_us.p99 > TICK_OVER_STEP * step.p99 and in_time > busy:
         change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
@@ -141,4 +141,4 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         change = f"compile the core: {REMEDY}"
     else:
         change = f"a faster processor, or less than {hz} Hz"
-    return Rate(loop, hz, configured, round(used, 3), used <= MOST_USED, change)
+    return Rate(loop, hz, configured, round(used, 3), used <= MAX_USED, change)

@@ -32,7 +32,7 @@ class Holder(msgspec.Struct, frozen=True):
     is_locking: bool
 
 
-class SerialPort(msgspec.Struct, frozen=True):
+class ListedPort(msgspec.Struct, frozen=True):
     """A serial port. `latency_ms` is that of a USB chip's driver, None where there is no such timer."""
 
     port: str
@@ -61,7 +61,7 @@ class Ports(msgspec.Struct, frozen=True):
     """What `tormagctl ports` found: the keys of `--json`. `hidden_processes` counts those whose open files are not
     shown to us."""
 
-    serial: tuple[SerialPort, ...]
+    serial: tuple[ListedPort, ...]
     can: tuple[CanChannel, ...]
     hidden_processes: int
 
@@ -106,13 +106,13 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
 
 def _serial_port(
     machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
-) -> SerialPort:
+) -> ListedPort:
     """Describe one serial port; `info` is None for one that pyserial does not list. A locking process counts as a
     holder."""
     locking = machine.lock_owners(path)
     names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
     has_usb_id = info is not None and info.vid is not None
-    return SerialPort(
+    return ListedPort(
         port=path,
         description="pseudo-terminal" if info is None else printable(str(info.description)),
         usb_id=f"{info.vid:04x}:{info.pid:04x}" if has_usb_id else None,

@@ -9,7 +9,7 @@ import msgspec
 from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, folded, usage_error
 from tormagd.ctl.process import answer_of
-from tormagd.scenes.measured import Measured, MeasuredScene, Share, Tried, Way, measured
+from tormagd.scenes.measured import MeasuredScene, Measurements, OperatingPoint, Share, Tried, measured
 from tormagd.scenes.scene import Force, Scene, load_scene, shipped_scenes
 from tormagd_client.endpoints import ConfigError, Endpoints
 
@@ -230,7 +230,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     return Outcome(result, folded("\n".join(lines)))
 
 
-def _tried(tried: Tried, share: Share | None, chosen: Way, runs: Way) -> str:
+def _tried(tried: Tried, share: Share | None, chosen: OperatingPoint, runs: OperatingPoint) -> str:
     """Return one way's row: errors on three samples, share of a processor, whether chosen, whether it runs here."""
     marks = [word for way, word in ((chosen, "chosen"), (runs, "runs here")) if way == tried.way]
     errors = " ".join(f"{1e3 * error_N:6.1f}" for error_N in tried.rms_N)
@@ -238,12 +238,12 @@ def _tried(tried: Tried, share: Share | None, chosen: Way, runs: Way) -> str:
     return f"{tried.way!s:28} {errors:>22} {taken:>15}  {', '.join(marks)}".rstrip()
 
 
-def way_of(derived: dict[str, Any]) -> Way:
+def way_of(derived: dict[str, Any]) -> OperatingPoint:
     """Return the way (rates and search) by which the daemon's own check would serve the scene."""
-    return Way(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
+    return OperatingPoint(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
 
 
-def measured_as(scene: Scene, file: Measured) -> MeasuredScene:
+def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
     """Return what was measured of a scene that asks for exactly what `scene` does. Raises CommandError (REFUSED) for
     none."""
     found = file.scene(scene.fingerprint)

@@ -9,10 +9,10 @@ from typing import Any
 
 import msgspec
 
-from tormagd.config import LEAST_INFERENCE_HZ
+from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene import as_toml, check_scene
-from tormagd.scenes.scene import LEAST_CONTROL_HZ, Scene
+from tormagd.scenes.scene import MIN_CONTROL_HZ, Scene
 from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError
 
@@ -173,7 +173,7 @@ def _tables(
         "force": {key: float(f"{value:.3g}") for key, value in force.items()},
         "signal": signal,
         "handle": dict(zip(("least_mm_s", "most_mm_s"), handle_mm_s, strict=True)),
-        "bandwidth": {"control_hz": LEAST_CONTROL_HZ, "inference_hz": LEAST_INFERENCE_HZ},
+        "bandwidth": {"control_hz": MIN_CONTROL_HZ, "inference_hz": MIN_INFERENCE_HZ},
     }
 
 

@@ -8,7 +8,7 @@ import msgspec
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.scene import as_toml, measured_as
-from tormagd.scenes.measured import Share, Tried, Way, measured
+from tormagd.scenes.measured import OperatingPoint, Share, Tried, measured
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd_client.endpoints import ConfigError
 
@@ -31,7 +31,7 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
     ways = [
         (tried, share_of) for tried in measured_as(scene, file).tried if (share_of := file.share(tried.way)) is not None
     ]
-    tried, taken = _most_wanted(ways, share, tolerance_N or 0.0)
+    tried, taken = _max_wanted(ways, share, tolerance_N or 0.0)
     text = (
         f"{scene.name}: {tried.way}: {1e3 * tried.worst_N:.1f} mN RMS at worst on samples 1 to 3, "
         f"the daemon takes {taken.daemon:.1%} of a processor"
@@ -46,7 +46,7 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
 Served = tuple[Tried, Share]
 
 
-def _most_wanted(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
+def _max_wanted(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
     """Return the most exact of `ways` that takes at most `share`, or for None the cheapest within `tolerance_N`.
 
     Raises CommandError (REFUSED) where no way does, ValueError where there is none at all.
@@ -72,7 +72,7 @@ def _most_wanted(ways: list[Served], share: float | None, tolerance_N: float) ->
     return min(fits, key=best)
 
 
-def _write(name: str, way: Way, out: Path) -> None:
+def _write(name: str, way: OperatingPoint, out: Path) -> None:
     """Write the scene with these rates and this search to the new file `out`; relative paths in it are adapted.
 
     Raises CommandError (USAGE) where `out` exists or cannot be made.

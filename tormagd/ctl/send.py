@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
-from tormagd.ctl.watch import Watch, require_range
+from tormagd.ctl.watch import StatusWatch, require_range
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.force_file import ForceFileError
 from tormagd.interrupt import interrupted_by
@@ -90,7 +90,7 @@ def send(
     return Outcome(result, f"{text}{became.accepted} taken and rendered{held}")
 
 
-def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> Watch:
+def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> StatusWatch:
     """Check the forces against the daemon's scene and return a watch of `source`.
 
     Raises CommandError: REFUSED where forces are not allowed, UNREACHABLE for another version's scene, FAULT where the
@@ -103,7 +103,7 @@ def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: s
             error.hint += "; with a key that may only publish: --blind"
         raise
     require_range(known, waveform.least_N, waveform.most_N)
-    return Watch(client, source)
+    return StatusWatch(client, source)
 
 
 def _publish(
@@ -115,14 +115,14 @@ def _publish(
     valid_for_ms: float,
     preview: int,
     is_interrupted: Callable[[], bool],
-    watch: Watch | None,
+    watch: StatusWatch | None,
 ) -> dict[str, Any]:
     """Publish setpoints until the time or an interrupt, and return the counts; `watch` looks at the daemon in between,
     unless None.
 
     Each deadline counts from the start, so that lateness does not add up. A setpoint whose successor is already due is
     `skipped`. Each carries the `preview` that follow it; after the end these stay at the last force. Raises
-    CommandError (UNREACHABLE) where the daemon goes, and as `Watch.look`.
+    CommandError (UNREACHABLE) where the daemon goes, and as `StatusWatch.look`.
     """
     sent = skipped = index = 0
     worst_late_s = 0.0

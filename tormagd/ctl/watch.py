@@ -19,7 +19,7 @@ LAST_ANSWER_S = 1.0
 "Longest wait for the last status: the daemon has answered all the time."
 ARRIVAL_S = 0.5
 "By then the last setpoint has arrived, even where an answer overtook it."
-LEAST_TAKEN = 0.9
+MIN_TAKEN = 0.9
 "Share of the setpoints that has to be taken; the first ones may be refused while their clock is not known."
 SPOILING = ("RANGE", "F_MAX")
 "Limits that mean another force than asked. F_MIN is not among them: 0 N asks for what the device gives at least."
@@ -98,7 +98,7 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
     return CommandError(Exit.REFUSED, code.lower(), message, why[code].remedy if code in why else "tormagctl status")
 
 
-class Watch:
+class StatusWatch:
     """Looks at the daemon's status while one source's setpoints are sent; waits only when made, and in `finish`.
 
     Counts looks, and looks that saw the force rendered, and keeps the limits met and the newest reason that held it
@@ -149,7 +149,7 @@ class Watch:
     def finish(self, sent: int) -> Fate:
         """Wait up to ARRIVAL_S until the daemon has taken all `sent` setpoints, and return what became of them.
 
-        Raises CommandError (REFUSED) where under LEAST_TAKEN of them were taken, the force never came, or was held back
+        Raises CommandError (REFUSED) where under MIN_TAKEN of them were taken, the force never came, or was held back
         later. Raises CommandError (FAULT) where the device is in FAULT.
         """
         until_s = time.monotonic() + ARRIVAL_S
@@ -165,7 +165,7 @@ class Watch:
             raise CommandError(
                 why.exit_code, why.code, f"sent {sent} setpoints, rendered {share}: {why.message}", why.hint
             )
-        if accepted < LEAST_TAKEN * sent:
+        if accepted < MIN_TAKEN * sent:
             raise CommandError(
                 Exit.REFUSED,
                 "not_taken",

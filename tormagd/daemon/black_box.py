@@ -38,7 +38,7 @@ AFTER_FAULT_S = 2.0
 BUFFER_BYTES = 4_000_000
 "Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
 LEAVING_S = 2.0
-MOST_ASKED = 8
+MAX_ASKED = 8
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ class BlackBox:
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._connection: Connection | None = None
-        self._asked: deque[Write] = deque(maxlen=MOST_ASKED)
+        self._asked: deque[Write] = deque(maxlen=MAX_ASKED)
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with the states before the first tick. It also takes what passes through `connection`."""

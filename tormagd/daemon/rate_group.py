@@ -31,7 +31,7 @@ class Histogram:
     def __init__(self) -> None:
         self._now = [0] * _BINS
         self._before = [0] * _BINS
-        self._most_now = self._most_before = 0.0
+        self._max_now = self._max_before = 0.0
         self._turned_s = -math.inf
         self.report: ExecReport
         "p50, p99, p99.9 (upper edges of their bins) and the largest, us; all 0 while nothing was added."
@@ -45,17 +45,17 @@ class Histogram:
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s
             self._before, self._now = self._now, [0] * _BINS
-            self._most_before, self._most_now = self._most_now, 0.0
+            self._max_before, self._max_now = self._max_now, 0.0
         self._now[_bin(value_us)] += 1
-        if value_us > self._most_now:
-            self._most_now = value_us
+        if value_us > self._max_now:
+            self._max_now = value_us
 
     def refresh(self) -> None:
         """Compute `report` anew from what is counted: p50, p99, p99.9 and the largest, us; 0 while nothing is.
 
         A percentile is the upper edge of its bin, but not above the largest.
         """
-        most = round(max(self._most_now, self._most_before), 1)
+        most = round(max(self._max_now, self._max_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []
         for share in SHARES:

@@ -48,7 +48,7 @@ from tormagd_client.messages import (
     TickRecord,
 )
 
-MOST_TICKS = 100
+MAX_TICKS = 100
 "Ticks in one recording message at most."
 REQUESTS = 16
 "Requests answered in a telemetry period at most: a client that asks on and on must not keep a `stop` waiting."
@@ -121,7 +121,7 @@ class TelemetryLoop:
     def record(self, _beat: Beat) -> None:
         """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing.
 
-        Also counts the delay of a new setpoint. Where telemetry is slow, MOST_TICKS kept records are published first.
+        Also counts the delay of a new setpoint. Where telemetry is slow, MAX_TICKS kept records are published first.
         """
         control = self._control
         if control.output is None or control.used is None:
@@ -138,7 +138,7 @@ class TelemetryLoop:
             timing.exec_us,
             timing.runs,
         )
-        if len(self._ticks) == MOST_TICKS:  # telemetry is slow: the recording does not wait for it
+        if len(self._ticks) == MAX_TICKS:  # telemetry is slow: the recording does not wait for it
             self._publish_ticks()
         self._ticks.append(record)
         self._box.ticked(record, control.stepper, self._inference.planner)

@@ -9,7 +9,7 @@ from tormagd.daemon.beat import Beat
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.verdict import CANNOT, Carriages, Judged, judged
+from tormagd.daemon.verdict import CANNOT, GapMotion, Judged, judged
 from tormagd.safety.codes import Limit
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, VERSION, Motion, Verdict
 
@@ -99,7 +99,7 @@ class Topics:
             measured.gap_mm if measured is not None and measured.is_homed else None,
             core.portrait,
             believe.device,
-            Carriages(core.gap_speed_mm_s, believe.carriages.lag_s, force.tolerance_rms_N, force.release_N_s),
+            GapMotion(core.gap_speed_mm_s, believe.carriages.lag_s, force.tolerance_rms_N, force.release_N_s),
         )
 
     @staticmethod

@@ -29,7 +29,7 @@ class Judged(NamedTuple):
     why: tuple[str, ...] = ()
 
 
-class Carriages(NamedTuple):
+class GapMotion(NamedTuple):
     """Figures of the gap's motion: its greatest speed, and its lag; and of the scene: its force tolerance and release
     rate."""
 
@@ -45,7 +45,7 @@ def judged(
     gap_mm: float | None,
     portrait: Portrait,
     device: DeviceFit,
-    carriages: Carriages,
+    motion: GapMotion,
 ) -> Judged:
     """Judge the setpoint that `plan` was made for: rendered, arrives in some time, or cannot, and why.
 
@@ -62,14 +62,14 @@ def judged(
     # unless the gap is held, it differs from the portrait's by the element's memory and the handle's rate
     if Limit.CEILING not in plan.limits and Limit.MODEL_RANGE not in plan.limits:
         gap_mm -= plan.gap_mm - portrait.gap_mm_at(device.model_N(plan.governed_N))
-    if abs(device.force_N(portrait.force_N_at(gap_mm)) - asked_N) <= carriages.tolerance_N:
+    if abs(device.force_N(portrait.force_N_at(gap_mm)) - asked_N) <= motion.tolerance_N:
         return Judged(RENDERED, 0.0)
     if why := tuple(str(limit) for limit in plan.limits if _holds(limit, plan, aim_mm)):
         return Judged(CANNOT, None, why)
-    moves_s = abs(aim_mm - gap_mm) / carriages.gap_speed_mm_s
+    moves_s = abs(aim_mm - gap_mm) / motion.gap_speed_mm_s
     if Limit.TAKEOVER in plan.limits:
-        moves_s = max(moves_s, abs(asked_N - plan.governed_N) / carriages.release_N_s)
-    return Judged(ARRIVES, round(1e3 * (moves_s + carriages.lag_s), 1))
+        moves_s = max(moves_s, abs(asked_N - plan.governed_N) / motion.release_N_s)
+    return Judged(ARRIVES, round(1e3 * (moves_s + motion.lag_s), 1))
 
 
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:

@@ -22,7 +22,7 @@ STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:80rem;m
 img{max-width:100%}table{border-collapse:collapse;margin:.5rem 0}h2{margin-top:2rem}
 th,td{padding:.25rem .8rem;text-align:left;vertical-align:top;border-bottom:1px solid #ddd}
 .bad{color:#b71c1c;font-weight:600}"""
-MOST_TOLD = 20
+MAX_TOLD = 20
 "How many moments of one fault are listed."
 
 
@@ -137,9 +137,9 @@ def _held(codes: Codes, lasts_s: float) -> str:
 
 
 def _moments(codes: Codes, _lasts_s: float) -> str:
-    """Say when a code's first MOST_TOLD spans began."""
-    more = f" and {len(codes.spans_ns) - MOST_TOLD} more" if len(codes.spans_ns) > MOST_TOLD else ""
-    return "at " + ", ".join(f"{begin * 1e-9:.2f}" for begin, _ in codes.spans_ns[:MOST_TOLD]) + f" s{more}"
+    """Say when a code's first MAX_TOLD spans began."""
+    more = f" and {len(codes.spans_ns) - MAX_TOLD} more" if len(codes.spans_ns) > MAX_TOLD else ""
+    return "at " + ", ".join(f"{begin * 1e-9:.2f}" for begin, _ in codes.spans_ns[:MAX_TOLD]) + f" s{more}"
 
 
 def _marks(of: Sequence[Reported]) -> list[list[str]]:

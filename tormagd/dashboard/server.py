@@ -20,7 +20,7 @@ from tormagd.recording.reader import RecordingError
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
 "Host names that are served. By another name for this address, a foreign page could read the answers."
-MOST_BROWSERS = 32
+MAX_BROWSERS = 32
 PAGE = Path(__file__).parent / "page"
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src data:; frame-ancestors 'none'",
@@ -33,7 +33,7 @@ def application(shown: Live | Recorded) -> web.Application:
     """Return the web application for a live daemon or a recording. Every route is a GET, for hosts in NAMES only.
 
     `/` is the page, with files in `/page`, and `/about` what it begins with. `/live` streams events (503 beyond
-    MOST_BROWSERS). `/frame?at_s=` gives a recording's frame: 400 for no number, 410 where it cannot be read.
+    MAX_BROWSERS). `/frame?at_s=` gives a recording's frame: 400 for no number, 410 where it cannot be read.
     """
 
     async def page(request: web.Request) -> web.StreamResponse:
@@ -44,8 +44,8 @@ def application(shown: Live | Recorded) -> web.Application:
 
     async def live(request: web.Request) -> web.StreamResponse:
         assert isinstance(shown, Live)
-        if len(shown.browsers) >= MOST_BROWSERS:
-            raise web.HTTPServiceUnavailable(text=f"{MOST_BROWSERS} browsers look already")
+        if len(shown.browsers) >= MAX_BROWSERS:
+            raise web.HTTPServiceUnavailable(text=f"{MAX_BROWSERS} browsers look already")
         response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
         await response.prepare(request)
         with shown.browser() as events, contextlib.suppress(ConnectionError):

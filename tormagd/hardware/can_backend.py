@@ -31,7 +31,7 @@ UNSENT_FRAMES = 50
 """Frames in a row that the bus may leave untaken; at 1 kHz, the device's own command timeout."""
 EXCHANGE_BITS = 395
 """Bits of one Drive, State and Sense with the most stuffing: firmware_protocol/README.md."""
-MOST_LOAD = 0.7
+MAX_LOAD = 0.7
 """Share of the bit rate that these three may take; the rest is for Status, commands and the bus's other nodes."""
 BUS_OFF = 0x40
 """Error class in the identifier of an error frame: linux/can/error.h, CAN_ERR_BUSOFF."""
@@ -184,7 +184,7 @@ class CanBackend:
 def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
     """Refuse an interface that is not installed, fails to load or has no descriptor, and a bit rate that is too low.
 
-    The bit rate has to carry `rates.control_hz` exchanges a second at MOST_LOAD. Raises ConfigError. Opens nothing.
+    The bit rate has to carry `rates.control_hz` exchanges a second at MAX_LOAD. Raises ConfigError. Opens nothing.
     """
     interface = options.interface
     if interface not in BACKENDS:
@@ -202,7 +202,7 @@ def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
             f"device.options.interface = {interface!r}: this driver has no descriptor to wait for; allowed is the "
             "kernel's driver of the same adapter, 'socketcan'"
         )
-    least = math.ceil(rates.control_hz * EXCHANGE_BITS / MOST_LOAD)
+    least = math.ceil(rates.control_hz * EXCHANGE_BITS / MAX_LOAD)
     if options.bitrate < least:
         raise ConfigError(
             f"device.options.bitrate = {options.bitrate}: allowed is from {least} on at rates.control_hz = "

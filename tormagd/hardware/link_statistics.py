@@ -19,10 +19,10 @@ USUAL_OF: Final = 101
 WINDOW_S = 0.5
 "The least delayed State of a window of this time stands for all of the window: queues on the way only ever add."
 WINDOWS = 60
-LEAST_WINDOWS = 6
+MIN_WINDOWS = 6
 OUTLIER = 4.0
 "Standard deviations, by the median of the absolute deviations, beyond which a window does not count."
-MOST_RESIDUAL_US = 2_000.0
+MAX_RESIDUAL_US = 2_000.0
 "A line with a larger standard deviation around it does not fit."
 NEWEST_WINDOWS = 3
 "Where none of so many newest windows lies on the line, the clock has left the line."
@@ -210,7 +210,7 @@ class DeviceClock:
     def fit(self) -> ClockFit | None:
         """Return the line through the last half minute, or since the clock was set; None where no line fits yet.
 
-        A line takes LEAST_WINDOWS windows, three seconds.
+        A line takes MIN_WINDOWS windows, three seconds.
         """
         if not self._is_fitted:
             self._fit = _newest_line(list(self._windows))
@@ -235,13 +235,13 @@ class DeviceClock:
 def _newest_line(windows: Windows) -> ClockFit | None:
     """Return the line through the newest of `windows`, which are in the order of time; None where no line fits.
 
-    The line is tried through all windows, then without the older half, and so on while LEAST_WINDOWS are left. It fits
-    with a residual under MOST_RESIDUAL_US and one of the NEWEST_WINDOWS on it.
+    The line is tried through all windows, then without the older half, and so on while MIN_WINDOWS are left. It fits
+    with a residual under MAX_RESIDUAL_US and one of the NEWEST_WINDOWS on it.
     """
     # no line fits across a clock that was set, or stood still for a while: the older half is dropped until one does
-    while len(windows) >= LEAST_WINDOWS:
+    while len(windows) >= MIN_WINDOWS:
         fit, is_left = _robust_line(windows)
-        if fit.residual_us < MOST_RESIDUAL_US and not is_left:
+        if fit.residual_us < MAX_RESIDUAL_US and not is_left:
             return fit
         windows = windows[len(windows) // 2 :]
     return None

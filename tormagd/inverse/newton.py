@@ -13,7 +13,7 @@ ACCURACY_MT: Final = 1e-3
 LOOKED_AT_MT: Final = 0.25 * ACCURACY_MT
 """A step that should end this near the root is taken for the last: at its end only the force is evaluated, no slope."""
 
-MOST_EVALUATIONS: Final = 60
+MAX_EVALUATIONS: Final = 60
 """Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; three times as many allow for steps between bisections."""
 
 
@@ -23,7 +23,7 @@ class RisingSearch:
 
     A rising force has one root at most. A step to or past an end of the range evaluates the force at that end, once.
     Any other step out of the bracket is replaced by a bisection, and so is one of over half the step before. The answer
-    is the root to `ACCURACY_MT`, or the nearer end for a force out of reach; after `MOST_EVALUATIONS` it is where the
+    is the root to `ACCURACY_MT`, or the nearer end for a force out of reach; after `MAX_EVALUATIONS` it is where the
     search stands. Raises `DomainError` unless the range is finite and rises.
     """
 
@@ -66,7 +66,7 @@ class RisingSearch:
                     return answer(curve, field, force_N, predicted_N, evaluations, Reach.BELOW)
                 right, right_seen = field, True
             # an end of the range that was not evaluated does not close the bracket: the force may be out of reach
-            if (left_seen and right_seen and right - left <= ACCURACY_MT) or evaluations >= MOST_EVALUATIONS:
+            if (left_seen and right_seen and right - left <= ACCURACY_MT) or evaluations >= MAX_EVALUATIONS:
                 break
             # a slope that rounding made flat gives no direction, but the force rises
             step = -excess_N / slope if slope > 0.0 else span if excess_N < 0.0 else -span

@@ -42,22 +42,22 @@ from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pul
 TURNED_MM_S = 42.0
 "Speed of the roller's surface at the thesis's 20 rpm."
 STEP_S = 1e-3
-MOST_N = 2.0
+MAX_N = 2.0
 "The greatest force of the scenes."
-MOST_STEPS = 300_000
+MAX_STEPS = 300_000
 ROUNDS = 30
 SETTLED = 1e-3
 "Relative change of the RMS error from round to round at which the rounds end."
 EXACT_N = 1e-6
 SECANT_MM_S = 5.0
 "Secant over which a limit is linearised: it has a kink at 0, and the carriages turn elsewhere next round."
-LEAST_BRAKING_MM_S2 = 50.0
+MIN_BRAKING_MM_S2 = 50.0
 
 
 GRID_MM = 2e-3
 "Grid of the moment over the gap."
 NEWTON_STEPS = 6
-LEAST_GAIN = 0.1
+MIN_GAIN = 0.1
 "Least slope of moment and lag together over the moment, just turned round."
 
 
@@ -177,7 +177,7 @@ class Brake(NamedTuple):
             # at a standstill the branch is the one that leads to the wanted strength
             branch_Tm = math.copysign(self.branch_Tm, -(change_Tm or short_Tm))
             fading = abs(lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm) / self.turn_Tm
-            wanted_Tm += short_Tm / max(1.0 - fading, LEAST_GAIN)
+            wanted_Tm += short_Tm / max(1.0 - fading, MIN_GAIN)
         return wanted_Tm
 
 
@@ -309,19 +309,19 @@ def bound(
 ) -> Bound:
     """Return the bound for forces at rising times, linear in between, or with `is_held` held until the next.
 
-    Forces are clipped to the device's range and MOST_N; the handle slides at TURNED_MM_S. `step_s` is the step of the
-    result. Raises `DomainError` for under 2 or over MOST_STEPS steps and as `brake_of`, and RuntimeError as
+    Forces are clipped to the device's range and MAX_N; the handle slides at TURNED_MM_S. `step_s` is the step of the
+    result. Raises `DomainError` for under 2 or over MAX_STEPS steps and as `brake_of`, and RuntimeError as
     `foresight_mm`.
     """
     steps = (time_s[-1] - time_s[0]) / step_s
-    if not 2.0 <= steps <= MOST_STEPS:
-        raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MOST_STEPS} steps of {step_s:g} s")
+    if not 2.0 <= steps <= MAX_STEPS:
+        raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MAX_STEPS} steps of {step_s:g} s")
     axis_s = time_s[0] + step_s * np.arange(math.floor(steps + 1e-6) + 1)
     wanted_N = np.interp(axis_s, time_s, force_N)
     if is_held:
         wanted_N = force_N[np.searchsorted(time_s, axis_s + 1e-9, side="right") - 1]
     brake, drive = brake_of(plant), drive_of(plant)
-    asked = asked_of(brake, wanted_N, most_N=MOST_N, hand_mm_s=TURNED_MM_S, step_s=step_s)
+    asked = asked_of(brake, wanted_N, most_N=MAX_N, hand_mm_s=TURNED_MM_S, step_s=step_s)
     greedy_mm = no_delay_mm(drive, brake, asked, step_s)
     best_mm = foresight_mm(drive, brake, asked, step_s)
     return Bound(axis_s, asked.force_N, asked.rendered_N(brake, greedy_mm), asked.rendered_N(brake, best_mm))
@@ -381,7 +381,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
             faster_mm_s = min(max(moves_mm_s, lowest), highest) + towards * SECANT_MM_S
             slowed = drive.lowest_mm_s if behind_mm > 0.0 else drive.highest_mm_s
             braking = towards * (faster_mm_s - slowed(gap_mm, faster_mm_s, step_s)) / step_s
-            change = max(braking, LEAST_BRAKING_MM_S2) * step_s
+            change = max(braking, MIN_BRAKING_MM_S2) * step_s
             closing = (math.sqrt(change * change + 8.0 * change * abs(behind_mm) / step_s) - change) / 2.0
             wanted_mm_s = moves_mm_s + towards * min(closing, abs(behind_mm) / step_s)
             speed_mm_s = min(max(wanted_mm_s, lowest), highest)

@@ -13,7 +13,7 @@ from tormagd.lab.errors import LabError
 from tormagd_client.regular_file import require_regular
 
 MAX_ROWS = 5_000_000
-MOST_TABLE_BYTES = 1 << 30
+MAX_TABLE_BYTES = 1 << 30
 "Largest table of measurements: a day of a testing machine. It is read row by row."
 
 
@@ -34,7 +34,7 @@ def read_columns(
     a cell that is no finite number within its bounds. The message names the file, and the row where one is wrong.
     """
     try:
-        require_regular(path, MOST_TABLE_BYTES)
+        require_regular(path, MAX_TABLE_BYTES)
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, delimiter=delimiter, strict=is_exact)
             try:

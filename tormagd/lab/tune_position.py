@@ -19,8 +19,8 @@ from tormagd.control.move.motor import margins
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 
-LEAST_GAIN_MARGIN_DB = 6.0
-LEAST_PHASE_MARGIN_DEG = 45.0
+MIN_GAIN_MARGIN_DB = 6.0
+MIN_PHASE_MARGIN_DEG = 45.0
 DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
 FILTER_TIMES_S = (0.002, 0.003, 0.004)
 INTEGRAL_TIMES_S = (0.1, 0.15, 0.2, 0.4)
@@ -110,4 +110,4 @@ def robust(config: Config, position: msgspec.Struct, gain: float) -> tuple[float
     tried = msgspec.structs.replace(config, position=msgspec.structs.replace(position, proportional_per_mm=gain))
     found = corner_margins(tried)
     gain_dB, phase_deg = found["gain_margin_dB"], found["phase_margin_deg"]
-    return (gain_dB, phase_deg) if gain_dB >= LEAST_GAIN_MARGIN_DB and phase_deg >= LEAST_PHASE_MARGIN_DEG else None
+    return (gain_dB, phase_deg) if gain_dB >= MIN_GAIN_MARGIN_DB and phase_deg >= MIN_PHASE_MARGIN_DEG else None

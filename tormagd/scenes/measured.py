@@ -6,7 +6,7 @@ import msgspec
 from msgspec import Struct
 
 
-class Way(Struct, frozen=True):
+class OperatingPoint(Struct, frozen=True):
     """One way to serve a scene: rates of control and of plans, Hz, and the search for the field."""
 
     control_hz: int
@@ -26,7 +26,7 @@ class Share(Struct, frozen=True):
     plan_us            what a plan takes; median
     """
 
-    way: Way
+    way: OperatingPoint
     daemon: float
     tick_us: float
     plan_us: float
@@ -40,7 +40,7 @@ class Share(Struct, frozen=True):
 class Tried(Struct, frozen=True):
     """The RMS error of the force, N, of a scene's own signal served in one way, on each of the three samples."""
 
-    way: Way
+    way: OperatingPoint
     rms_N: tuple[float, ...]
 
     @property
@@ -49,7 +49,7 @@ class Tried(Struct, frozen=True):
         return max(self.rms_N)
 
 
-class Judged(Struct, frozen=True):
+class WorstDevice(Struct, frozen=True):
     """The worst device of a group in one situation.
 
     group      `deciding` or `judging`: the devices that a way was chosen on, or those that it was judged on
@@ -77,9 +77,9 @@ class MeasuredScene(Struct, frozen=True):
     name: str
     fingerprint: str
     tolerance_N: float
-    chosen: Way
+    chosen: OperatingPoint
     tried: tuple[Tried, ...]
-    judged: tuple[Judged, ...]
+    judged: tuple[WorstDevice, ...]
 
     @property
     def usual(self) -> Tried:
@@ -91,12 +91,12 @@ class MeasuredScene(Struct, frozen=True):
         """Whether the usual way keeps to the tolerance on the three samples."""
         return self.usual.worst_N <= self.tolerance_N
 
-    def of(self, way: Way) -> Tried:
+    def of(self, way: OperatingPoint) -> Tried:
         """Return what was found of `way`. Raises StopIteration where it was not tried."""
         return next(each for each in self.tried if each.way == way)
 
 
-class Measured(Struct, frozen=True):
+class Measurements(Struct, frozen=True):
     """The file of measurements: how it was made, what each way costs, and every scene."""
 
     command: str
@@ -109,7 +109,7 @@ class Measured(Struct, frozen=True):
     shares: tuple[Share, ...]
     scenes: tuple[MeasuredScene, ...]
 
-    def share(self, way: Way) -> Share | None:
+    def share(self, way: OperatingPoint) -> Share | None:
         """Return what serving in this `way` costs; None where it was not measured."""
         return next((each for each in self.shares if each.way == way), None)
 
@@ -125,9 +125,9 @@ WORSE = 0.2
 "Share of a scene's tolerance: an error that is so much over the usual way's may be chosen."
 
 
-def measured() -> Measured:
+def measured() -> Measurements:
     """Read the file of measurements that comes with the package, and return it."""
-    return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measured)
+    return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measurements)
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:

@@ -11,15 +11,15 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from tormagd.config import LEAST_INFERENCE_HZ
+from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.named_file import named, shipped
 from tormagd.toml_file import convert
 from tormagd_client.endpoints import Strict
 
 AUTO = "auto"
-LEAST_SETPOINT_HZ = 12.0
+MIN_SETPOINT_HZ = 12.0
 "Setpoints a tenth of a second apart are no stream any more."
-LEAST_CONTROL_HZ = 500
+MIN_CONTROL_HZ = 500
 "What is watched for safety is watched in every control tick: slower than this is none that a scene is run at."
 ENDING = ".toml"
 _SHIPPED = resources.files(__package__)
@@ -52,8 +52,8 @@ class Force(Strict, frozen=True):
 class Bandwidth(Strict, frozen=True):
     """The rates below which the task is not served, Hz."""
 
-    control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
-    inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = LEAST_INFERENCE_HZ
+    control_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 1_000
+    inference_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = MIN_INFERENCE_HZ
 
 
 class Signal(Strict, frozen=True):
@@ -73,7 +73,7 @@ class Signal(Strict, frozen=True):
     "After each rise and each fall; 0 where it is not given."
     is_known_ahead: bool = False
     "Whether the publisher knows what comes, and sends it as a preview."
-    setpoint_hz: Annotated[float, Meta(ge=LEAST_SETPOINT_HZ, le=1_000.0)] | UnsetType = UNSET
+    setpoint_hz: Annotated[float, Meta(ge=MIN_SETPOINT_HZ, le=1_000.0)] | UnsetType = UNSET
     "How often the publisher sends; as often as plans are made where it is not given."
 
     def __post_init__(self) -> None:

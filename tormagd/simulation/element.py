@@ -15,7 +15,7 @@ from tormagd.simulation.warmth import Warmth
 
 
 @final
-class Element:
+class TorqueElement:
     """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristle deflection, temperature.
 
     Advances in equal steps of `dt_s`. `force_N` is the friction at the roller surface, as a torque sensor feels it.

@@ -31,7 +31,7 @@ from firmware_protocol.codec import (
 )
 from firmware_protocol.value import Value
 from tormagd.simulation.hand import ROLLER_RADIUS_MM
-from tormagd.simulation.motion import Carriage, Homing, Outcome, Retraction
+from tormagd.simulation.motion import Carriage, HomingMotion, Outcome, Retraction
 from tormagd.simulation.parameters import PlantParameters
 
 TICK_S: Final = 1e-3
@@ -41,8 +41,8 @@ OVERCURRENT_S: Final = 0.15  # a reversal at full speed takes about 50 ms of hig
 MAX_SKEW_MM: Final = 2.0
 MAX_SLIP_MM: Final = 0.2
 COASTING_S: Final = 0.1  # a carriage may go on this long before its motion counts as uncommanded
-LEAST_SUPPLY_V: Final = 9.0
-MOST_SUPPLY_V: Final = 15.0
+MIN_SUPPLY_V: Final = 9.0
+MAX_SUPPLY_V: Final = 15.0
 MAX_TEMPERATURE_C: Final = 60.0
 VERSION: Final = (1, 0)
 SERIAL_NUMBER: Final = 1
@@ -138,7 +138,7 @@ class Firmware:
         self._right_zero_mm = 0.0
         self._compatible = False
         self._may_run = True
-        self._motion: Retraction | Homing | None = None
+        self._motion: Retraction | HomingMotion | None = None
         self._drive_counter: int | None = None
         self._drive_s = 0.0
         self._nonce: int | None = None
@@ -215,7 +215,7 @@ class Firmware:
             self.mode = HOMING
             self.homed = False
             self._calm(time_s)
-            self._motion = Homing(
+            self._motion = HomingMotion(
                 time_s,
                 self._carriages(sensors),
                 lead_mm_rev=self._lead_mm_rev,
@@ -274,7 +274,7 @@ class Firmware:
         """
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
-        homing = isinstance(motion, Homing)
+        homing = isinstance(motion, HomingMotion)
         if homing and (causes := self._causes(time_s, sensors)):
             self._fail(time_s, causes, sensors)
             return
@@ -297,7 +297,7 @@ class Firmware:
             return
         if outcome is Outcome.FAILED:
             self.faults |= DeviceFault.RETRACT_FAILED
-        elif isinstance(motion, Homing):
+        elif isinstance(motion, HomingMotion):
             left_mm, right_mm = motion.zeros_mm
             self._left_zero_mm += left_mm
             self._right_zero_mm += right_mm
@@ -376,7 +376,7 @@ class Firmware:
         The supply has to be LEAST_SUPPLY_V to MOST_SUPPLY_V, the temperature at most MAX_TEMPERATURE_C.
         """
         causes = NO_FAULT
-        if not LEAST_SUPPLY_V <= sensors.supply_V <= MOST_SUPPLY_V:
+        if not MIN_SUPPLY_V <= sensors.supply_V <= MAX_SUPPLY_V:
             causes |= DeviceFault.SUPPLY
         if sensors.temperature_C > MAX_TEMPERATURE_C:
             causes |= DeviceFault.TEMPERATURE

@@ -26,7 +26,7 @@ WRONG_WAY_MM: Final = 1.0  # back, while homing drives the carriage open: its mo
 TIME_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
 SEARCH_SHARE: Final = 0.5  # of the speed of opening, about that of homing, from which it brakes at a switch
 STROKE_MM: Final = 25.5  # of a carriage, between its stops
-LEAST_SHARE: Final = 0.6  # of the speed of opening: what the weakest motors reach on the lowest supply
+MIN_SHARE: Final = 0.6  # of the speed of opening: what the weakest motors reach on the lowest supply
 LATE_S: Final = 0.5  # to turn round, to taper, to settle at the switch
 
 
@@ -69,7 +69,7 @@ class Ramp:
 
 
 @final
-class Opening:
+class CarriageOpening:
     """Motion that brings one carriage to its open switch and brakes it there.
 
     A carriage that comes no further has failed when its current says why: a stall, or no current at all. Standing still
@@ -134,10 +134,10 @@ class Retraction:
         tapered: bool,
     ) -> None:
         self._deadline_s = time_s + TIME_LIMIT_S
-        self._late_s = time_s + STROKE_MM / (LEAST_SHARE * speed_mm_s) + LATE_S
+        self._late_s = time_s + STROKE_MM / (MIN_SHARE * speed_mm_s) + LATE_S
         self._speed_mm_s = speed_mm_s
         self._tapered = tapered
-        self._openings = [Opening(time_s, carriage, lead_mm_rev, stall_A) for carriage in carriages]
+        self._openings = [CarriageOpening(time_s, carriage, lead_mm_rev, stall_A) for carriage in carriages]
 
     @property
     def duties(self) -> tuple[float, float]:
@@ -186,7 +186,7 @@ class Retraction:
 
 
 @final
-class Homing:
+class HomingMotion:
     """Motion that finds both open switches twice: at speed, then creeping after a back-off, so that the zero repeats.
 
     `zeros_mm` holds the encoder positions of the two switches once the outcome is DONE.

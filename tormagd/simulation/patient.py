@@ -1,8 +1,8 @@
 """The patient, simulated: what a robot's tip meets, and the network between.
 
 A robot's tip follows the handle late, rubs in a vessel, and meets a wall. `python -m tormagd.simulation.patient` sends
-what it feels to the daemon, as any patient's unit. `Patient` and `Delay` live in the time that they are given, which
-never falls.
+what it feels to the daemon, as any patient's unit. `Patient` and `NetworkDelay` live in the time that they are given,
+which never falls.
 """
 
 import argparse
@@ -119,7 +119,7 @@ def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
     return fields
 
 
-class Delay(Generic[T]):
+class NetworkDelay(Generic[T]):
     """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage from .. to, seconds.
 
     `loss` is the share of messages lost in the long run, `burst` the mean number lost in a row. Jitter may let a later
@@ -168,8 +168,8 @@ def run(
     client: Any,
     patient: Patient,
     mode: str,
-    there: Delay[float],
-    back: Delay[dict[str, Any]],
+    there: NetworkDelay[float],
+    back: NetworkDelay[dict[str, Any]],
     is_over: Callable[[float], bool],
     clock_s: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
@@ -226,8 +226,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         patient = Patient(friction_N=options.friction_N, wall_mm=options.wall_mm, stiffness_N_mm=options.stiffness_N_mm)
         network = 1e-3 * options.delay_ms, 1e-3 * options.jitter_ms, options.loss, 3.0
-        there: Delay[float] = Delay(*network, seed=1)
-        back: Delay[dict[str, Any]] = Delay(*network, seed=2)
+        there: NetworkDelay[float] = NetworkDelay(*network, seed=1)
+        back: NetworkDelay[dict[str, Any]] = NetworkDelay(*network, seed=2)
     except ValueError as error:
         command.error(str(error))
     ends_s = time.monotonic() + options.seconds

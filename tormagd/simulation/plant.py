@@ -7,7 +7,7 @@ from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
 from tormagd.simulation.axis import Axis
-from tormagd.simulation.element import Element
+from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import FeltHand, Hand, HandError
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.pressed_pad import PressedPad
@@ -60,7 +60,7 @@ class Truth(Value):
 
 
 class Sensor(Protocol):
-    """What shows the rendered force: a `ForceSensor`, or a test's own in its place."""
+    """What shows the rendered force: a `SimulatedSensor`, or a test's own in its place."""
 
     @property
     def reading_N(self) -> float:
@@ -72,7 +72,7 @@ class Sensor(Protocol):
 
 @final
 class Plant:
-    """The device without its electronics, in fixed substeps of its own time; `Axis` and `Element` state the laws.
+    """The device without its electronics, in fixed substeps of its own time; `Axis` and `TorqueElement` state the laws.
 
     `advance` takes any time step and keeps the remainder of a substep for the next call. A voltage that changes within
     a substep acts in it with its mean. A bridge opens at the nearer end of a substep, which moves a carriage at full
@@ -93,7 +93,7 @@ class Plant:
         screw = parameters.screw
         self.left = Axis(parameters, screw.drag_left_N, assumed.start_left_mm, pull_N, substep_s)
         self.right = Axis(parameters, screw.drag_right_N, assumed.start_right_mm, pull_N, substep_s)
-        self.element: Element | PressedPad | SecondElement
+        self.element: TorqueElement | PressedPad | SecondElement
         if parameters.pad is not None:
             if isinstance(hand, FeltHand):
                 raise HandError("hand felt: allowed at a pad is a prescribed hand, as pressing is")
@@ -101,10 +101,10 @@ class Plant:
         elif parameters.second is not None:
             self.element = SecondElement(parameters, gap_mm, ELEMENT_STEP_S)
         else:
-            self.element = Element(parameters, gap_mm, ELEMENT_STEP_S)
+            self.element = TorqueElement(parameters, gap_mm, ELEMENT_STEP_S)
         self.handle_mm = hand.position_mm(0.0)
         self.handle_mm_s = 0.0
-        self.force_sensor: Sensor = ForceSensor(parameters, random.Random(seed))
+        self.force_sensor: Sensor = SimulatedSensor(parameters, random.Random(seed))
         self._target_s = 0.0
         self._left_V: float | None = None
         self._right_V: float | None = None
@@ -237,7 +237,7 @@ def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None
 
 
 @final
-class ForceSensor:
+class SimulatedSensor:
     """The force sensor: samples at its own rate, adds noise and a drifting offset, saturates, and shows samples late.
 
     `reading_N` is the newest sample that shows; 0 before the first.

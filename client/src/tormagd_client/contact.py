@@ -19,7 +19,7 @@ TOUCHES_N = 0.1
 "A force above friction by this much is a wall's."
 OFF, STRIKES = 5.0, 3
 "Deviations from the line, and points in a row beyond them, after which the wall is another one."
-MOST_SHARE, MOST_MM = 0.2, 0.5
+MAX_SHARE, MAX_MM = 0.2, 0.5
 "Largest standard deviations of a known wall: of stiffness, as a share, and of place."
 
 
@@ -45,7 +45,7 @@ class ContactEstimator:
         None is also a wall beyond MAX_PLACE_MM. Stiffness is MAX_STIFFNESS_N_MM at most, friction 0 at least.
         """
         slope_N_mm, place_mm, slope_sd, place_sd_mm, _ = self._line()
-        is_known = slope_sd <= MOST_SHARE * slope_N_mm and place_sd_mm <= MOST_MM
+        is_known = slope_sd <= MAX_SHARE * slope_N_mm and place_sd_mm <= MAX_MM
         if not (is_known and abs(place_mm) <= MAX_PLACE_MM):
             return None
         stiffness_N_mm = min(slope_N_mm, MAX_STIFFNESS_N_MM)

@@ -12,7 +12,7 @@ from tormagd.control.believe.strength import DeviceFit
 
 STEP_S = 0.01
 SPEED_MM_S = 40.0
-MOST_MM = SPEED_MM_S * STEP_S
+MAX_MM = SPEED_MM_S * STEP_S
 
 
 def path_mm(start_mm: float, wanted_mm: list[float], weights: list[float], elapsed_s: float = STEP_S) -> list[float]:
@@ -34,7 +34,7 @@ def test_what_the_gap_can_follow_is_followed() -> None:
 def test_a_step_is_met_in_its_middle() -> None:
     """As much too soon as too late: the gap is half way where the step is."""
     path = path_mm(60.0, [60.0] * 20 + [64.0] * 20, [1.0] * 40)
-    assert (path[19], path[20]) == pytest.approx((62.0 - MOST_MM / 2.0, 62.0 + MOST_MM / 2.0))
+    assert (path[19], path[20]) == pytest.approx((62.0 - MAX_MM / 2.0, 62.0 + MAX_MM / 2.0))
     assert (path[:14], path[26:]) == (pytest.approx([60.0] * 14), pytest.approx([64.0] * 14))
 
 
@@ -47,7 +47,7 @@ def test_the_first_gap_is_within_reach_of_the_last() -> None:
     for elapsed_s in (0.0, 0.002, 0.5):
         path = path_mm(60.0, [70.0] * 10, [1.0] * 10, elapsed_s)
         assert (path[0], path[1]) == pytest.approx(
-            (min(60.0 + SPEED_MM_S * elapsed_s, 70.0), min(path[0] + MOST_MM, 70.0))
+            (min(60.0 + SPEED_MM_S * elapsed_s, 70.0), min(path[0] + MAX_MM, 70.0))
         )
 
 
@@ -79,12 +79,12 @@ def test_no_path_within_the_speed_misses_less(points: list[tuple[float, float, i
     """Nor where the points are unevenly far apart."""
     wanted, weights = [60.0 + at for at, _, _ in points], [weight for _, weight, _ in points]
     steps = [step for _, _, step in points]
-    grid_mm = MOST_MM / GRID
+    grid_mm = MAX_MM / GRID
     start_mm = 60.0 + start * grid_mm
     times_s = [STEP_S * (passed - steps[0]) for passed in itertools.accumulate(steps)]
     path = nearest_path_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, SPEED_MM_S, len(wanted))
     for (before, after), step in zip(itertools.pairwise([start_mm, *path]), steps, strict=True):
-        assert abs(after - before) <= step * MOST_MM + 1e-9
+        assert abs(after - before) <= step * MAX_MM + 1e-9
     reached = {start: 0.0}
     for want, weight, step in zip(wanted, weights, steps, strict=True):
         following: dict[int, float] = {}

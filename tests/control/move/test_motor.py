@@ -10,7 +10,7 @@ from hypothesis import example, given, settings, strategies as st
 from scipy.optimize import brentq
 from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 
-from tormagd.assembly.build import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
+from tormagd.assembly.build import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG, build_core
 from tormagd.config import Config, Motor, Position
 from tormagd.control.move.motor import (
     MAX_MARGIN_DB,
@@ -194,7 +194,7 @@ def test_gains_at_their_bounds_are_unstable_only_where_the_margins_say_so(positi
     """What build_core accepts is stable, from end to end of what the configuration allows."""
     motor = Config().motor
     found = margins(motor, position, PERIOD_S)
-    if found.phase_margin_deg >= LEAST_PHASE_MARGIN_DEG and found.gain_margin_dB >= LEAST_GAIN_MARGIN_DB:
+    if found.phase_margin_deg >= MIN_PHASE_MARGIN_DEG and found.gain_margin_dB >= MIN_GAIN_MARGIN_DB:
         assert closed_loop_radius(motor, position) < 1.0
 
 

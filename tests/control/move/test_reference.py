@@ -11,7 +11,7 @@ from tormagd.control.move.reference import Expected, Reference, Speeds, follow
 
 DT_S = 1e-3
 LIMITS = Config().position
-MOST_MM_S2 = LIMITS.gap_acceleration_mm_s2
+MAX_MM_S2 = LIMITS.gap_acceleration_mm_s2
 NO_LOAD_MM_S = 2.0 * full_speed_mm_s(Config().motor)
 "Speed of the gap at full duty, of the shipped motor."
 SPEEDS = Speeds(NO_LOAD_MM_S, LIMITS.gap_speed_mm_s, LIMITS.gap_speed_mm_s)
@@ -77,7 +77,7 @@ def test_a_step_takes_hardly_longer_than_its_limits_ask() -> None:
     """1 mm of gap: time-optimal with this acceleration is 2 sqrt(d / a); the last stretch is a little slower."""
     reference, ticks = Reference(70.0), 0
     while abs(reference.gap_mm - 69.0) > 0.1:
-        reference, _, _ = follow(MOST_MM_S2, reference, Reference(69.0), DT_S, SPEEDS)
+        reference, _, _ = follow(MAX_MM_S2, reference, Reference(69.0), DT_S, SPEEDS)
         ticks += 1
     assert ticks * DT_S < 1.3 * 2.0 * math.sqrt(1.0 / LIMITS.gap_acceleration_mm_s2)
 
@@ -88,7 +88,7 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
     reference, target, is_limited = Reference(start), start, True
     for _ in range(800):
         target += speed * DT_S
-        reference, is_limited, _ = follow(MOST_MM_S2, reference, Reference(target, speed), DT_S, SPEEDS)
+        reference, is_limited, _ = follow(MAX_MM_S2, reference, Reference(target, speed), DT_S, SPEEDS)
     # its sampling is one period late at most
     assert abs(reference.gap_mm - target) <= abs(speed) * DT_S + 1e-6
     assert reference.speed_mm_s == pytest.approx(speed, abs=1e-3)
@@ -96,12 +96,12 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
 
 
 def test_being_held_back_is_said() -> None:
-    reference, is_limited, _ = follow(MOST_MM_S2, Reference(95.0), Reference(45.0), DT_S, SPEEDS)
+    reference, is_limited, _ = follow(MAX_MM_S2, Reference(95.0), Reference(45.0), DT_S, SPEEDS)
     assert is_limited
-    _, is_limited, _ = follow(MOST_MM_S2, reference, Reference(reference.gap_mm), DT_S, SPEEDS)
+    _, is_limited, _ = follow(MAX_MM_S2, reference, Reference(reference.gap_mm), DT_S, SPEEDS)
     assert not is_limited
     _, is_limited, _ = follow(
-        MOST_MM_S2, reference, Reference(reference.gap_mm, 2.0 * LIMITS.gap_speed_mm_s), DT_S, SPEEDS
+        MAX_MM_S2, reference, Reference(reference.gap_mm, 2.0 * LIMITS.gap_speed_mm_s), DT_S, SPEEDS
     )
     assert is_limited
 
@@ -115,7 +115,7 @@ def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: 
     # one period of full braking covers a dt^2 / 2: a slow loop cannot stop more exactly than a part of that
     grain = HALF_COUNT_MM + 0.2 * LIMITS.gap_acceleration_mm_s2 * dt_s**2
     for _ in range(400):
-        reference, _, _ = follow(MOST_MM_S2, reference, Reference(target), dt_s, SPEEDS)
+        reference, _, _ = follow(MAX_MM_S2, reference, Reference(target), dt_s, SPEEDS)
         assert math.isfinite(reference.gap_mm + reference.speed_mm_s + reference.acceleration_mm_s2)
         assert min(start, target) - grain <= reference.gap_mm <= max(start, target) + grain
     if dt_s * 400 > 4.0:
@@ -127,7 +127,7 @@ def test_either_way_has_its_own_limit() -> None:
     for target, most in ((95.0, 30.0), (45.0, LIMITS.gap_speed_mm_s)):
         reference, speeds = Reference(70.0), []
         for _ in range(500):
-            reference, _, _ = follow(MOST_MM_S2, reference, Reference(target), DT_S, slow)
+            reference, _, _ = follow(MAX_MM_S2, reference, Reference(target), DT_S, slow)
             speeds.append(abs(reference.speed_mm_s))
         assert max(speeds) == pytest.approx(most, rel=1e-3)
 
@@ -141,7 +141,7 @@ def test_a_target_that_turns_is_met_where_it_turns() -> None:
             phase = 2.0 * math.pi * 3.0 * tick * DT_S
             rate = 2.0 * math.pi * 3.0
             target = Reference(71.0 - math.cos(phase), rate * math.sin(phase), rate**2 * math.cos(phase) * is_known)
-            reference, _, _ = follow(MOST_MM_S2, reference, target, DT_S, SPEEDS)
+            reference, _, _ = follow(MAX_MM_S2, reference, target, DT_S, SPEEDS)
             worst = max(worst, abs(reference.gap_mm - target.gap_mm))
         excess[is_known] = worst
     assert excess[True] <= excess[False]
@@ -186,5 +186,5 @@ def test_what_is_expected_of_a_ramp_is_late_by_the_lag() -> None:
 def test_no_target_leads_it_beyond_its_floor(start: float, path: list[tuple[float, float, float]]) -> None:
     reference = Reference(start)
     for gap_mm, speed_mm_s, turning in path:
-        reference, _, _ = follow(MOST_MM_S2, reference, Reference(gap_mm, speed_mm_s, turning), DT_S, SPEEDS, 70.0)
-        assert reference.gap_mm >= 70.0 - MOST_MM_S2 * DT_S**2 / 8.0  # 0.2 um: it brakes in whole periods
+        reference, _, _ = follow(MAX_MM_S2, reference, Reference(gap_mm, speed_mm_s, turning), DT_S, SPEEDS, 70.0)
+        assert reference.gap_mm >= 70.0 - MAX_MM_S2 * DT_S**2 / 8.0  # 0.2 um: it brakes in whole periods

@@ -22,7 +22,7 @@ from tormagd.physics.errors import require
 from tormagd.physics.relaxation import MAX_FORCE_N, PronySeries
 
 MAX_BRANCHES = 6
-LEAST_FRACTION = 1e-6
+MIN_FRACTION = 1e-6
 """A branch under this share of the force is noise, and left out of the series."""
 
 _STARTS = 3
@@ -80,7 +80,7 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
     scale = float(coefficients.sum())
     if not coefficients[0] > 0.0:
         raise LabError("nothing is left at equilibrium: the record is too short to tell the slowest time from it")
-    kept = coefficients[1:] / scale >= LEAST_FRACTION
+    kept = coefficients[1:] / scale >= MIN_FRACTION
     series = PronySeries(tuple((coefficients[1:][kept] / scale).tolist()), tuple(times_s[kept].tolist()))
     left = float(np.sum(left_N**2))
     whole = float(np.sum((record.force_N - record.force_N.mean()) ** 2))

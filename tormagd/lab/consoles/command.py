@@ -25,7 +25,7 @@ from tormagd.output import write_line
 from tormagd_client.printable import printable
 
 HEADINGS = ("device", "insert", "files", "enabled", "RMS, worst mN", "trim", "current A", "clock ppm", "held back by")
-LEAST_SHARE, MOST_LIMITS = 0.001, 3
+MIN_SHARE, MAX_LIMITS = 0.001, 3
 "Least share of the time, and most limits, that are shown to a person."
 KINDS = {
     str: pyarrow.string(),
@@ -55,10 +55,10 @@ def write_parquet(summaries: dict[str, Summary], url: str) -> None:
 def _cells(console: Console) -> tuple[str, ...]:
     """Return a console's texts for a person, one under each of HEADINGS.
 
-    `unknown` stands for what no recording says; limits under LEAST_SHARE of the time are left out.
+    `unknown` stands for what no recording says; limits under MIN_SHARE of the time are left out.
     """
     errors_N = (console.tracking_rms_N, console.worst_rms_N)
-    held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= LEAST_SHARE][:MOST_LIMITS]
+    held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= MIN_SHARE][:MAX_LIMITS]
     faults = [f"{code} in {count}" for code, count in console.faults.items()]
     return (
         "unknown" if console.serial_number is None else f"{console.serial_number:08x}",

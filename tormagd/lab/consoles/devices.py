@@ -9,7 +9,7 @@ import numpy as np
 from tormagd.lab.consoles.summary import Summary
 
 DAY_S = 86_400.0
-LEAST_DAYS, LEAST_RECORDINGS = 1.0, 3
+MIN_DAYS, MIN_RECORDINGS = 1.0, 3
 "Fewest days and recordings of which a drift per day is told."
 
 
@@ -93,5 +93,5 @@ def _drift(values: list[tuple[float, float | None]]) -> Drift | None:
         return None
     at_s, shown = np.array(known).T
     days = (at_s - at_s[0]) / DAY_S
-    is_told = len(known) >= LEAST_RECORDINGS and days[-1] >= LEAST_DAYS
+    is_told = len(known) >= MIN_RECORDINGS and days[-1] >= MIN_DAYS
     return Drift(known[0][1], known[-1][1], float(np.polyfit(days, shown, 1)[0]) if is_told else None)

@@ -38,7 +38,7 @@ SLOW_M_S = 1e-3
 MOSTLY, THROUGHOUT = 0.5, 0.98
 "Shares of moving rows. Without a current, turns tell friction from drag; with one they only blur it."
 BLOCK_S = 1.0
-LEAST_BLOCKS = 8
+MIN_BLOCKS = 8
 EDGE = 4
 "Rows at both ends that carry the filters' guesses."
 SPREAD = 2.0
@@ -112,7 +112,7 @@ def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
     sign = np.sign(speed) * (np.abs(speed) > SLOW_M_S)
     factor = max(1, round(1.0 / log.period_s / thinned_Hz))
     found = Motion(position - position.mean(), speed, np.gradient(speed, log.period_s), sign, factor)
-    if len(found.thin(speed)) < LEAST_BLOCKS * BLOCK_S * thinned_Hz or not (sign > 0).any() or not (sign < 0).any():
+    if len(found.thin(speed)) < MIN_BLOCKS * BLOCK_S * thinned_Hz or not (sign > 0).any() or not (sign < 0).any():
         raise LabError("the log moves too little: mass, friction and offset cannot be told apart")
     return found
 
@@ -137,11 +137,11 @@ def block_numbers(seen: Motion, period_s: float) -> Array:
 def linear(rows: Array, target: Array, blocks: Array) -> Fit:
     """Fit `target` (n) by `rows` (n, k) in least squares; rows of one number in `blocks` (n) may be correlated.
 
-    Raises LabError for under LEAST_BLOCKS blocks or columns that depend on each other.
+    Raises LabError for under MIN_BLOCKS blocks or columns that depend on each other.
     """
     scale = np.linalg.norm(rows, axis=0)
     if (
-        len(np.unique(blocks)) < LEAST_BLOCKS
+        len(np.unique(blocks)) < MIN_BLOCKS
         or not (scale > 0.0).all()
         or np.linalg.matrix_rank(rows / scale) < rows.shape[1]
     ):
@@ -252,7 +252,7 @@ def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array)
     return fitted, delay_s
 
 
-class Way(NamedTuple):
+class Variant(NamedTuple):
     """One way to fit a model: with terms usually left out, with other rows, other currents, in another band."""
 
     is_full: bool = False
@@ -263,24 +263,24 @@ class Way(NamedTuple):
 
 
 OTHER_WAYS = (
-    (Way(is_full=True), Way(is_full=True, moving_share=MOSTLY)),
-    (Way(current_shift=-0.5), Way(current_shift=0.5)),
+    (Variant(is_full=True), Variant(is_full=True, moving_share=MOSTLY)),
+    (Variant(current_shift=-0.5), Variant(current_shift=0.5)),
     # a sample a millisecond is not the current's mean; every second sample shows by how much that matters
-    (Way(currents=slice(0, None, 2)), Way(currents=slice(1, None, 2))),
-    (Way(thinned_Hz=WIDER_HZ),),
+    (Variant(currents=slice(0, None, 2)), Variant(currents=slice(1, None, 2))),
+    (Variant(thinned_Hz=WIDER_HZ),),
 )
 "Groups of ways; of each group the way that differs most counts."
 
 
-def _estimates(fit_in: Callable[[Way], tuple[Array, Array]]) -> list[Estimate]:
+def _estimates(fit_in: Callable[[Variant], tuple[Array, Array]]) -> list[Estimate]:
     """Return the values of the plain way to fit, with intervals that cover what the other ways make of them.
 
     `fit_in` fits in one way, and gives values and half widths (n each).
     """
-    values, widths = fit_in(Way())
+    values, widths = fit_in(Variant())
     widths = widths.copy()
     for group in OTHER_WAYS:
-        widths += np.max([np.abs(fit_in(way)[0] - values) for way in group], axis=0)
+        widths += np.max([np.abs(fit_in(variant)[0] - values) for variant in group], axis=0)
     return [Estimate(float(value), float(width)) for value, width in zip(values, widths, strict=True)]
 
 
@@ -299,12 +299,12 @@ def fit_windings(log: Log) -> Windings:
     Raises LabError where the log moves too little, has no current, or fits best with a delay over LONGEST_DELAY_S.
     """
 
-    def fit_in(way: Way) -> tuple[Array, Array]:
-        seen = motion(log, way.thinned_Hz)
-        kept = moving(seen, way.moving_share)
-        current = _low_pass(log)(_current(log, way))
+    def fit_in(variant: Variant) -> tuple[Array, Array]:
+        seen = motion(log, variant.thinned_Hz)
+        kept = moving(seen, variant.moving_share)
+        current = _low_pass(log)(_current(log, variant))
         terms = [current, np.gradient(current, log.period_s), seen.v]
-        if way.is_full:  # brushes that take a voltage of their own, and a meter with an offset
+        if variant.is_full:  # brushes that take a voltage of their own, and a meter with an offset
             terms += [seen.sign, np.ones_like(seen.v)]
         rows = np.column_stack([seen.thin(term)[kept] for term in terms])
         fitted, delay_s = _with_delay(log, seen, rows, kept, block_numbers(seen, log.period_s)[kept])
@@ -333,17 +333,17 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
     Raises LabError where the log moves too little, or has no current.
     """
 
-    def fit_in(way: Way) -> tuple[Array, Array]:
-        seen = motion(log, way.thinned_Hz)
-        kept = moving(seen, way.moving_share)
+    def fit_in(variant: Variant) -> tuple[Array, Array]:
+        seen = motion(log, variant.thinned_Hz)
+        kept = moving(seen, variant.moving_share)
         blocks = block_numbers(seen, log.period_s)[kept]
-        force = force_N_A * _current(log, way)
+        force = force_N_A * _current(log, variant)
         x = seen.x / seen.x.std()
         terms = [seen.a, seen.v, seen.sign * np.abs(force), np.ones_like(x), x, x**2, seen.sign, seen.sign * x]
         target = seen.thin(force)[kept]
         fitted = linear(np.column_stack([seen.thin(term)[kept] for term in terms]), target, blocks)
         idle_N = 0.0
-        if way.is_full:
+        if variant.is_full:
             # the force that the gears take idling is not transmitted, so no share of it is lost; `fit_volts` on mass
             idle_N = abs(float(fitted.values[6]))
             terms += [seen.sign * np.minimum(np.abs(force), idle_N), seen.a * np.sign(seen.a * seen.v)]
@@ -360,12 +360,12 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
     return Gearbox(*_estimates(fit_in))
 
 
-def _current(log: Log, way: Way) -> Array:
-    """Return the log's current at its times, shifted and thinned as `way` says. Raises LabError without a current."""
+def _current(log: Log, variant: Variant) -> Array:
+    """Return the log's current at its times, shifted and thinned by `variant`. Raises LabError without a current."""
     if log.current_A is None:
         raise LabError("current_A: needed to tell the motor's windings from its load")
-    times = log.t_s + way.current_shift * log.period_s
-    return np.asarray(np.interp(times, log.t_s[way.currents], log.current_A[way.currents]))
+    times = log.t_s + variant.current_shift * log.period_s
+    return np.asarray(np.interp(times, log.t_s[variant.currents], log.current_A[variant.currents]))
 
 
 def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:

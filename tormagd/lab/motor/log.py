@@ -9,13 +9,13 @@ from scipy.io.matlab import MatReadError
 
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
-from tormagd.lab.tables import MOST_TABLE_BYTES, read_columns
+from tormagd.lab.tables import MAX_TABLE_BYTES, read_columns
 from tormagd_client.regular_file import require_regular
 
 COLUMNS = ("t_s", "input_V", "position_mm")
 CURRENT_COLUMN = "current_A"
-LEAST_ROWS = 100
-LEAST_RATE_HZ = 400.0
+MIN_ROWS = 100
+MIN_RATE_HZ = 400.0
 
 
 class Log(NamedTuple):
@@ -44,8 +44,8 @@ def read_log(path: Path) -> Log:
     Raises LabError for an unreadable file, too few rows, values that are not finite, uneven times, or under 400 Hz.
     """
     log = _read_mat(path) if path.suffix == ".mat" else _read_csv(path)
-    if len(log.t_s) < LEAST_ROWS:
-        raise LabError(f"{path}: {len(log.t_s)} rows: allowed are at least {LEAST_ROWS}")
+    if len(log.t_s) < MIN_ROWS:
+        raise LabError(f"{path}: {len(log.t_s)} rows: allowed are at least {MIN_ROWS}")
     for name, values in zip((*COLUMNS, "gain", CURRENT_COLUMN), log, strict=True):
         if isinstance(values, np.ndarray) and not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values))[0])
@@ -56,8 +56,8 @@ def read_log(path: Path) -> Log:
         raise LabError(
             f"{path}, row {row + 1}: t_s steps by {steps[row]:g} s: allowed is about {period:g} s throughout"
         )
-    if 1.0 / period < LEAST_RATE_HZ:
-        raise LabError(f"{path}: sampled at {1.0 / period:.0f} Hz: allowed is at least {LEAST_RATE_HZ:.0f} Hz")
+    if 1.0 / period < MIN_RATE_HZ:
+        raise LabError(f"{path}: sampled at {1.0 / period:.0f} Hz: allowed is at least {MIN_RATE_HZ:.0f} Hz")
     return log
 
 
@@ -67,7 +67,7 @@ def _read_mat(path: Path) -> Log:
     Raises LabError for a file that is unreadable, without t, vir, qm and gtau, or with columns of different lengths.
     """
     try:
-        require_regular(path, MOST_TABLE_BYTES)
+        require_regular(path, MAX_TABLE_BYTES)
         data = loadmat(path)
         t_s, input_V, position_m = (np.asarray(data[name], dtype=np.float64).ravel() for name in ("t", "vir", "qm"))
         gain = float(np.asarray(data["gtau"]).item())

@@ -22,7 +22,7 @@ NEIGHBOURS = (1, 2, 4, 8, 16, 64)
 SHALLOW_MM = 1.0
 "Depth beyond which the pad's force rises, but for fractions of a millinewton."
 CONTACTS, STEPS, SEED = 60, 400, 3
-MOST_DRAWS = 6_000
+MAX_DRAWS = 6_000
 "Of contacts, before a model counts as one whose force rises with the field everywhere."
 JUMP_MT = 20.0
 MODELS = {"pad": ("tactile_mre_c", "tactile", (0.0, 365.0)), "brake": ("torque_mre_50_40", "torque", (330.0, 740.0))}
@@ -32,19 +32,19 @@ def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float
     """Draw CONTACTS contacts from the model's box, the same each time: displacement, mm, and rate, mm/s.
 
     `shallow_mm` None: all count. With `shallow_mm` displacements end there, and only contacts at which the force falls
-    somewhere in the fields `range_mT` are kept. Raises LabError where MOST_DRAWS do not give as many.
+    somewhere in the fields `range_mT` are kept. Raises LabError where MAX_DRAWS do not give as many.
     """
     draw, fields = np.random.default_rng(SEED), np.linspace(*range_mT, 366)
     (low_mm, high_mm), rates, _, (cip_percent, _) = model.feature_ranges
     found: list[tuple[float, float]] = []
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         displacement_mm, rate_mm_s = draw.uniform(low_mm, shallow_mm or high_mm), draw.uniform(*rates)
         forces_N = model.curve(displacement_mm, rate_mm_s, cip_percent).forces_N(fields)
         if shallow_mm is None or (np.diff(forces_N) <= 0.0).any():
             found.append((displacement_mm, rate_mm_s))
         if len(found) == CONTACTS:
             return found
-    raise LabError(f"the force falls with the field at {len(found)} of {MOST_DRAWS} contacts: needed are {CONTACTS}")
+    raise LabError(f"the force falls with the field at {len(found)} of {MAX_DRAWS} contacts: needed are {CONTACTS}")
 
 
 def followed(

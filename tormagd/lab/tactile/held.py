@@ -32,7 +32,7 @@ from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import PlantError, load_plant
-from tormagd.simulation.plant import ForceSensor
+from tormagd.simulation.plant import SimulatedSensor
 from tormagd.simulation.pressed_pad import PressedPad
 
 SCENE = "radial_pulse"
@@ -140,7 +140,7 @@ def _coarse(case: Case) -> Iterator[Moment]:
     made = _Prepared(case)
     planner = made.core.planner()
     element = PressedPad(made.plant, planner.planned.gap_mm, COARSE_S)
-    sensor, depth_mm, each_s = ForceSensor(made.plant, random.Random(1)), 0.0, round(1.0 / COARSE_S)
+    sensor, depth_mm, each_s = SimulatedSensor(made.plant, random.Random(1)), 0.0, round(1.0 / COARSE_S)
     begins, ends = round(made.begins_s / COARSE_S), round((made.begins_s + case.seconds) / COARSE_S)
     for tick in range(1, ends + 1):
         now_s, before_mm, gap_mm = tick * COARSE_S, depth_mm, planner.planned.gap_mm
