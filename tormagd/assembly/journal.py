@@ -59,7 +59,7 @@ class Journal:
     """The core's inputs since the last `take`, in their order. Every method but `take` adds an entry.
 
     An entry costs a reference in a list: records do not change, and states are written out at once. With `is_kept`
-    False nothing is added. MOST_ENTRIES that nobody took are dropped, and MISSING stands for them.
+    False nothing is added. MAX_ENTRIES that nobody took are dropped, and MISSING stands for them.
     """
 
     def __init__(self, *, is_kept: bool = True) -> None:

@@ -16,8 +16,8 @@ def black_box(client: Client, copy: Path | None) -> Outcome:
     """Have the daemon write its black box, wait until it is on this disk, and copy it to the new file `copy`; None
     copies nothing.
 
-    The outcome's `file` is the copy, or without one the daemon's file. Raises CommandError: USAGE where `copy` exists
-    or the file cannot be copied; REFUSED where the daemon says it could not write it, or has not within LONGEST_S.
+    The outcome's `file` is the copy, or without one the daemon's file. Raises CommandError (USAGE) where `copy` exists
+    or the file cannot be copied. Raises it (REFUSED) where the daemon could not write it, or has not within LONGEST_S.
     Raises as `Client.request` where the daemon keeps no black box.
     """
     if copy is not None and copy.exists():

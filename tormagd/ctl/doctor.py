@@ -224,7 +224,7 @@ def bare_timer(found: Headroom) -> Finding:
 def others(found: Headroom) -> Finding:
     """Judge what a hypervisor and other programs took during the measurement, by the kernel's counters.
 
-    WARN above MOST_STOLEN or MOST_WAITED; a wait that is not known passes.
+    WARN above MAX_STOLEN or MAX_WAITED; a wait that is not known passes.
     """
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
     is_stolen = found.steal > MAX_STOLEN

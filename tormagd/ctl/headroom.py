@@ -122,7 +122,7 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
     """Judge one rate `hz` of `loop`, beside the other loop's: `used` is the larger share of time and of processor.
 
     A control tick has to fit its period even when it wakes late (p99); a plan, with the tick before it, in the median.
-    All runs in one thread, so ticks and plans together must fit one processor. It holds up to MOST_USED; else `change`
+    All runs in one thread, so ticks and plans together must fit one processor. It holds up to MAX_USED; else `change`
     says what helps.
     """
     late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us

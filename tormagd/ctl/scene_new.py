@@ -31,8 +31,8 @@ def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcom
     """Write the new scene file `out` from a recorded force, or for None from a person's answers, with a fitting insert.
 
     `config` is the configuration to check it by; None means the defaults. The text warns of a greatest force over
-    RESERVED of the device's. Raises CommandError: USAGE for files and answers that cannot be used, or nobody to ask;
-    REFUSED where no shipped insert renders the scene, or the check fails. Then there is no file.
+    RESERVED of the device's. Raises CommandError (USAGE) for files and answers that cannot be used, or nobody to ask.
+    Raises it (REFUSED) where no shipped insert renders the scene, or the check fails. Then there is no file.
     """
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")

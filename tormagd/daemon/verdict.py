@@ -75,8 +75,8 @@ def judged(
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
     """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there.
 
-    The ceiling does where the aim is beyond it, the model's range where it bounds the field, F_MIN where the ramp does
-    not lead up from it, and the others in HOLDING always.
+    The ceiling does where the aim is beyond it, and the model's range where it bounds the field. F_MIN does where the
+    ramp does not lead up from it. The others in HOLDING always do.
     """
     if limit is Limit.CEILING:
         return aim_mm < plan.min_gap_mm

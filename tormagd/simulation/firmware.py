@@ -373,7 +373,7 @@ class Firmware:
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
         """Return the faults whose cause is there now, whatever the device does: SUPPLY and TEMPERATURE.
 
-        The supply has to be LEAST_SUPPLY_V to MOST_SUPPLY_V, the temperature at most MAX_TEMPERATURE_C.
+        The supply has to be MIN_SUPPLY_V to MAX_SUPPLY_V, the temperature at most MAX_TEMPERATURE_C.
         """
         causes = NO_FAULT
         if not MIN_SUPPLY_V <= sensors.supply_V <= MAX_SUPPLY_V:

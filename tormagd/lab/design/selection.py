@@ -41,10 +41,10 @@ class Verdict:
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
     """Judge one insert for a task, where the gap is placed in steps of `gap_resolution_mm`.
 
-    Returns its forces, the largest force step, the share of the task that it reaches, 0 to 1, the gap that is open
-    enough for the task, and the reasons why it does not serve. The step is the largest within that part of the task; of
-    an insert that reaches none, or a task of one force, it is the open gap's. A passive brake never reaches 0 N. A
-    least force that is missed by no more than the task's resolution counts as reached: the task could not tell the
+    Returns its forces, the largest force step, and the share of the task that it reaches, 0 to 1. Also the gap that is
+    open enough for the task, and the reasons why it does not serve. The step is the largest within that part of the
+    task. Where the insert reaches none, or the task is one force, it is the open gap's. A passive brake never reaches 0
+    N. A least force that is missed by no more than the task's resolution counts as reached: the task could not tell the
     difference.
     """
     least, most = brake.least_N, brake.most_N

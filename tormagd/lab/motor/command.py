@@ -40,8 +40,8 @@ def run(options: argparse.Namespace) -> Found:
     """Identify the motor from the log `options.log` and return its parameters, as `identify`; write configuration and
     plot if asked.
 
-    `options.gain` None takes the log's own, if any. Raises LabError where the log cannot be used, and where a
-    configuration is asked for with a gain, from a log without current, or at a file that exists. Raises ConfigError
+    `options.gain` None takes the log's own, if any. Raises LabError where the log cannot be used. Raises it,
+    too, where a configuration is asked for with a gain, without current, or at a file that exists. Raises ConfigError
     where the present one is refused, OSError where the plot cannot be written.
     """
     log = read_log(options.log)

@@ -63,8 +63,8 @@ Moment = tuple[float, float, Plan, str]
 def hold(case: Case) -> dict[str, Any]:
     """Hold a force on the pad of `case` and return how well it was held, as plain data beside the case's own fields.
 
-    Errors are shares of the force asked for, one a second: the greatest and the mean of magnitudes, the last with its
-    sign, positive for too much. `shares` has every tenth, with signs. `limits` has the share of the time that each
+    Errors are shares of the force asked for, one a second. The greatest and the mean are of magnitudes, the last has
+    its sign, positive for too much. `shares` has every tenth, with signs. `limits` has the share of the time that each
     limit was there, `held_s` the seconds. `fault` names the fault that ended the hold; it is empty where none did.
     Raises PlantError for a plant that cannot be loaded or has no pad, ValueError for a fault in the first second.
     """

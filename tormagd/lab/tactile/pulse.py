@@ -200,8 +200,8 @@ def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
     """Render pulses by feed-forward on a pad held at 4.5 mm for `duration_s` of virtual time.
 
     Returns relative force errors of the network alone ("without") and with memory ("with"): the greatest of ten minutes
-    and in all, the mean, and the share of forces out of the field's reach. Raises ModuleNotFoundError where heartpy is
-    not installed.
+    and in all, and the mean. Returns also the share of forces out of the field's reach. Raises ModuleNotFoundError
+    where heartpy is not installed.
     """
     dt_s = 1.0 / HOLD_RATE_HZ
     rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)
