@@ -42,7 +42,6 @@ from tormagd_client.messages import (
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/messages.md").read_text(encoding="utf-8")
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 TELEMETRY = (
     "v t_ns seq operating_state is_homed is_busy setpoint_cf governed_cf measured_cf predicted_cf field_mT gap_mm "
     "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick belief search_age_ms "
@@ -99,8 +98,9 @@ WORDS = {int: "int", float: "float", str: "str", bool: "bool", Any: "any"}
 
 @pytest.mark.parametrize("kind", V1, ids=lambda kind: kind.__name__)
 def test_no_key_of_this_version_goes(kind: type[msgspec.Struct]) -> None:
-    """A key that goes, or gets another name, takes a higher `v`; one that comes is added here and in the page."""
-    assert (messages.VERSION, set(kind.__struct_encode_fields__)) == (1, set(V1[kind].split()))
+    """A key that goes, or is renamed, takes a higher `v`. A new one stands in the page, and here from a release on."""
+    assert messages.VERSION == 1
+    assert set(V1[kind].split()) <= set(kind.__struct_encode_fields__)
 
 
 def test_every_struct_that_leaves_the_daemon_is_pinned() -> None:
@@ -144,8 +144,3 @@ def test_the_page_lists_every_field_with_its_type(kind: type[msgspec.Struct]) ->
 
 def test_the_page_has_no_table_of_what_is_not_there() -> None:
     assert set(re.findall(r"^### (\w+)$", PAGE, re.MULTILINE)) == {kind.__name__ for kind in V1}
-
-
-def test_the_readme_lists_the_telemetry_as_it_is() -> None:
-    (listed,) = re.findall(r"Telemetry, 50 times a second: `\{(.*?)\}`", README, re.DOTALL)
-    assert re.split(r",\s+", listed) == list(Telemetry.__struct_fields__)
