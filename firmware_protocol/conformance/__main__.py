@@ -3,25 +3,29 @@
 import argparse
 import contextlib
 import json
+import math
+import shlex
 import signal
+import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, TextIO
 
 from firmware_protocol.codec import Identity
 from firmware_protocol.conformance.check import Check, Result, run
 from firmware_protocol.conformance.examination import CHECKS, checks_on
-from firmware_protocol.conformance.host import INSIDE_MM, MOST_DUTY, Host
+from firmware_protocol.conformance.host import OPENING_MM_S, STROKE_MM, Host
 from firmware_protocol.conformance.line import Line
 from firmware_protocol.conformance.overall import left_open
 from firmware_protocol.conformance.ports import open_line
 
 PASSED, FAILED, USAGE = 0, 1, 2
+RESET_S: Final = 30.0
 PAGE: Final = "firmware_protocol/README.md"
-WARNING: Final = f"""\
-{{line}}: THE DEVICE'S MOTORS WILL MOVE, for about a minute: homings, duties of up to {MOST_DUTY:g}, ways of
-{INSIDE_MM:g} mm, openings because this program falls silent on purpose. A firmware that is wrong may do anything: keep
-the motors' supply switch in reach, take hands and patient's side off the brake, and end the daemon."""
+WARNING: Final = """\
+{line}: THE DEVICE'S MOTORS WILL MOVE, for about five minutes: homings, duties of up to 1, the whole way to the closed
+switches, openings because this program falls silent on purpose. A firmware that is wrong may do anything: keep the
+motors' supply switch in reach, take hands and patient's side off the brake, and end the daemon."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command.parse_args(arguments)
     if options.list:
         for one in CHECKS:
-            print(f"{one.name}: {one.sent}: {one.expected} ({one.page})")
+            print(f"{one.name}: {one.sent}: {one.expected} ({one.page}; else {one.hazard.value})")
         return PASSED
     if options.line is None:
         command.error("the following arguments are required: PORT|CHANNEL")
@@ -52,23 +56,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command.error(str(error))
     finally:
         line.close()
-    return PASSED if results and all(result.passed for result in results) else FAILED
+    return PASSED if results and all(result.passed is not False for result in results) else FAILED
 
 
 def report(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the results as the JSON document that `--json` prints."""
+    """Return the results as the JSON document that `--json` prints; what was not tested is a list of its own."""
     return {
-        "checks": [
-            {
-                "name": result.check.name,
-                "passed": result.passed,
-                "seen": result.seen,
-                "expected": result.check.expected,
-                "sent": result.check.sent,
-                "page": f"{PAGE}: {result.check.page}",
-            }
-            for result in results
-        ]
+        "checks": [{**_row(result), "passed": result.passed} for result in results if result.passed is not None],
+        "untested": [_row(result) for result in results if result.passed is None],
+    }
+
+
+def _row(result: Result) -> dict[str, Any]:
+    one = result.check
+    return {
+        "name": one.name,
+        "seen": result.seen,
+        "expected": one.expected,
+        "sent": one.sent,
+        "page": f"{PAGE}: {one.page}",
+        "hazard": one.hazard.value,
     }
 
 
@@ -77,9 +84,11 @@ def told(result: Result) -> str:
     one = result.check
     if result.passed:
         return f"ok    {one.name}: {result.seen}"
+    if result.passed is None:
+        return f"-     {one.name}: not tested: {result.seen}"
     return (
         f"FAIL  {one.name}\n      sent      {one.sent}\n      seen      {result.seen}\n"
-        f"      expected  {one.expected}\n      page      {PAGE}: {one.page}"
+        f"      expected  {one.expected}\n      page      {PAGE}: {one.page}\n      hazard    {one.hazard.value}"
     )
 
 
@@ -90,7 +99,13 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
     """
     checks = _chosen(checks_on(line), options.only)
     out = sys.stderr if options.json else sys.stdout
-    host = Host(line)
+    host = Host(
+        line,
+        opening_mm_s=options.opening_mm_s,
+        stroke_mm=options.stroke_mm,
+        uptime_s=options.uptime,
+        reset=_resetter(options),
+    )
     results: list[Result] = []
 
     def tell(result: Result) -> None:
@@ -114,11 +129,41 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
         except OSError as error:
             print(f"the line is gone ({error}): by the page the device opens the gap by itself now", file=sys.stderr)
             return []
-    passed = sum(result.passed for result in results)
-    _say(f"{options.line}: {_name(host)}: {passed} of {len(results)} checks passed", out)
+    passed, failed, untested = (sum(result.passed is each for result in results) for each in (True, False, None))
+    besides = f", {untested} not tested" if untested else ""
+    _say(f"{options.line}: {_name(host)}: {passed} of {passed + failed} checks passed{besides}", out)
     if options.json:
         _say(json.dumps(report(results), indent=2), sys.stdout)
     return results
+
+
+def _resetter(options: argparse.Namespace) -> Callable[[str], None] | None:
+    """Return what resets the device: the command of `--reset`, or a person at the terminal; None without either.
+
+    It raises OSError where the command fails.
+    """
+    if options.reset:
+        return lambda how: _call([*shlex.split(options.reset), how])
+    if options.yes or not sys.stdin.isatty():
+        return None
+    return _ask_for_reset
+
+
+def _call(command: Sequence[str]) -> None:
+    """Run a command. Raises OSError where it is not there, fails, or takes over RESET_S."""
+    try:
+        done = subprocess.run(command, check=False, timeout=RESET_S, stdin=subprocess.DEVNULL)
+    except subprocess.TimeoutExpired as error:
+        raise OSError(f"{shlex.join(command)} took over {RESET_S:g} s") from error
+    if done.returncode:
+        raise OSError(f"{shlex.join(command)} ended with {done.returncode}")
+
+
+def _ask_for_reset(how: str) -> None:
+    """Ask a person for a reset, and wait until it is done. By then the device has opened, as after any silence."""
+    ways = {"warm": "by its reset pin", "cold": "by its supply, off and on"}
+    print(f"Reset the device {ways[how]}, then press Enter: ", end="", file=sys.stderr, flush=True)
+    sys.stdin.readline()
 
 
 def _say(text: str, out: TextIO) -> None:
@@ -177,7 +222,30 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--baud", type=int, default=1_000_000, metavar="N", help="of a serial port; default 1000000")
     made.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="of a CAN bus; default 1000000")
     made.add_argument("--node", type=int, choices=range(16), default=1, metavar="N", help="on a CAN bus; default 1")
+    made.add_argument(
+        "--reset",
+        metavar="COMMAND",
+        help="resets the device: called with the word warm (memory kept) or cold (supply off and on); the line stays",
+    )
+    made.add_argument("--uptime", type=_positive, metavar="S", help="how long the device's clock has run")
+    made.add_argument(
+        "--opening-mm-s", type=_positive, default=OPENING_MM_S, metavar="V", help=f"default {OPENING_MM_S:g}"
+    )
+    made.add_argument(
+        "--stroke-mm", type=_positive, default=STROKE_MM, metavar="MM", help=f"between switches; default {STROKE_MM:g}"
+    )
     return made
+
+
+def _positive(text: str) -> float:
+    """Return a word of the command line as a number over 0. Raises ArgumentTypeError."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: allowed are numbers over 0")
+    return value
 
 
 if __name__ == "__main__":

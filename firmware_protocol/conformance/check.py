@@ -1,19 +1,34 @@
-"""A check, which says what is sent and what the protocol page expects; and the running of checks in a row."""
+"""A check, which says what is sent, what the protocol page expects, and which hazard it bears on; and their running."""
 
 from collections.abc import Callable, Iterable, Sequence
+from enum import Enum
 from typing import Final, NamedTuple
 
-from firmware_protocol.conformance.host import STALLED_S, Host, Unmet
+from firmware_protocol.conformance.host import STALLED_S, Host, Unmet, Untested
 
 ATTEMPTS: Final = 3
 "A check that fails while this process is late is tried this often."
 Perform = Callable[[Host], str]
 
 
+class Hazard(Enum):
+    """What may happen where a rule is broken."""
+
+    SHUT = "the gap stays shut: the brake holds the hand"
+    CLOSES = "the gap closes unasked: the force rises"
+    OPENS = "the gap opens unasked: the force is lost"
+    MISLED = "the host acts on what is not so"
+    WORN = "a motor, a screw or a stop takes harm"
+
+
 class Check(NamedTuple):
-    """One rule of the page as a test. `perform` returns what was seen, or raises Unmet with what was seen."""
+    """One rule of the page as a test. `perform` returns what was seen.
+
+    It raises Unmet with what was seen instead, or Untested where the rule cannot be tested here.
+    """
 
     name: str
+    hazard: Hazard
     page: str
     "Heading in firmware_protocol/README.md, and the number of the rule below it."
     sent: str
@@ -25,18 +40,18 @@ class Check(NamedTuple):
 
 
 class Result(NamedTuple):
-    """The result of one check: whether it passed, and what was seen."""
+    """The result of one check: whether it passed, None where it was not tested, and what was seen."""
 
     check: Check
-    passed: bool
+    passed: bool | None
     seen: str
 
 
 def check(
-    page: str, sent: str, expected: str, *, moves: bool = False, is_gate: bool = False
+    hazard: Hazard, page: str, sent: str, expected: str, *, moves: bool = False, is_gate: bool = False
 ) -> Callable[[Perform], Check]:
     """Return a decorator that makes a Check of a function, with the function's name."""
-    return lambda perform: Check(perform.__name__, page, sent, expected, perform, moves, is_gate)
+    return lambda perform: Check(perform.__name__, hazard, page, sent, expected, perform, moves, is_gate)
 
 
 def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = lambda result: None) -> Sequence[Result]:
@@ -51,7 +66,7 @@ def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = la
             result = Result(one, passed=False, seen=f"not tried, because {closed_by} failed")
         else:
             result = _performed(host, one)
-        if one.is_gate and not result.passed:
+        if one.is_gate and result.passed is False:
             closed_by = closed_by or one.name
         results.append(result)
         tell(result)
@@ -64,6 +79,8 @@ def _performed(host: Host, one: Check) -> Result:
         host.begin()
         try:
             return Result(one, passed=True, seen=one.perform(host))
+        except Untested as untested:
+            return Result(one, passed=None, seen=str(untested))
         except Unmet as unmet:
             seen = str(unmet)
             if host.stalled_s > STALLED_S:

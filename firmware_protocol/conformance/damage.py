@@ -1,18 +1,36 @@
 """Checks that frames which are damaged, cut off, too long or for another device are neither obeyed nor answered.
 
-The damaged message is a Drive OFF or a Clear, so that a device that obeys it does no harm.
+Every message of a host gets every damage. The damaged Drive is an OFF, so that a device that obeys it does no harm.
 """
 
 import struct
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from firmware_protocol.codec import FUNCTION, Clear, Drive, DriveMode, Hello, Identity, State, crc8, encode
-from firmware_protocol.conformance.check import Check, check
-from firmware_protocol.conformance.host import ANSWER_S, PERIOD_S, SEEN_S, Beat, Host, Unmet
+from firmware_protocol.codec import (
+    FUNCTION,
+    Clear,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Retract,
+    State,
+    crc8,
+    encode,
+)
+from firmware_protocol.conformance.check import Check, Hazard, check
+from firmware_protocol.conformance.host import ANSWER_S, PERIOD_S, Beat, Host, Unmet, shown
 
 DRIVE: Final = FUNCTION[Drive]
 SILENT = "no State, drive_counter unchanged; the good Drive after it is answered"
+UNDONE = "no Identity, nonce not shown, mode as before; the good Clear after it is acknowledged"
+COMMANDS: Final = (Home, Clear, Retract, Hello)
+Send = Callable[[int], None]
+"""Sends a bad message with this counter or nonce."""
 
 
 def _raw_drive(duty_steps: int, mode: int, counter: int) -> bytes:
@@ -25,7 +43,12 @@ def _drive(counter: int) -> bytes:
     return encode(Drive(0.0, 0.0, DriveMode.OFF, counter))
 
 
-def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
+def _command(kind: type[Message], nonce: int) -> bytes:
+    """Return the payload of a command; a Hello is of no schema: a device that takes it does no more than latch."""
+    return encode(Hello(0, 0, nonce)) if kind is Hello else bytes((nonce,))
+
+
+def _ignores(host: Host, put: Iterable[Send]) -> str:
     """Send bad Drives, each by a function of `put` that takes the counter, and a good Drive after each.
 
     Raises Unmet where a bad Drive is answered or shows in Status, and where the good Drive after it is not answered.
@@ -42,9 +65,9 @@ def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
         if states := len(host.all_of(State)):
             raise Unmet(f"form {tried}: {states} State")
         host.next_status(Beat.NOTHING)
-        shown = host.next_status(Beat.NOTHING).drive_counter
-        if shown != before:
-            raise Unmet(f"form {tried}: drive_counter {shown} in Status, {before} before it")
+        after = host.next_status(Beat.NOTHING).drive_counter
+        if after != before:
+            raise Unmet(f"form {tried}: drive_counter {after} in Status, {before} before it")
         host.counter = (host.counter + 1) % 256
         host.beat(Beat.OFF)
         host.pass_time(ANSWER_S)
@@ -53,7 +76,28 @@ def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
     return f"{tried} {'form' if tried == 1 else 'forms'} ignored"
 
 
-@check("Carriers", "a Drive with a wrong CRC-8 in a whole frame", SILENT)
+def _refuses(host: Host, put: Iterable[tuple[str, Send]]) -> str:
+    """Send bad commands to an idle device, each by a function that takes the nonce, and a good Clear after each.
+
+    Raises Unmet where a bad command leaves a trace, and where the good one after it does not.
+    """
+    tried = 0
+    host.idle()
+    for what, send in put:
+        nonce = host.new_nonce()
+        host.forget()
+        send(nonce)
+        host.next_status(Beat.NOTHING)
+        status = host.next_status(Beat.NOTHING)
+        if status.command_nonce == nonce or status.mode is not DeviceMode.IDLE or host.all_of(Identity):
+            raise Unmet(f"{what} with nonce {nonce}: {len(host.all_of(Identity))} Identity, {shown(status)}")
+        if not host.command(Clear, Beat.NOTHING):
+            raise Unmet(f"{what}: ignored, and so was the good Clear after it")
+        tried += 1
+    return f"{tried} forms of commands ignored"
+
+
+@check(Hazard.CLOSES, "Carriers", "a Drive with a wrong CRC-8 in a whole frame", SILENT)
 def drive_crc_8(host: Host) -> str:
     """Check that a Drive with a wrong bit, in the CRC-8 or in a duty, is ignored."""
     return _ignores(
@@ -65,7 +109,7 @@ def drive_crc_8(host: Host) -> str:
     )
 
 
-@check("Who says what when, 2", "a Drive with a duty of 1.0001 or -3.2768, its CRC-8 right", SILENT)
+@check(Hazard.CLOSES, "Who says what when, 2", "a Drive with a duty of 1.0001 or -3.2768, its CRC-8 right", SILENT)
 def drive_range(host: Host) -> str:
     """Check that a Drive with a duty out of range is ignored."""
     return _ignores(
@@ -77,7 +121,7 @@ def drive_range(host: Host) -> str:
     )
 
 
-@check("Who says what when, 2", "a Drive of mode 2 or 255, its CRC-8 right", SILENT)
+@check(Hazard.SHUT, "Who says what when, 2", "a Drive of mode 2 or 255, its CRC-8 right", SILENT)
 def drive_mode(host: Host) -> str:
     """Check that a Drive with an undefined mode is ignored."""
     return _ignores(
@@ -89,7 +133,7 @@ def drive_mode(host: Host) -> str:
     )
 
 
-@check("Carriers", "a Drive of 6 and of 8 bytes, and of none", SILENT)
+@check(Hazard.CLOSES, "Carriers", "a Drive of 6 and of 8 bytes, and of none", SILENT)
 def drive_length(host: Host) -> str:
     """Check that a Drive of a wrong length is ignored, though its frame is whole."""
     return _ignores(
@@ -102,58 +146,57 @@ def drive_length(host: Host) -> str:
     )
 
 
-@check("Carriers", "functions 10 and 127, and a device's own State and Identity", SILENT)
+@check(Hazard.MISLED, "Carriers", "functions 10 and 127, and a device's own State and Identity", SILENT)
 def other_functions(host: Host) -> str:
     """Check that messages of unknown functions and a device's own are ignored."""
 
-    def send(function: int) -> Callable[[int], None]:
+    def send(function: int) -> Send:
         return lambda counter: host.line.send(function, _drive(counter) + b"\x00")
 
     return _ignores(host, [send(function) for function in (10, 127, FUNCTION[State], FUNCTION[Identity])])
 
 
-@check("Carriers", "a Clear of 2 bytes and of none, a Hello of 5 and of 7", "not acknowledged, not answered")
+@check(Hazard.OPENS, "Carriers", "each command with a byte more, a byte less, and without any", UNDONE)
 def command_length(host: Host) -> str:
     """Check that commands of a wrong length are ignored: without a CRC-8, the length is all there is to check."""
-    host.idle()
-    nonce = host.new_nonce()
-    hello = encode(Hello(0, 0, nonce))  # of no schema: a device that takes it does no more than latch
-    host.forget()
-    for function, payload in (
-        (FUNCTION[Clear], bytes((nonce, nonce))),
-        (FUNCTION[Clear], b""),
-        (FUNCTION[Hello], hello[:-1]),
-        (FUNCTION[Hello], hello + bytes((nonce,))),
-    ):
-        host.line.send(function, payload)
-        host.pass_time(SEEN_S)
-        shown = host.status.command_nonce
-        if shown == nonce or host.all_of(Identity):
-            what = f"nonce {shown} in Status, {len(host.all_of(Identity))} Identity"
-            raise Unmet(f"function {function} with {len(payload)} bytes: {what}")
-    return "4 forms ignored"
+
+    def send(kind: type[Message], cut: Callable[[bytes], bytes]) -> tuple[str, Send]:
+        return kind.__name__, lambda nonce: host.line.send(FUNCTION[kind], cut(_command(kind, nonce)))
+
+    cuts: tuple[Callable[[bytes], bytes], ...] = (lambda body: body + body[-1:], lambda body: body[:-1], lambda _: b"")
+    return _refuses(host, [send(kind, cut) for kind in COMMANDS for cut in cuts])
 
 
 SENT: Final = {
-    "frame_crc_16": "a Drive with a wrong CRC-16, one without its final XOR, one with another sequence under it",
-    "frame_cut_off": "a Drive cut off after its first byte, in the middle, before its last",
-    "frame_too_long": "a Drive with a byte more, with 300 more, three with no delimiter between them",
-    "frame_zero_inside": "a Drive with a delimiter in its middle",
+    "frame_crc_16": "a wrong CRC-16, one without its final XOR, one with another sequence under it",
+    "frame_cut_off": "cut off after its first byte, in the middle, before its last",
+    "frame_too_long": "a byte more, 300 more, three with no delimiter between them",
+    "frame_zero_inside": "a delimiter in its middle",
     "noise": "30, 11 and 1200 bytes of noise, then a delimiter",
-    "other_node": "a Drive to another node, from which nothing was heard",
+    "other_node": "to another node, from which nothing was heard",
 }
 
 
 def _of_carrier(name: str) -> Check:
-    """Return the check that a Drive with one kind of damage of the carrier is ignored; `name` is a key of SENT."""
+    """Return the check that messages with one kind of damage of the carrier are ignored; `name` is a key of SENT."""
 
     def perform(host: Host) -> str:
-        def send(at: int) -> Callable[[int], None]:
-            return lambda counter: host.line.send_damaged(host.line.damages(DRIVE, _drive(counter))[name][at])
+        def forms(kind: type[Message], body: Callable[[int], bytes]) -> list[Send]:
+            function = FUNCTION[kind]
 
-        return _ignores(host, [send(at) for at in range(len(host.line.damages(DRIVE, _drive(0))[name]))])
+            def send(at: int) -> Send:
+                return lambda number: host.line.send_damaged(host.line.damages(function, body(number))[name][at])
 
-    return Check(name, "Carriers", SENT[name], SILENT, perform, moves=False, is_gate=False)
+            return [send(at) for at in range(len(host.line.damages(function, body(0))[name]))]
+
+        def commands(kind: type[Message]) -> list[tuple[str, Send]]:
+            return [(kind.__name__, send) for send in forms(kind, lambda nonce: _command(kind, nonce))]
+
+        seen = _ignores(host, forms(Drive, _drive))
+        return f"{seen}; {_refuses(host, [one for kind in COMMANDS for one in commands(kind)])}"
+
+    sent = f"a Drive, Home, Clear, Retract, Hello: {SENT[name]}"
+    return Check(name, Hazard.CLOSES, "Carriers", sent, f"{SILENT}; {UNDONE}", perform, moves=False, is_gate=False)
 
 
 CHECKS: Final = (

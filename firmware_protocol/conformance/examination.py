@@ -3,7 +3,18 @@
 from collections.abc import Sequence
 
 from firmware_protocol.codec import FUNCTION, Drive
-from firmware_protocol.conformance import damage, homing, meeting, overall, running, silence, streams
+from firmware_protocol.conformance import (
+    bench,
+    damage,
+    homing,
+    meeting,
+    opening,
+    overall,
+    running,
+    silence,
+    streams,
+    stroke,
+)
 from firmware_protocol.conformance.check import Check
 from firmware_protocol.conformance.line import Line
 
@@ -21,7 +32,10 @@ CHECKS = (
     *damage.ON_A_CARRIER,
     *homing.CHECKS,
     *running.CHECKS,
+    *stroke.CHECKS,
+    *opening.CHECKS,
     *silence.CHECKS,
+    *bench.CHECKS,
     *overall.CHECKS,
 )
 """The checks of every line."""

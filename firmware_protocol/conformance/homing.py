@@ -3,7 +3,7 @@
 from typing import Final
 
 from firmware_protocol.codec import Clear, DeviceMode, Home, Retract, State
-from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.check import Hazard, check
 from firmware_protocol.conformance.host import (
     HOMED_S,
     OPENED_S,
@@ -37,6 +37,7 @@ def _homings(host: Host) -> list[Homing]:
 
 
 @check(
+    Hazard.OPENS,
     PAGE,
     "Home to an idle device without a zero",
     "acknowledged; HOMING, then IDLE, HOMED, at both open switches, no fault",
@@ -54,7 +55,13 @@ def home_homes(host: Host) -> str:
     return unless(not is_right or not went, seen)
 
 
-@check(PAGE, "Home, Drive OFF every 1 ms", f"both positions within {ZERO_MM:g} mm of 0 afterwards", moves=True)
+@check(
+    Hazard.MISLED,
+    PAGE,
+    "Home, Drive OFF every 1 ms",
+    f"both positions within {ZERO_MM:g} mm of 0 afterwards",
+    moves=True,
+)
 def home_zeroes(host: Host) -> str:
     """Check that positions are near 0 after each homing: the origin is the open switch, found at a creep."""
     seen = ""
@@ -67,6 +74,7 @@ def home_zeroes(host: Host) -> str:
 
 
 @check(
+    Hazard.MISLED,
     PAGE,
     "Home, Drive OFF every 1 ms",
     "the first State after a Status with HOMED is in the new origin",
@@ -85,7 +93,9 @@ def homed_is_in_new_origin(host: Host) -> str:
     return seen
 
 
-@check("Who says what when, 5", "Home, and when it is done the same Home again", "not done again", moves=True)
+@check(
+    Hazard.OPENS, "Who says what when, 5", "Home, and when it is done the same Home again", "not done again", moves=True
+)
 def repeated_command(host: Host) -> str:
     """Check that the device acts on a nonce once: a repeated Home is not done again."""
     host.homed()
@@ -101,6 +111,7 @@ def repeated_command(host: Host) -> str:
 
 
 @check(
+    Hazard.SHUT,
     TAKES,
     "Retract to an idle device",
     "acknowledged; IDLE at both open switches, HOMED as before",
@@ -116,6 +127,7 @@ def retract_when_idle(host: Host) -> str:
 
 
 @check(
+    Hazard.SHUT,
     TAKES,
     "Home; while HOMING a Clear, another Home, then a Retract",
     "only Retract acknowledged; IDLE, open, not HOMED",

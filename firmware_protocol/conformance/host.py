@@ -1,10 +1,10 @@
 """The host of one device: it keeps the rhythm, records messages, and brings the device to where a check begins.
 
-A device that does not follow ends the check with `Unmet`. Duties are small, and no carriage goes further in than
-INSIDE_MM.
+A device that does not follow ends the check with `Unmet`.
 """
 
 import math
+import random
 from collections.abc import Callable
 from enum import Enum, auto
 from itertools import dropwhile, groupby
@@ -31,6 +31,7 @@ from firmware_protocol.codec import (
     Switches,
     decode,
     encode,
+    period,
 )
 from firmware_protocol.conformance.line import Line
 
@@ -50,10 +51,18 @@ HELLO_NONCE: Final = 255
 MOST_NONCE: Final = 254
 INSIDE_MM: Final = 2.0
 "How far a carriage is brought from its open switch where a check needs room."
-MOST_DUTY: Final = 0.5
-DUTY_PER_MM: Final = 2.0
-ARRIVED_MM: Final = 0.5
-MOVED_S: Final = 3.0
+DUTY_PER_MM: Final = 3.0
+TRAVEL_MM_S: Final = 8.0
+ARRIVED_MM: Final = 0.3
+MOVED_S: Final = 2.0
+"How much longer than at TRAVEL_MM_S a way may take."
+OPENING_MM_S: Final = 15.0
+STROKE_MM: Final = 25.25
+"From the open to the closed switch of a carriage."
+SWITCH_MM: Final = 0.5
+"A switch may close this far from where it should, while a carriage passes it at any speed."
+FRESH_S: Final = 5e-3
+TIME_SPAN_S: Final = period(State, "device_time_s")
 OPEN: Final = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
 NO_FAULT: Final = DeviceFault(0)
 STALLED_S: Final = 0.005
@@ -65,6 +74,10 @@ Command = type[Retract] | type[Clear] | type[Home]
 
 class Unmet(Exception):  # noqa: N818  (what a device leaves unmet; nothing has gone wrong here)
     """The device does not do what the protocol page says. The text is what was seen."""
+
+
+class Untested(Exception):  # noqa: N818  (nothing has gone wrong here either)
+    """A rule cannot be tested here. The text says why, and what would help."""
 
 
 def told(was_acknowledged: bool) -> str:
@@ -109,17 +122,6 @@ class Homing(NamedTuple):
     """The last State, when the carriages are at rest; None where none came."""
 
 
-class Silence(NamedTuple):
-    """What a device in RUN did when no Drive came any more."""
-
-    statuses: tuple[tuple[float, Status], ...]
-    """Each Status, with the time since the last Drive, s."""
-    seconds: float
-    """The time from the last Drive until the drives were off, or until the host waited no longer."""
-    status: Status
-    """The last Status."""
-
-
 class Host:
     """One conversation with a device.
 
@@ -127,8 +129,26 @@ class Host:
     raise OSError when the line is gone.
     """
 
-    def __init__(self, line: Line) -> None:
+    def __init__(
+        self,
+        line: Line,
+        *,
+        opening_mm_s: float = OPENING_MM_S,
+        stroke_mm: float = STROKE_MM,
+        uptime_s: float | None = None,
+        reset: Callable[[str], None] | None = None,
+    ) -> None:
+        """Begin a conversation with a device that opens at `opening_mm_s` and has ways of `stroke_mm`.
+
+        `uptime_s` is how long it has been up, None where nobody knows; `reset` resets it, "warm" or "cold", None where
+        nothing can.
+        """
         self.line = line
+        self.opening_mm_s = opening_mm_s
+        self.stroke_mm = stroke_mm
+        self.reset = reset
+        self.random = random.Random(41)
+        self._booted_s = None if uptime_s is None else line.now_s() - uptime_s
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
         self.refused: dict[str, int] = {}
@@ -137,6 +157,8 @@ class Host:
         """How often a Status with nonce 0 followed one with another nonce."""
         self.contradictions: dict[str, int] = {}
         """Contradictions within a Status, and how often each came."""
+        self.misplaced: dict[str, int] = {}
+        """End switches that did not fit the positions, and how often."""
         self.homings: list[Homing] = []
         self.stalled_s = 0.0
         """The greatest lateness of this process since `begin`."""
@@ -150,6 +172,11 @@ class Host:
     def now_s(self) -> float:
         """The line's clock."""
         return self.line.now_s()
+
+    @property
+    def uptime_s(self) -> float | None:
+        """How long the device has been up; None where nobody knows."""
+        return None if self._booted_s is None else self.now_s - self._booted_s
 
     # -- what is sent ------------------------------------------------------------------------------------------------
 
@@ -212,16 +239,16 @@ class Host:
         besides = f"{kind.__name__} {told(not is_refused)}"
         return self.shows(mode, beat, homed=homed, besides=besides, wrong=not is_refused)
 
-    def beat(self, beat: Beat, left: float = 0.0, right: float = 0.0) -> None:
-        """Send a Drive, unless `beat` is NOTHING, and listen for a millisecond."""
+    def beat(self, beat: Beat, left: float = 0.0, right: float = 0.0, period_s: float = PERIOD_S) -> None:
+        """Send a Drive, unless `beat` is NOTHING, and listen for a millisecond or `period_s`."""
         if beat is not Beat.NOTHING:
             self.drive(DriveMode.RUN if beat is Beat.RUN else DriveMode.OFF, left, right)
-        self._listen()
+        self._listen(period_s)
 
-    def pass_time(self, seconds: float, beat: Beat = Beat.NOTHING) -> None:
-        """Repeat `beat` every millisecond for a time."""
-        for _ in range(round(seconds / PERIOD_S)):
-            self.beat(beat)
+    def pass_time(self, seconds: float, beat: Beat = Beat.NOTHING, period_s: float = PERIOD_S) -> None:
+        """Repeat `beat` every millisecond or `period_s` for a time."""
+        for _ in range(round(seconds / period_s)):
+            self.beat(beat, period_s=period_s)
 
     def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = Beat.OFF) -> bool:
         """Repeat `beat` every millisecond until `reached()` or for `limit_s`; return whether it was reached."""
@@ -282,15 +309,15 @@ class Host:
     ) -> str:
         """Return what the next Status shows, in words, behind what was seen `besides`.
 
-        Raises Unmet with these words unless the Status shows `mode` and all that is not None; `fault` may be one of
-        several, NO_FAULT is none at all. Raises it also where `wrong` is true: something else went wrong before.
+        Raises Unmet with these words unless the Status shows `mode` and all that is not None; `fault` are all the
+        faults. Raises it also where `wrong` is true: something else went wrong before.
         """
         status = self.next_status(beat)
         is_right = (
             status.mode is mode
             and homed in (None, is_homed(status))
             and opened in (None, is_open(status))
-            and (fault is None or (fault in status.faults if fault else not status.faults))
+            and fault in (None, status.faults)
         )
         return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
 
@@ -298,9 +325,9 @@ class Host:
         """Return the nonce in the newest Status; 0 before the first."""
         return self.last(Status).command_nonce if Status in self.newest else 0
 
-    def _listen(self) -> None:
-        """Take what comes in the next millisecond, and note how late this process is."""
-        self._next_s += PERIOD_S
+    def _listen(self, period_s: float) -> None:
+        """Take what comes in the next `period_s`, and note how late this process is."""
+        self._next_s += period_s
         for arrival in self.line.receive(self._next_s):
             try:
                 message = decode(arrival.function, arrival.payload)
@@ -326,8 +353,27 @@ class Host:
             self.resets += self._shown_nonce() != 0 and message.command_nonce == 0
             for what in contradictions(message):
                 self.contradictions[what] = self.contradictions.get(what, 0) + 1
+            for what in self._misplaced(heard.time_s, message):
+                self.misplaced[what] = self.misplaced.get(what, 0) + 1
         self.heard.append(heard)
         self.newest[type(message)] = heard
+
+    def _misplaced(self, time_s: float, status: Status) -> list[str]:
+        """Return the end switches in a Status that do not fit a State just before it.
+
+        None for a device that was not homed: its origin is another.
+        """
+        state = self.newest.get(State)
+        is_usable = Status in self.newest and is_homed(self.last(Status)) and is_homed(status)
+        if state is None or not is_usable or time_s - state.time_s > FRESH_S:
+            return []
+        found = []
+        for side, at_mm in zip(("LEFT", "RIGHT"), places(self.last(State)), strict=True):
+            for end, in_mm in (("OPEN", at_mm), ("CLOSED", -self.stroke_mm - at_mm)):
+                closed = Switches[f"{side}_{end}"] in status.switches
+                if (closed and in_mm < -SWITCH_MM) or (not closed and in_mm > SWITCH_MM):
+                    found.append(f"{side}_{end} {'closed' if closed else 'not closed'} at {at_mm:+.1f} mm")
+        return found
 
     # -- where a check begins ----------------------------------------------------------------------------------------
 
@@ -359,7 +405,7 @@ class Host:
             self.home()
             if not is_homed(self.status):
                 raise Unmet(f"not homed: {shown(self.status)}")
-        if not is_open(self.status) and not (self.command(Retract) and self.until(self._is_resting, OPENED_S)):
+        if not is_open(self.status) and not (self.command(Retract) and self.until(self.is_resting, OPENED_S)):
             raise Unmet(f"Retract does not open: {shown(self.status)}")
 
     def home(self, beat: Beat = Beat.OFF) -> Homing:
@@ -390,55 +436,64 @@ class Host:
         if not self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, Beat.RUN):
             raise Unmet(f"Drive RUN does not lead to RUN: {shown(self.status)}")
         if inside_mm > 0.0:
-            self._go_in(inside_mm)
+            self.bring(-inside_mm, -inside_mm)
+            self.pass_time(SEEN_S, Beat.RUN)
 
-    def _go_in(self, inside_mm: float) -> None:
-        """Drive both carriages in RUN to `inside_mm` from their open switches. Raises Unmet after MOVED_S."""
-        end_s = self._next_s + MOVED_S
-        while True:
-            state = self.last(State)
-            errors = -inside_mm - state.left_position_mm, -inside_mm - state.right_position_mm
-            if max(abs(error) for error in errors) < ARRIVED_MM:
-                break
-            left, right = (min(max(DUTY_PER_MM * error, -MOST_DUTY), MOST_DUTY) for error in errors)
+    def bring(
+        self, left_mm: float, right_mm: float, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Bring the carriages in RUN to places from home, at this speed, unless `ends()` becomes true before.
+
+        Raises Unmet where RUN ends before, and where they are late by MOVED_S.
+        """
+        goals = left_mm, right_mm
+        targets = places(self.last(State))
+        way_mm = max(abs(goal - at) for goal, at in zip(goals, targets, strict=True))
+        end_s = self._next_s + way_mm / mm_s + MOVED_S
+        step_mm = mm_s * PERIOD_S
+        while not ends():
+            at_mm = places(self.last(State))
+            if max(abs(goal - at) for goal, at in zip(goals, at_mm, strict=True)) < ARRIVED_MM:
+                return
+            left_to, right_to = (at + clamped(goal - at, step_mm) for at, goal in zip(targets, goals, strict=True))
+            targets = left_to, right_to
+            left, right = (clamped(DUTY_PER_MM * (to - at), 1.0) for to, at in zip(targets, at_mm, strict=True))
             self.beat(Beat.RUN, left, right)
-            if self.status.mode is not DeviceMode.RUN or self._next_s > end_s:
-                raise Unmet(
-                    f"duties of up to {MOST_DUTY:g} did not bring the carriages {inside_mm:g} mm in: "
-                    f"{positions(state)}, {shown(self.status)}"
-                )
-        self.pass_time(SEEN_S, Beat.RUN)
+            if not ends() and (self.status.mode is not DeviceMode.RUN or self._next_s > end_s):
+                seen = f"{positions(self.last(State))}, {shown(self.status)}"
+                raise Unmet(f"on the way to left {left_mm:+.1f} mm, right {right_mm:+.1f} mm: {seen}")
 
-    def fall_silent(self, meanwhile: Callable[[], None] | None = None) -> Silence:
-        """Send no Drive any more in RUN, until the drives are off, and return what the device did.
+    def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] | None = None) -> float:
+        """Send no Drive in RUN for a time, then a Drive RUN; return how long the device's clock says that this was, s.
 
-        `meanwhile` is called every millisecond, to send other things. The last Drive goes out so that a Status is due
-        57 ms after it, when the device has to have noticed the silence.
+        The silence begins at a random time after a Status. `meanwhile` is called every millisecond, to send other
+        things. Raises Unmet where no State answers.
         """
         self.next_status(Beat.RUN)
-        self.pass_time(3 * PERIOD_S, Beat.RUN)
-        silent_s, first_heard = self.drive_s, len(self.heard)
-        end_s = self._next_s + OPENED_S
-        while self._next_s < end_s:
+        self.pass_time(self.random.randrange(20) * PERIOD_S, Beat.RUN)
+        self._answered(Beat.RUN)
+        before = self.last(State)
+        while self._next_s < self.drive_s + silent_s - 0.5 * PERIOD_S:
             if meanwhile is not None:
                 meanwhile()
             self.beat(Beat.NOTHING)
-            if self._next_s > silent_s + SEEN_S + 2 * STATUS_S and self._is_resting():
-                break
-            if self._next_s > silent_s + 0.5 and self.status.mode is DeviceMode.RUN:
-                break  # the device will not notice any more
-        seconds = self._next_s - silent_s
-        statuses = tuple(
-            (one.time_s - silent_s, one.message) for one in self.heard[first_heard:] if isinstance(one.message, Status)
-        )
-        return Silence(statuses, seconds, self.status)
+        return (self._answered(Beat.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
+
+    def _answered(self, beat: Beat) -> State:
+        """Send a Drive and return the State that answers it. Raises Unmet without one."""
+        before = self.newest.get(State)
+        self.beat(beat)
+        if not self.until(lambda: self.newest.get(State) is not before, ANSWER_S, Beat.NOTHING):
+            raise Unmet(f"no State: {shown(self.status)}")
+        return self.last(State)
 
     def latched(self) -> None:
         """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN; at once where it is. Raises Unmet."""
         status = self.next_status(Beat.NOTHING)
         if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults:
             self.running(INSIDE_MM)
-            self.fall_silent()
+            self.pass_time(0.1)
+            self.until(self.is_resting, OPENED_S)
             if self.status.mode is not DeviceMode.LATCHED:
                 raise Unmet(f"silence in RUN does not lead to LATCHED: {shown(self.status)}")
 
@@ -451,17 +506,18 @@ class Host:
         for _ in range(2):
             if Status not in self.newest and not self.until(lambda: Status in self.newest, 0.2):
                 return "the device sends no Status"
-            self.until(self._is_resting, OPENED_S)
-            if is_open(self.next_status(Beat.OFF)) and self._is_resting():
+            self.until(self.is_resting, OPENED_S)
+            if is_open(self.next_status(Beat.OFF)) and self.is_resting():
                 return ""
             if self.status.mode is DeviceMode.LATCHED:
                 self.command(Clear)
             self.command(Retract)
-            self.until(self._is_resting, OPENED_S)
+            self.until(self.is_resting, OPENED_S)
         status = self.next_status(Beat.OFF)
-        return "" if is_open(status) and self._is_resting() else shown(status)
+        return "" if is_open(status) and self.is_resting() else shown(status)
 
-    def _is_resting(self) -> bool:
+    def is_resting(self) -> bool:
+        """Tell whether the newest Status shows the drives off."""
         return self.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED)
 
 
@@ -480,6 +536,16 @@ def shown(status: Status) -> str:
     faults = "|".join(fault.name or "" for fault in DeviceFault if fault in status.faults) or "no fault"
     switches = "|".join(switch.name or "" for switch in Switches if switch in status.switches) or "no switch"
     return f"{status.mode.name}, {faults}, {switches}, nonce {status.command_nonce}"
+
+
+def places(state: State) -> tuple[float, float]:
+    """Return where the left and the right carriage are, mm from home."""
+    return state.left_position_mm, state.right_position_mm
+
+
+def clamped(value: float, most: float) -> float:
+    """Return the value, in -most..most."""
+    return min(max(value, -most), most)
 
 
 def positions(state: State) -> str:

@@ -3,15 +3,17 @@
 from typing import Final
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Clear, DeviceFault, DeviceMode, Identity
-from firmware_protocol.conformance.check import check
-from firmware_protocol.conformance.host import NO_FAULT, SEEN_S, Beat, Host, Unmet, is_homed, shown, unless
+from firmware_protocol.conformance.check import Hazard, check
+from firmware_protocol.conformance.host import ANSWER_S, NO_FAULT, SEEN_S, Beat, Host, Unmet, is_homed, shown, unless
 
 PAGE = "Who says what when, 1"
 CLEARING = "What each mode takes"
 HELLOS = 3
+NONCES: Final = (1, 129, 1, 65, 1, 33, 1, 17, 1, 9, 1, 5, 1, 3, 2, 254, 253, 128, 127, 126, 6)
+"""Each bit changes alone, and they rise and fall by any way."""
 
 
-@check(PAGE, f"{HELLOS} Hellos", "one Identity each, at once", is_gate=True)
+@check(Hazard.MISLED, PAGE, f"{HELLOS} Hellos", "one Identity each, at once", is_gate=True)
 def identity_answers_hello(host: Host) -> str:
     """Check that the device answers each Hello with one Identity."""
     for _ in range(HELLOS):
@@ -22,6 +24,7 @@ def identity_answers_hello(host: Host) -> str:
 
 
 @check(
+    Hazard.MISLED,
     PAGE,
     "Hello",
     f"Identity with schema {SCHEMA_HASH:08X}, bytes {SCHEMA_HASH.to_bytes(4, 'little').hex(' ')}",
@@ -38,7 +41,7 @@ def schema_hash(host: Host) -> str:
     return unless(different, seen + different)
 
 
-@check("Who says what when, 5", "Hello with nonce 255, 77, 77, 255", "the next Status shows each")
+@check(Hazard.MISLED, "Who says what when, 5", "Hello with nonce 255, 77, 77, 255", "the next Status shows each")
 def hello_nonce(host: Host) -> str:
     """Check that the nonce of a Hello counts as accepted: the next Status shows it."""
     seen = []
@@ -65,19 +68,26 @@ def _mismatch(host: Host, schema: int, version: int) -> str:
     )
 
 
-@check(PAGE, "Hello with another schema hash", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
+@check(
+    Hazard.CLOSES, PAGE, "Hello with another schema hash", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED"
+)
 def schema_mismatch(host: Host) -> str:
     """Check that a device latches for a host of another schema."""
     return _mismatch(host, SCHEMA_HASH ^ 1, PROTOCOL_VERSION)
 
 
-@check(PAGE, "Hello with another protocol version", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
+@check(
+    Hazard.CLOSES,
+    PAGE,
+    "Hello with another protocol version",
+    "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED",
+)
 def version_mismatch(host: Host) -> str:
     """Check that a device latches for a host of another protocol version."""
     return _mismatch(host, SCHEMA_HASH, (PROTOCOL_VERSION + 1) % 256)
 
 
-@check(CLEARING, "Hello with another schema hash, then Clear", "Clear not acknowledged, still LATCHED")
+@check(Hazard.CLOSES, CLEARING, "Hello with another schema hash, then Clear", "Clear not acknowledged, still LATCHED")
 def mismatch_holds(host: Host) -> str:
     """Check that Clear does not take away a mismatch while its cause is there."""
     schema_mismatch.perform(host)
@@ -86,6 +96,7 @@ def mismatch_holds(host: Host) -> str:
 
 
 @check(
+    Hazard.OPENS,
     CLEARING,
     "Hello with another schema hash, the right Hello, then Clear",
     "Clear acknowledged; IDLE, no fault, not HOMED",
@@ -99,7 +110,7 @@ def clear_clears(host: Host) -> str:
     return host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT)
 
 
-@check("Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
+@check(Hazard.CLOSES, "Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
 def run_needs_homing(host: Host) -> str:
     """Check that a device without a zero does not run."""
     host.without_zero()
@@ -107,6 +118,19 @@ def run_needs_homing(host: Host) -> str:
         raise Unmet(f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     host.pass_time(SEEN_S, Beat.RUN)
     return host.shows(DeviceMode.IDLE, Beat.RUN)
+
+
+@check(Hazard.SHUT, "Who says what when, 5", f"Clear with the nonces {NONCES}", "each acknowledged")
+def every_nonce(host: Host) -> str:
+    """Check that a command is new whenever its nonce differs, in any bit, up or down; a Retract would be lost."""
+    host.idle()
+    for nonce in NONCES:
+        host.send(Clear(nonce))
+        host.pass_time(ANSWER_S)
+        host.next_status(Beat.NOTHING)
+        if host.status.command_nonce != nonce:
+            raise Unmet(f"nonce {nonce} not acknowledged, {host.status.command_nonce} in Status")
+    return f"{len(NONCES)} acknowledged"
 
 
 CHECKS: Final = (
@@ -118,4 +142,5 @@ CHECKS: Final = (
     mismatch_holds,
     clear_clears,
     run_needs_homing,
+    every_nonce,
 )

@@ -1,4 +1,4 @@
-"""Checks of RUN: how it is entered, what the duties do, what ends it. Duties are small, ways are short."""
+"""Checks of RUN: how it is entered, what the duties do, what ends it; and of each mode that refuses it."""
 
 from typing import Final
 
@@ -13,10 +13,10 @@ from firmware_protocol.codec import (
     Sense,
     State,
 )
-from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.check import Hazard, check
 from firmware_protocol.conformance.host import (
+    ANSWER_S,
     INSIDE_MM,
-    MOST_DUTY,
     NO_FAULT,
     OPENED_S,
     PERIOD_S,
@@ -25,14 +25,23 @@ from firmware_protocol.conformance.host import (
     Host,
     Unmet,
     is_open,
+    places,
     positions,
     shown,
     told,
 )
 
 PAGE: Final = "Modes"
+TAKES: Final = "What each mode takes"
+MET: Final = "Who says what when, 1"
 OPENING: Final = "Opening"
 RAMP_PER_S: Final = 1.0
+MOST_DUTY: Final = 0.5
+REFUSED_DUTY: Final = -0.4
+"A motor in RUN would go in by over REFUSED_MM with it, in SEEN_S."
+REFUSED_MM: Final = 0.1
+HOMING_MM: Final = 3.0
+"A homing that goes in further than it backs off has another in command."
 MOVED_MM: Final = 0.3
 AT_STOP_DUTY: Final = 0.3
 AT_STOP_MM: Final = 0.1
@@ -50,7 +59,7 @@ IN_TIME: Final = (
 RUNNING: Final = f"in RUN, {INSIDE_MM:g} mm in, "
 
 
-@check(PAGE, "homed, Drive OFF, then Drive RUN with a duty of 0", "RUN", moves=True)
+@check(Hazard.OPENS, PAGE, "homed, Drive OFF, then Drive RUN with a duty of 0", "RUN", moves=True)
 def run_is_entered(host: Host) -> str:
     """Check that a Drive RUN is enough to enter RUN for a device that is homed, without a fault, after a Hello."""
     host.running()
@@ -58,6 +67,7 @@ def run_is_entered(host: Host) -> str:
 
 
 @check(
+    Hazard.CLOSES,
     "Drive",
     f"in RUN, a left duty that falls from 0 to -{MOST_DUTY:g} at most, right 0",
     f"the left carriage goes in by {MOVED_MM:g} mm, the right one stays",
@@ -70,6 +80,7 @@ def left_duty(host: Host) -> str:
 
 
 @check(
+    Hazard.CLOSES,
     "Drive",
     f"in RUN, a right duty that falls from 0 to -{MOST_DUTY:g} at most, left 0",
     f"the right carriage goes in by {MOVED_MM:g} mm, the left one stays",
@@ -99,6 +110,7 @@ def _duty_moves(host: Host, *, is_left: bool) -> str:
 
 
 @check(
+    Hazard.WORN,
     PAGE,
     f"in RUN at both open switches, duties of +{AT_STOP_DUTY:g} for 0.2 s",
     f"no motion over {AT_STOP_MM:g} mm, no current over {AT_STOP_A:g} A",
@@ -131,6 +143,7 @@ def _moved_mm(host: Host, start: State) -> tuple[float, float]:
 
 
 @check(
+    Hazard.SHUT,
     OPENING,
     f"{RUNNING}Drive OFF",
     IN_TIME,
@@ -143,6 +156,7 @@ def off_opens(host: Host) -> str:
 
 
 @check(
+    Hazard.SHUT,
     OPENING,
     f"{RUNNING}Retract, while Drive RUN goes on",
     f"acknowledged; {IN_TIME}",
@@ -163,7 +177,7 @@ def _opens(host: Host, beat: Beat) -> str:
     if not host.until(lambda: min(_moved_mm(host, start)) >= BEGUN_MM, BEGUN_S, beat):
         what = "went the wrong way" if min(_moved_mm(host, start)) <= -BEGUN_MM else "did not begin"
         raise Unmet(f"{what}: {seen}{positions(host.last(State))} in {BEGUN_S:g} s, {_given_up(host, beat)}")
-    if not host.until(lambda: _is_over(host), OPEN_S - BEGUN_S, beat):
+    if not host.until(host.is_resting, OPEN_S - BEGUN_S, beat):
         late = host.last(State)
         host.pass_time(SEEN_S, beat)
         what = "too slow" if max(_moved_mm(host, late)) > 0.0 else "stands"
@@ -172,17 +186,14 @@ def _opens(host: Host, beat: Beat) -> str:
     return host.shows(DeviceMode.IDLE, beat, homed=True, opened=True, fault=NO_FAULT, besides=besides)
 
 
-def _is_over(host: Host) -> bool:
-    return host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED)
-
-
 def _given_up(host: Host, beat: Beat) -> str:
     """Return what a device that does not open in time says of it, within GIVEN_UP_S; it has to say RETRACT_FAILED."""
-    said = host.until(lambda: _is_over(host) or DeviceFault.RETRACT_FAILED in host.status.faults, GIVEN_UP_S, beat)
+    said = host.until(lambda: host.is_resting() or DeviceFault.RETRACT_FAILED in host.status.faults, GIVEN_UP_S, beat)
     return f"then {shown(host.status)}" if said else f"and says nothing of it in {GIVEN_UP_S:g} s"
 
 
 @check(
+    Hazard.CLOSES,
     PAGE,
     "Retract in RUN while Drive RUN goes on; then one Drive OFF",
     "IDLE until the Drive OFF, RUN after it",
@@ -201,28 +212,26 @@ def has_to_let_go(host: Host) -> str:
 
     Raises Unmet where RUN comes before the Drive OFF, or not after it.
     """
-    host.pass_time(SEEN_S, Beat.RUN)
-    host.shows(DeviceMode.IDLE, Beat.RUN, besides="before a Drive OFF")
+    start = host.last(State)
+    for _ in range(round(SEEN_S / PERIOD_S)):
+        host.beat(Beat.RUN, REFUSED_DUTY, REFUSED_DUTY)
+    moved_mm = min(_moved_mm(host, start))
+    besides = f"before a Drive OFF, moved by {moved_mm:+.2f} mm"
+    host.shows(DeviceMode.IDLE, Beat.RUN, besides=besides, wrong=abs(moved_mm) > REFUSED_MM)
     host.beat(Beat.OFF)
     host.pass_time(SEEN_S, Beat.RUN)
     return host.shows(DeviceMode.RUN, Beat.RUN, besides="IDLE, and after a Drive OFF and Drive RUN again")
 
 
-@check("What each mode takes", "Home in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
-def home_refused_in_run(host: Host) -> str:
-    """Check that Home is refused in RUN: a homing would take the brake out of the host's hands."""
+@check(Hazard.OPENS, TAKES, "in RUN a Home, then a Clear", "neither acknowledged, stays RUN and HOMED", moves=True)
+def run_refuses_home_and_clear(host: Host) -> str:
+    """Check that Home and Clear are refused in RUN: they would take the brake out of the host's hands."""
     host.running()
-    return host.refuses(Home, DeviceMode.RUN, Beat.RUN, homed=True)
+    seen = [host.refuses(kind, DeviceMode.RUN, Beat.RUN, homed=True) for kind in (Home, Clear)]
+    return "; ".join(seen)
 
 
-@check("What each mode takes", "Clear in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
-def clear_refused_in_run(host: Host) -> str:
-    """Check that Clear is refused in RUN: it is for drives that are off."""
-    host.running()
-    return host.refuses(Clear, DeviceMode.RUN, Beat.RUN, homed=True)
-
-
-@check("Who says what when, 1", "the right Hello in RUN", "Identity; stays RUN and HOMED", moves=True)
+@check(Hazard.OPENS, "Who says what when, 1", "the right Hello in RUN", "Identity; stays RUN and HOMED", moves=True)
 def hello_in_run(host: Host) -> str:
     """Check that a right Hello is answered in RUN and changes nothing; the host sends one every second."""
     host.running()
@@ -234,37 +243,87 @@ def hello_in_run(host: Host) -> str:
     return host.shows(DeviceMode.RUN, Beat.RUN, homed=True, besides=besides, wrong=count != 2)
 
 
+@check(Hazard.CLOSES, TAKES, f"Home; while HOMING, Drive RUN with {REFUSED_DUTY:g}", "homes as without", moves=True)
+def homing_refuses_run(host: Host) -> str:
+    """Check that a Drive RUN neither ends a homing nor drives a motor in it."""
+    host.homed()
+    host.obeyed(Home)
+    start_mm = min(places(host.last(State)))
+    while host.status.mode is DeviceMode.HOMING and min(places(host.last(State))) > start_mm - HOMING_MM:
+        host.beat(Beat.RUN, REFUSED_DUTY, REFUSED_DUTY)
+    least_mm = min(places(host.last(State)))
+    host.pass_time(SEEN_S, Beat.OFF)
+    return host.shows(
+        DeviceMode.IDLE, homed=True, opened=True, besides=f"from {start_mm:+.2f} to {least_mm:+.2f} mm, then"
+    )
+
+
+def refuses_run(host: Host, mode: DeviceMode) -> str:
+    """Send closing Drive RUN to a device that must not run. Raises Unmet where it moves, answers not, or leaves `mode`.
+
+    `mode` is one in which the drives are off.
+    """
+    host.beat(Beat.OFF)
+    host.pass_time(ANSWER_S)
+    start = host.last(State)
+    host.forget()
+    for _ in range(round(SEEN_S / PERIOD_S)):
+        host.beat(Beat.RUN, REFUSED_DUTY, REFUSED_DUTY)
+    host.pass_time(ANSWER_S)
+    states = len(host.all_of(State))
+    moved_mm = min(_moved_mm(host, start))
+    is_wrong = abs(moved_mm) > REFUSED_MM or states != round(SEEN_S / PERIOD_S)
+    return host.shows(mode, besides=f"{states} State, moved by {moved_mm:+.2f} mm", wrong=is_wrong)
+
+
+def _mismatched(host: Host, beat: Beat, faults: DeviceFault = DeviceFault.SCHEMA_MISMATCH) -> str:
+    """Send a Hello of another schema. Raises Unmet unless the gap opens and the device latches just these faults."""
+    host.hello(SCHEMA_HASH ^ 1, beat=beat)
+    if (status := host.next_status(beat)).mode not in (DeviceMode.RETRACTING, DeviceMode.LATCHED):
+        raise Unmet(shown(status))
+    host.until(host.is_resting, OPENED_S, beat)
+    return host.shows(DeviceMode.LATCHED, beat, homed=False, opened=True, fault=faults)
+
+
 @check(
-    "Who says what when, 1",
-    f"{RUNNING}a Hello with another schema hash",
-    "opens; LATCHED with SCHEMA_MISMATCH",
+    Hazard.CLOSES,
+    TAKES,
+    "a Hello with another schema hash in RUN, in HOMING, while RETRACTING, when LATCHED by silence",
+    "each time opens; LATCHED with SCHEMA_MISMATCH, and the fault that was there before",
     moves=True,
 )
-def mismatch_in_run(host: Host) -> str:
-    """Check that a Hello of another schema in RUN opens the gap: a host has come that does not know the protocol."""
+def mismatch_in_every_mode(host: Host) -> str:
+    """Check that a Hello of another schema is acted on in every mode: a host has come that does not know the rules."""
     host.running(INSIDE_MM)
-    host.hello(SCHEMA_HASH ^ 1, beat=Beat.RUN)
-    if (status := host.next_status(Beat.RUN)).mode is DeviceMode.RUN:
-        raise Unmet(shown(status))
-    host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, Beat.RUN)
-    return host.shows(DeviceMode.LATCHED, Beat.RUN, opened=True, fault=DeviceFault.SCHEMA_MISMATCH)
+    seen = [f"in RUN: {_mismatched(host, Beat.RUN)}"]
+    host.homed()
+    host.obeyed(Home)
+    seen.append(f"in HOMING: {_mismatched(host, Beat.OFF)}")
+    host.running(INSIDE_MM)
+    host.shows(DeviceMode.RETRACTING)
+    seen.append(f"while RETRACTING: {_mismatched(host, Beat.OFF)}")
+    host.latched()
+    both = DeviceFault.COMMAND_TIMEOUT | DeviceFault.SCHEMA_MISMATCH
+    seen.append(f"when LATCHED: {_mismatched(host, Beat.OFF, both)}")
+    return "; ".join(seen)
 
 
 @check(
-    "What each mode takes",
-    f"{RUNNING}Drive OFF; while RETRACTING Home, then Retract",
+    Hazard.SHUT,
+    TAKES,
+    f"{RUNNING}Drive OFF; while RETRACTING Home, Clear, then Retract",
     "only Retract acknowledged; IDLE, open, HOMED",
     moves=True,
 )
 def retracting_takes_only_retract(host: Host) -> str:
-    """Check that a device that opens refuses Home and takes Retract."""
-    host.running(INSIDE_MM)
+    """Check that a device that opens refuses Home and Clear, and takes Retract."""
+    host.running(2.0 * INSIDE_MM)
     host.shows(DeviceMode.RETRACTING, besides="after Drive OFF")
-    is_refused = host.is_refused(Home)
+    taken = [kind.__name__ for kind in (Home, Clear) if not host.is_refused(kind)]
     was_acknowledged = host.command(Retract)
     host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
-    besides = f"Home {told(not is_refused)}, Retract {told(was_acknowledged)}"
-    is_wrong = not is_refused or not was_acknowledged
+    besides = f"{', '.join(taken) or 'nothing'} acknowledged, Retract {told(was_acknowledged)}"
+    is_wrong = taken or not was_acknowledged
     return host.shows(DeviceMode.IDLE, homed=True, opened=True, besides=besides, wrong=is_wrong)
 
 
@@ -277,8 +336,8 @@ CHECKS: Final = (
     retract_opens,
     retracting_takes_only_retract,
     let_go_after_retract,
-    home_refused_in_run,
-    clear_refused_in_run,
+    run_refuses_home_and_clear,
     hello_in_run,
-    mismatch_in_run,
+    homing_refuses_run,
+    mismatch_in_every_mode,
 )

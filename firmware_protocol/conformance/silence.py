@@ -14,83 +14,99 @@ from firmware_protocol.codec import (
     Hello,
     Home,
     Retract,
-    State,
+    Sense,
     encode,
 )
-from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.check import Check, Hazard, check
 from firmware_protocol.conformance.host import (
     HELLO_NONCE,
     INSIDE_MM,
     NO_FAULT,
+    OPENED_S,
+    PERIOD_S,
     SEEN_S,
     Beat,
     Host,
-    Silence,
     Unmet,
+    Untested,
     is_homed,
-    is_open,
-    positions,
     shown,
     unless,
 )
-from firmware_protocol.conformance.running import has_to_let_go
+from firmware_protocol.conformance.running import has_to_let_go, refuses_run
 
 PAGE: Final = "Who says what when, 6"
 LATCHES: Final = "What each mode takes"
-SHORT_S: Final = 0.044
-"""A silence that, with a period of the host and a tick of the device, is under 50 ms."""
-NOTICED_S: Final = 0.054
-"""50 ms, a tick of the device, and the time that a Status is on its way."""
+SHORT_S: Final = 0.047
+LONG_S: Final = 0.053
+BORNE_S: Final = 0.0495
+NOTICED_S: Final = 0.0515
+"""By the device's clock between two answers: a silence up to here is borne, from here on noticed; a tick is between."""
+SHORTS, LONGS = 12, 5
+LATCHED_S: Final = 10.0
+RESTING_A: Final = 0.05
+HELD_S: Final = 37.0
+HOLDS: Final = 3
+"""Modulo 2^16 ms every time is one in RUN, though it takes 5 s to get back there, and no 2^15 ms lack a silence."""
+SPARSE_S: Final = 0.02
+"""Drives that come this seldom still hold RUN."""
+OVER_S: Final = 16.0
+UPTIMES: Final = {31: 2.0**31 * 1e-6, 32: 2.0**32 * 1e-6}
 SILENT: Final = f"in RUN, {INSIDE_MM:g} mm in, no Drive any more"
 LATCHED: Final = "LATCHED by silence, "
+TIMED_OUT: Final = DeviceFault.COMMAND_TIMEOUT
 
 
-@check(PAGE, f"in RUN, {SHORT_S * 1e3:g} ms without a Drive, three times", "stays RUN, no fault", moves=True)
-def short_silence_is_borne(host: Host) -> str:
-    """Check that silences of SHORT_S change nothing: up to 50 ms are allowed."""
-    host.running()
-    seen = ""
-    for _ in range(3):
-        host.pass_time(SHORT_S)
-        host.pass_time(SEEN_S, Beat.RUN)
-        seen = host.shows(DeviceMode.RUN, Beat.RUN, fault=NO_FAULT)
-    return seen
+def _ends(host: Host, silent_s: float) -> bool:
+    """Return whether a silence of a device in RUN ended RUN.
 
-
-def _judged(silence: Silence) -> str:
-    """Return what the first Status after NOTICED_S shows. Raises Unmet unless it shows COMMAND_TIMEOUT and no RUN."""
-    late = [(at_s, status) for at_s, status in silence.statuses if at_s > NOTICED_S]
-    if not late:
-        raise Unmet("no Status after the last Drive")
-    at_s, status = late[0]
-    seen = f"{at_s * 1e3:.0f} ms after the last Drive: {shown(status)}"
-    return unless(status.mode is DeviceMode.RUN or DeviceFault.COMMAND_TIMEOUT not in status.faults, seen)
+    Raises Unmet where the device's clock says that it should not have, or should; and for any other fault.
+    """
+    silence_s = host.fall_silent(silent_s)
+    status = host.next_status(Beat.RUN)
+    has_ended = status.mode is not DeviceMode.RUN
+    seen = f"after {silence_s * 1e3:.2f} ms on the device's clock: {shown(status)}"
+    unless(silence_s < BORNE_S if has_ended else silence_s > NOTICED_S, seen)
+    unless(status.faults != (TIMED_OUT if has_ended else NO_FAULT), seen)
+    return has_ended
 
 
 @check(
+    Hazard.OPENS,
     PAGE,
-    SILENT,
-    f"the first Status later than {NOTICED_S * 1e3:.0f} ms shows COMMAND_TIMEOUT and no RUN",
+    f"in RUN, {SHORT_S * 1e3:g} ms without a Drive, {SHORTS} times, at random times after a Status",
+    "stays RUN, no fault",
+    moves=True,
+)
+def short_silence_is_borne(host: Host) -> str:
+    """Check that short silences change nothing: up to 50 ms are allowed."""
+    host.running()
+    for _ in range(SHORTS):
+        _ends(host, SHORT_S)
+    return host.shows(DeviceMode.RUN, Beat.RUN, fault=NO_FAULT)
+
+
+@check(
+    Hazard.SHUT,
+    PAGE,
+    f"in RUN, at the open end and {INSIDE_MM:g} mm in, {LONG_S * 1e3:g} ms without a Drive, then Drive RUN; {LONGS} "
+    "times, at random times after a Status",
+    "by then no RUN, COMMAND_TIMEOUT alone; opens, LATCHED",
     moves=True,
 )
 def silence_is_noticed(host: Host) -> str:
-    """Check that the device notices silence after 50 ms on its clock, and a tick."""
-    host.running(INSIDE_MM)
-    return _judged(host.fall_silent())
-
-
-@check(PAGE, SILENT, "both carriages go to their open switches, then the drives are off", moves=True)
-def silence_opens(host: Host) -> str:
-    """Check that the device opens the gap on silence, then switches the drives off."""
-    host.running(INSIDE_MM)
-    before = positions(host.last(State))
-    silence = host.fall_silent()
-    modes = {status.mode.name for _, status in silence.statuses}
-    seen = f"from {before}: {shown(silence.status)} after {silence.seconds:.2f} s, by way of {', '.join(sorted(modes))}"
-    return unless(not is_open(silence.status) or silence.status.mode is DeviceMode.RUN, seen)
+    """Check that the device notices silence after 50 ms on its clock and a tick, whenever it begins."""
+    noticed = 0
+    for at in range(LONGS):
+        host.running(INSIDE_MM if at else 0.0)
+        noticed += _ends(host, LONG_S)
+        host.until(host.is_resting, OPENED_S)
+        host.shows(DeviceMode.LATCHED, homed=False, opened=True, fault=TIMED_OUT)
+    return unless(noticed < LONGS - 1, f"{noticed} of {LONGS} noticed, the others too short by the device's clock")
 
 
 @check(
+    Hazard.SHUT,
     PAGE,
     f"{SILENT}, but every 1 ms a repeated Drive, one with a wrong CRC-8, a Clear and Hellos",
     "noticed as before",
@@ -98,7 +114,7 @@ def silence_opens(host: Host) -> str:
 )
 def only_good_drives_extend(host: Host) -> str:
     """Check that only a good Drive extends the 50 ms: not a repeated or damaged one, a Clear or a Hello."""
-    host.running()
+    host.running(2.0 * INSIDE_MM)
     bad_counter = 0
 
     def chatter() -> None:
@@ -113,52 +129,57 @@ def only_good_drives_extend(host: Host) -> str:
         elif bad_counter % 10 == 5:
             host.send(Clear(host.new_nonce()))
 
-    return _judged(host.fall_silent(chatter))
-
-
-@check(PAGE, f"{LATCHED}Drive OFF every 1 ms for 0.3 s", "stays LATCHED with COMMAND_TIMEOUT, not HOMED", moves=True)
-def silence_latches(host: Host) -> str:
-    """Check that the fault of silence stays until it is cleared, and takes the zero away."""
-    host.running(INSIDE_MM)
-    host.fall_silent()
-    host.pass_time(0.3, Beat.OFF)
-    return host.shows(DeviceMode.LATCHED, homed=False, fault=DeviceFault.COMMAND_TIMEOUT)
-
-
-@check(LATCHES, f"{LATCHED}Drive RUN with a duty of 0", "stays LATCHED; each Drive is answered", moves=True)
-def latched_refuses_run(host: Host) -> str:
-    """Check that a latched device does not run, and answers each Drive all the same."""
-    host.latched()
-    host.forget()
-    host.pass_time(SEEN_S, Beat.RUN)
-    states = len(host.all_of(State))
-    return host.shows(DeviceMode.LATCHED, Beat.RUN, besides=f"{states} State", wrong=states < SEEN_S * 900)
-
-
-@check(LATCHES, f"{LATCHED}Home", "not acknowledged, stays LATCHED", moves=True)
-def latched_refuses_home(host: Host) -> str:
-    """Check that a latched device refuses Home: the fault is cleared first."""
-    host.latched()
-    return host.refuses(Home, DeviceMode.LATCHED)
-
-
-@check(LATCHES, f"{LATCHED}Retract", "not acknowledged, stays LATCHED", moves=True)
-def latched_refuses_retract(host: Host) -> str:
-    """Check that a latched device refuses Retract: it has opened already, or cannot."""
-    host.latched()
-    return host.refuses(Retract, DeviceMode.LATCHED)
-
-
-@check(LATCHES, f"{LATCHED}Clear, then Drive RUN", "acknowledged, no fault, not HOMED; stays IDLE", moves=True)
-def cleared_is_not_homed(host: Host) -> str:
-    """Check that a Clear brings back no zero: after a fault the device has to home again."""
-    host.latched()
-    host.obeyed(Clear)
-    host.pass_time(SEEN_S, Beat.RUN)
-    return host.shows(DeviceMode.IDLE, Beat.RUN, homed=False, fault=NO_FAULT)
+    silence_s = host.fall_silent(LONG_S, chatter)
+    seen = f"after {silence_s * 1e3:.1f} ms"
+    return host.shows(DeviceMode.RETRACTING, Beat.RUN, fault=TIMED_OUT, besides=seen, wrong=silence_s < NOTICED_S)
 
 
 @check(
+    Hazard.CLOSES,
+    PAGE,
+    f"{SILENT}; then for {LATCHED_S:g} s nothing, Drive OFF, and Drive RUN by turns",
+    "stays LATCHED, open, with COMMAND_TIMEOUT alone, not HOMED; no motion, no current",
+    moves=True,
+)
+def silence_latches(host: Host) -> str:
+    """Check that the fault of silence stays until it is cleared, and the drives off."""
+    host.latched()
+    host.pass_time(LATCHED_S / 2.0, Beat.NOTHING, SPARSE_S)
+    host.pass_time(LATCHED_S / 4.0, Beat.OFF, SPARSE_S)
+    host.pass_time(LATCHED_S / 4.0, Beat.RUN, SPARSE_S)
+    sense = host.last(Sense)
+    most_A = max(abs(sense.left_current_A), abs(sense.right_current_A))
+    refuses_run(host, DeviceMode.LATCHED)
+    besides = f"{most_A:.3f} A"
+    return host.shows(
+        DeviceMode.LATCHED, homed=False, opened=True, fault=TIMED_OUT, besides=besides, wrong=most_A > RESTING_A
+    )
+
+
+@check(Hazard.OPENS, LATCHES, f"{LATCHED}Home, then Retract", "neither acknowledged, stays LATCHED", moves=True)
+def latched_refuses_home_and_retract(host: Host) -> str:
+    """Check that a latched device takes nothing but a Clear: it is open, or cannot open."""
+    host.latched()
+    return "; ".join(host.refuses(kind, DeviceMode.LATCHED, homed=False) for kind in (Home, Retract))
+
+
+@check(
+    Hazard.CLOSES,
+    LATCHES,
+    f"{LATCHED}Clear without any Drive, then Drive RUN",
+    "acknowledged: the cause is gone; no fault, not HOMED, stays IDLE",
+    moves=True,
+)
+def cleared_is_not_homed(host: Host) -> str:
+    """Check that a Clear is taken in LATCHED and brings back no zero: after a fault the device has to home again."""
+    host.latched()
+    host.obeyed(Clear, Beat.NOTHING)
+    host.shows(DeviceMode.IDLE, Beat.NOTHING, homed=False, fault=NO_FAULT)
+    return refuses_run(host, DeviceMode.IDLE)
+
+
+@check(
+    Hazard.CLOSES,
     "Modes",
     f"{LATCHED}Clear and Home, Drive RUN going on all the time; then one Drive OFF",
     "IDLE until the Drive OFF, RUN after it",
@@ -167,7 +188,8 @@ def cleared_is_not_homed(host: Host) -> str:
 def let_go_after_fault(host: Host) -> str:
     """Check that RUN comes back after a fault only by a Drive OFF, for a host that did not see the fault."""
     host.running(INSIDE_MM)
-    host.fall_silent()
+    host.pass_time(0.1)
+    host.until(host.is_resting, OPENED_S, Beat.RUN)
     host.obeyed(Clear, Beat.RUN)
     homing = host.home(Beat.RUN)
     if not is_homed(homing.status):
@@ -175,15 +197,64 @@ def let_go_after_fault(host: Host) -> str:
     return has_to_let_go(host)
 
 
+def _holds(host: Host, end_s: float) -> str:
+    """Hold RUN until then with Drives that come seldom, then fall silent. Raises Unmet where that is not noticed."""
+    host.running()
+    while host.now_s < end_s:
+        host.beat(Beat.RUN, period_s=SPARSE_S)
+        if host.status.mode is not DeviceMode.RUN:
+            raise Unmet(f"RUN with a Drive every {SPARSE_S * 1e3:g} ms ends: {shown(host.status)}")
+    host.pass_time(SEEN_S, Beat.RUN)
+    _ends(host, LONG_S + PERIOD_S)
+    host.until(host.is_resting, OPENED_S)
+    return host.shows(DeviceMode.LATCHED, fault=TIMED_OUT)
+
+
+@check(
+    Hazard.SHUT,
+    PAGE,
+    f"{HOLDS} times in RUN a Drive every {SPARSE_S * 1e3:g} ms, {HOLDS * HELD_S:g} s in all, then none",
+    "stays RUN; then COMMAND_TIMEOUT alone, whenever",
+    moves=True,
+)
+def any_uptime(host: Host) -> str:
+    """Check that a counter of the timeout that runs over at 2^16 ms, or changes its sign, is not seen."""
+    began_s = host.now_s
+    seen = [_holds(host, began_s + at * HELD_S) for at in range(1, HOLDS + 1)]
+    return f"{len(seen)} times: {seen[-1]}"
+
+
+def _clock_runs_over(bits: int) -> Check:
+    """Return the check that nothing happens where a counter of microseconds runs over at 2 to this power."""
+    over_s = UPTIMES[bits]
+
+    def perform(host: Host) -> str:
+        host.running()
+        up_s = host.uptime_s
+        if up_s is None or not up_s < over_s < up_s + OVER_S:
+            raise Untested(f"build a firmware whose clock starts {OVER_S / 2.0:g} s before {over_s:.0f} s; --uptime")
+        return _holds(host, host.now_s + OVER_S)
+
+    return Check(
+        f"uptime_of_2_{bits}_us",
+        Hazard.SHUT,
+        PAGE,
+        f"in RUN while the uptime becomes {over_s:.0f} s, then no Drive any more",
+        "stays RUN; then COMMAND_TIMEOUT alone",
+        perform,
+        moves=True,
+        is_gate=False,
+    )
+
+
 CHECKS: Final = (
     short_silence_is_borne,
     silence_is_noticed,
-    silence_opens,
     only_good_drives_extend,
     silence_latches,
-    latched_refuses_run,
-    latched_refuses_home,
-    latched_refuses_retract,
+    latched_refuses_home_and_retract,
     cleared_is_not_homed,
     let_go_after_fault,
+    any_uptime,
+    *(_clock_runs_over(bits) for bits in UPTIMES),
 )

@@ -1,0 +1,99 @@
+"""Checks that need more than the line: a reset, and what only a bench can bring about."""
+
+from typing import Final
+
+from firmware_protocol.codec import DeviceMode, Home, Identity, Retract, State, Status
+from firmware_protocol.conformance.check import Check, Hazard, check
+from firmware_protocol.conformance.host import (
+    NO_FAULT,
+    OPENED_S,
+    Beat,
+    Host,
+    Unmet,
+    Untested,
+    is_homed,
+    is_open,
+    positions,
+    shown,
+)
+from firmware_protocol.conformance.opening import LEAST_SHARE
+from firmware_protocol.conformance.running import refuses_run
+
+PAGE: Final = "Reset"
+INSIDE_MM: Final = 10.0
+BOOT_S: Final = 10.0
+UNHOMED_SHARE: Final = 0.5
+TO_TURN_S: Final = 0.5
+
+
+def _is_new(host: Host, how: str) -> str:
+    """Reset a device in RUN, INSIDE_MM in, and hold it against a new one.
+
+    Raises Unmet unless it is IDLE, without zero, fault and host, opens slowly, and runs only after Home and Hello.
+    """
+    if host.reset is None:
+        raise Untested(f"nobody can reset the device: --reset COMMAND, which is called with {how}")
+    host.running(INSIDE_MM)
+    host.reset(how)
+    for kind in (Status, State, Identity):
+        host.newest.pop(kind, None)
+    host.begin()
+    host.until(lambda: Status in host.newest, BOOT_S, Beat.NOTHING)
+    status = host.status
+    if status.command_nonce:
+        raise Unmet(f"no reset, or one that keeps the nonce: {shown(status)}")
+    seen = [refuses_run(host, DeviceMode.IDLE)]
+    if is_homed(status) or status.faults or is_open(status):
+        raise Unmet(f"after the reset: {shown(status)}")
+    start_s, start = host.now_s, host.last(State)
+    host.obeyed(Retract)
+    host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S)
+    seen.append(f"opens in {host.now_s - start_s:.1f} s from {positions(start)}")
+    limit_s = INSIDE_MM / (LEAST_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
+    is_late = host.now_s - start_s > limit_s
+    host.shows(DeviceMode.IDLE, homed=False, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=is_late)
+    host.obeyed(Home)
+    host.until(lambda: host.status.mode is not DeviceMode.HOMING, OPENED_S)
+    host.shows(DeviceMode.IDLE, homed=True, fault=NO_FAULT, besides="homed without a Hello")
+    seen.append(refuses_run(host, DeviceMode.IDLE))
+    host.running()
+    return f"{'; '.join(seen)} without a Hello; after it {shown(host.status)}"
+
+
+LIKE_NEW: Final = (
+    f"nonce 0, IDLE, not HOMED, no fault, drives off; opens {INSIDE_MM:g} mm at over "
+    f"{LEAST_SHARE * UNHOMED_SHARE:g} of the device's speed and {TO_TURN_S:g} s; runs after Home and Hello, not before"
+)
+
+
+@check(Hazard.CLOSES, PAGE, f"in RUN, {INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
+def warm_reset(host: Host) -> str:
+    """Check that a reset by watchdog or pin leaves nothing of before: a zero that was kept may be off."""
+    return _is_new(host, "warm")
+
+
+@check(Hazard.CLOSES, PAGE, f"in RUN, {INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
+def cold_reset(host: Host) -> str:
+    """Check that a device without a memory of before waits for Home and Hello."""
+    return _is_new(host, "cold")
+
+
+def _by_hand(name: str, hazard: Hazard, sent: str, expected: str) -> Check:
+    """Return a rule that only a person with tools can test; it is listed as untested."""
+
+    def perform(host: Host) -> str:
+        raise Untested("for the bench, by hand")
+
+    return Check(name, hazard, "Faults", sent, expected, perform, moves=False, is_gate=False)
+
+
+BY_HAND: Final = (
+    _by_hand("overcurrent", Hazard.WORN, "in RUN a carriage held", "OVERCURRENT after 0.15 s; LATCHED"),
+    _by_hand("retract_failed", Hazard.SHUT, "a carriage held while RETRACTING", "RETRACT_FAILED"),
+    _by_hand("uncommanded_motion", Hazard.CLOSES, "IDLE, a screw turned by 0.3 mm", "UNCOMMANDED_MOTION, opens"),
+    _by_hand("supply", Hazard.SHUT, "a supply of 8.5 V, and of 15.5 V", "SUPPLY until Clear, refused meanwhile"),
+    _by_hand("temperature", Hazard.WORN, "the sensor warmed to over 60 degC", "TEMPERATURE; as SUPPLY"),
+    _by_hand("watchdog", Hazard.CLOSES, "a firmware that hangs in RUN", "a reset within 50 ms, drives off"),
+)
+"""What only a bench can show."""
+CHECKS: Final = (warm_reset, cold_reset, *BY_HAND)

@@ -1,0 +1,105 @@
+"""Checks of opening from the whole stroke: how fast, how far, and what it ends in, whatever it was for."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, Retract, State
+from firmware_protocol.conformance.check import Hazard, check
+from firmware_protocol.conformance.host import (
+    NO_FAULT,
+    OPENED_S,
+    TIME_SPAN_S,
+    Beat,
+    Host,
+    Unmet,
+    places,
+    shown,
+)
+
+PAGE: Final = "Opening"
+NEARLY_MM: Final = 1.25
+"Before the closed switch: here an opening from the whole stroke begins."
+LEAST_SHARE: Final = 0.6
+MOST_SHARE: Final = 1.15
+"""Of the device's speed of opening: what a carriage has as a mean but for both ends, and at most."""
+ENDS_MM: Final = 3.0
+WINDOW: Final = 50
+"""States over which a speed is taken."""
+FULLY: Final = f"all the way at {LEAST_SHARE:g} to {MOST_SHARE:g} of the device's speed; "
+NEARLY: Final = f"in RUN, {NEARLY_MM:g} mm from the closed switches, "
+
+
+def opens_fully(host: Host, fault: DeviceFault, beat: Beat = Beat.OFF) -> str:
+    """Watch a device open that has begun, and judge each carriage's speed on the device's clock.
+
+    Raises Unmet where the mean is under LEAST_SHARE or a window over MOST_SHARE of the device's speed, and where it
+    ends in anything but rest at both open switches with just this fault.
+    """
+    host.forget()
+    starts_mm = places(host.last(State))
+    host.until(host.is_resting, OPENED_S, beat)
+    rows: list[tuple[float, tuple[float, float]]] = []
+    time_s, before_s = 0.0, -1.0
+    for _, state in host.all_of(State):
+        time_s += (state.device_time_s - before_s) % TIME_SPAN_S if rows else 0.0
+        before_s = state.device_time_s
+        rows.append((time_s, places(state)))
+    speeds = [_speeds(rows, side, starts_mm[side]) for side in (0, 1)]
+    means, mosts = [mean for mean, _ in speeds], [most for _, most in speeds]
+    seen = f"{min(means):.1f} mm/s on the way, {max(mosts):.1f} at most"
+    is_wrong = min(means) < LEAST_SHARE * host.opening_mm_s or max(mosts) > MOST_SHARE * host.opening_mm_s
+    mode = DeviceMode.LATCHED if fault else DeviceMode.IDLE
+    return host.shows(mode, beat, homed=not fault, opened=True, fault=fault, besides=seen, wrong=is_wrong)
+
+
+def _speeds(rows: list[tuple[float, tuple[float, float]]], side: int, start_mm: float) -> tuple[float, float]:
+    """Return one carriage's mean speed but for ENDS_MM at both ends, and the most over a window, mm/s; 0 for no way."""
+    window: deque[tuple[float, float]] = deque(maxlen=WINDOW)
+    way: list[tuple[float, float]] = []
+    most_mm_s = 0.0
+    for time_s, at in rows:
+        window.append((time_s, at[side]))
+        if len(window) == WINDOW and time_s > window[0][0]:
+            most_mm_s = max(most_mm_s, (at[side] - window[0][1]) / (time_s - window[0][0]))
+        if start_mm + ENDS_MM < at[side] < -ENDS_MM:
+            way.append((time_s, at[side]))
+    if len(way) < 2:
+        return 0.0, most_mm_s
+    return (way[-1][1] - way[0][1]) / (way[-1][0] - way[0][0]), most_mm_s
+
+
+def _from_inside(host: Host, ends_run: Callable[[], object], fault: DeviceFault, beat: Beat) -> str:
+    """Bring the carriages in, end RUN, and watch the device open as `opens_fully`."""
+    host.running(host.stroke_mm - NEARLY_MM)
+    ends_run()
+    if (status := host.next_status(beat)).mode is not DeviceMode.RETRACTING:
+        raise Unmet(shown(status))
+    return opens_fully(host, fault, beat)
+
+
+@check(Hazard.SHUT, PAGE, f"{NEARLY}Drive OFF", f"{FULLY}IDLE, open, HOMED, no fault", moves=True)
+def off_opens_fully(host: Host) -> str:
+    """Check speed and way of the opening that ends every run."""
+    return _from_inside(host, lambda: host.beat(Beat.OFF), NO_FAULT, Beat.OFF)
+
+
+@check(Hazard.SHUT, PAGE, f"{NEARLY}Retract, Drive RUN going on", f"{FULLY}IDLE, open, HOMED, no fault", moves=True)
+def retract_opens_fully(host: Host) -> str:
+    """Check speed and way of the opening that a Retract begins."""
+    return _from_inside(host, lambda: host.obeyed(Retract, Beat.RUN), NO_FAULT, Beat.RUN)
+
+
+@check(
+    Hazard.SHUT,
+    "Who says what when, 6",
+    f"{NEARLY}no Drive for 0.1 s, then Drive OFF",
+    f"{FULLY}LATCHED, open, with COMMAND_TIMEOUT alone",
+    moves=True,
+)
+def silence_opens_fully(host: Host) -> str:
+    """Check speed and way of the opening that the device begins by itself."""
+    return _from_inside(host, lambda: host.pass_time(0.1), DeviceFault.COMMAND_TIMEOUT, Beat.OFF)
+
+
+CHECKS: Final = (off_opens_fully, retract_opens_fully, silence_opens_fully)
