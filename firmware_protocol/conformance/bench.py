@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from firmware_protocol.codec import DeviceMode, Home, Identity, Retract, State, Status
+from firmware_protocol.codec import DeviceMode, Home, Retract, State
 from firmware_protocol.conformance.check import Check, Hazard, check
 from firmware_protocol.conformance.host import (
     NO_FAULT,
@@ -11,7 +11,6 @@ from firmware_protocol.conformance.host import (
     Host,
     Unmet,
     Untested,
-    is_homed,
     is_open,
     positions,
     shown,
@@ -35,16 +34,11 @@ def _is_new(host: Host, how: str) -> str:
         raise Untested(f"nobody can reset the device: --reset COMMAND, which is called with {how}")
     host.running(INSIDE_MM)
     host.reset(how)
-    for kind in (Status, State, Identity):
-        host.newest.pop(kind, None)
     host.begin()
-    host.until(lambda: Status in host.newest, BOOT_S, Beat.NOTHING)
-    status = host.status
-    if status.command_nonce:
-        raise Unmet(f"no reset, or one that keeps the nonce: {shown(status)}")
+    if not host.until(lambda: host.status.command_nonce == 0, BOOT_S, Beat.NOTHING):
+        raise Unmet(f"no reset, or one that keeps the nonce: {shown(host.status)}")
+    host.shows(DeviceMode.IDLE, Beat.NOTHING, homed=False, fault=NO_FAULT, besides="after the reset")
     seen = [refuses_run(host, DeviceMode.IDLE)]
-    if is_homed(status) or status.faults or is_open(status):
-        raise Unmet(f"after the reset: {shown(status)}")
     start_s, start = host.now_s, host.last(State)
     host.obeyed(Retract)
     host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S)

@@ -109,7 +109,12 @@ def drive_crc_8(host: Host) -> str:
     )
 
 
-@check(Hazard.CLOSES, "Who says what when, 2", "a Drive with a duty of 1.0001 or -3.2768, its CRC-8 right", SILENT)
+@check(
+    Hazard.CLOSES,
+    "Who says what when, 2",
+    "a Drive OFF or RUN with a duty of 1.0001 or -3.2768, its CRC-8 right",
+    SILENT,
+)
 def drive_range(host: Host) -> str:
     """Check that a Drive with a duty out of range is ignored."""
     return _ignores(
@@ -117,6 +122,8 @@ def drive_range(host: Host) -> str:
         [
             lambda counter: host.line.send(DRIVE, _raw_drive(10_001, 0, counter)),
             lambda counter: host.line.send(DRIVE, _raw_drive(-32_768, 0, counter)),
+            lambda counter: host.line.send(DRIVE, _raw_drive(10_001, 1, counter)),
+            lambda counter: host.line.send(DRIVE, _raw_drive(-32_768, 1, counter)),
         ],
     )
 

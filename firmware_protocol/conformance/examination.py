@@ -35,7 +35,8 @@ CHECKS = (
     *stroke.CHECKS,
     *opening.CHECKS,
     *silence.CHECKS,
-    *bench.CHECKS,
     *overall.CHECKS,
+    *bench.CHECKS,
+    overall.left_open,
 )
 """The checks of every line."""

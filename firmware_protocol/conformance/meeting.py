@@ -120,7 +120,12 @@ def run_needs_homing(host: Host) -> str:
     return host.shows(DeviceMode.IDLE, Beat.RUN)
 
 
-@check(Hazard.SHUT, "Who says what when, 5", f"Clear with the nonces {NONCES}", "each acknowledged")
+@check(
+    Hazard.SHUT,
+    "Who says what when, 5",
+    f"Clear with the nonces {NONCES}, then 1 to 254",
+    "each acknowledged, the last one of the row",
+)
 def every_nonce(host: Host) -> str:
     """Check that a command is new whenever its nonce differs, in any bit, up or down; a Retract would be lost."""
     host.idle()
@@ -130,7 +135,12 @@ def every_nonce(host: Host) -> str:
         host.next_status(Beat.NOTHING)
         if host.status.command_nonce != nonce:
             raise Unmet(f"nonce {nonce} not acknowledged, {host.status.command_nonce} in Status")
-    return f"{len(NONCES)} acknowledged"
+    for nonce in range(1, 255):
+        host.send(Clear(nonce))
+        host.beat(Beat.NOTHING)
+    host.next_status(Beat.NOTHING)
+    nonce = host.next_status(Beat.NOTHING).command_nonce
+    return unless(nonce != 254, f"{len(NONCES)} acknowledged, then, of 254 more in a row, the one with {nonce}")
 
 
 CHECKS: Final = (

@@ -9,12 +9,15 @@ from firmware_protocol.conformance.check import Hazard, check
 from firmware_protocol.conformance.host import (
     NO_FAULT,
     OPENED_S,
+    PERIOD_S,
+    SEEN_S,
     TIME_SPAN_S,
     Beat,
     Host,
     Unmet,
     places,
     shown,
+    unless,
 )
 
 PAGE: Final = "Opening"
@@ -24,6 +27,7 @@ LEAST_SHARE: Final = 0.6
 MOST_SHARE: Final = 1.15
 """Of the device's speed of opening: what a carriage has as a mean but for both ends, and at most."""
 ENDS_MM: Final = 3.0
+CLOSING_DUTY: Final = -0.5
 WINDOW: Final = 50
 """States over which a speed is taken."""
 FULLY: Final = f"all the way at {LEAST_SHARE:g} to {MOST_SHARE:g} of the device's speed; "
@@ -78,10 +82,23 @@ def _from_inside(host: Host, ends_run: Callable[[], object], fault: DeviceFault,
     return opens_fully(host, fault, beat)
 
 
-@check(Hazard.SHUT, PAGE, f"{NEARLY}Drive OFF", f"{FULLY}IDLE, open, HOMED, no fault", moves=True)
+def _lets_go(host: Host) -> None:
+    """Send Drive OFF with closing duties for SEEN_S. Raises Unmet where the device is not opening by then."""
+    for _ in range(round(SEEN_S / PERIOD_S)):
+        host.beat(Beat.OFF, CLOSING_DUTY, CLOSING_DUTY)
+    unless(host.status.mode is not DeviceMode.RETRACTING, f"Drive OFF with duties: {shown(host.status)}")
+
+
+@check(
+    Hazard.SHUT,
+    PAGE,
+    f"{NEARLY}Drive OFF, at first with duties of {CLOSING_DUTY:g}",
+    f"{FULLY}IDLE, open, HOMED, no fault",
+    moves=True,
+)
 def off_opens_fully(host: Host) -> str:
     """Check speed and way of the opening that ends every run."""
-    return _from_inside(host, lambda: host.beat(Beat.OFF), NO_FAULT, Beat.OFF)
+    return _from_inside(host, lambda: _lets_go(host), NO_FAULT, Beat.OFF)
 
 
 @check(Hazard.SHUT, PAGE, f"{NEARLY}Retract, Drive RUN going on", f"{FULLY}IDLE, open, HOMED, no fault", moves=True)

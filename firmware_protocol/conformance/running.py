@@ -16,6 +16,7 @@ from firmware_protocol.codec import (
 from firmware_protocol.conformance.check import Hazard, check
 from firmware_protocol.conformance.host import (
     ANSWER_S,
+    HOMED_S,
     INSIDE_MM,
     NO_FAULT,
     OPENED_S,
@@ -25,7 +26,6 @@ from firmware_protocol.conformance.host import (
     Host,
     Unmet,
     is_open,
-    places,
     positions,
     shown,
     told,
@@ -40,6 +40,7 @@ MOST_DUTY: Final = 0.5
 REFUSED_DUTY: Final = -0.4
 "A motor in RUN would go in by over REFUSED_MM with it, in SEEN_S."
 REFUSED_MM: Final = 0.1
+HOMING_S: Final = 0.5
 HOMING_MM: Final = 3.0
 "A homing that goes in further than it backs off has another in command."
 MOVED_MM: Final = 0.3
@@ -248,14 +249,13 @@ def homing_refuses_run(host: Host) -> str:
     """Check that a Drive RUN neither ends a homing nor drives a motor in it."""
     host.homed()
     host.obeyed(Home)
-    start_mm = min(places(host.last(State)))
-    while host.status.mode is DeviceMode.HOMING and min(places(host.last(State))) > start_mm - HOMING_MM:
+    start = host.last(State)
+    end_s = host.now_s + HOMING_S
+    while host.now_s < end_s and min(_moved_mm(host, start)) > -HOMING_MM:
         host.beat(Beat.RUN, REFUSED_DUTY, REFUSED_DUTY)
-    least_mm = min(places(host.last(State)))
-    host.pass_time(SEEN_S, Beat.OFF)
-    return host.shows(
-        DeviceMode.IDLE, homed=True, opened=True, besides=f"from {start_mm:+.2f} to {least_mm:+.2f} mm, then"
-    )
+    besides = f"moved by {min(_moved_mm(host, start)):+.2f} mm after {HOMING_S:g} s, then"
+    host.until(lambda: host.status.mode is not DeviceMode.HOMING, HOMED_S)
+    return host.shows(DeviceMode.IDLE, homed=True, opened=True, fault=NO_FAULT, besides=besides)
 
 
 def refuses_run(host: Host, mode: DeviceMode) -> str:

@@ -194,16 +194,23 @@ def device_time_is_fine(host: Host) -> str:
     return unless(len(steps) < 20, f"{len(steps)} different times of 100 within a millisecond")
 
 
-@check(Hazard.MISLED, "Sense", "Drive OFF every 1 ms for 1 s, somebody turning the handle", "no leap over 1 mm")
+@check(
+    Hazard.MISLED,
+    "Sense",
+    "Drive OFF every 1 ms for 1 s, somebody turning the handle",
+    "no leap over 1 mm, a force against the motion",
+)
 def handle_runs_on(host: Host) -> str:
-    """Check that the handle's position has no leaps, its bytes the right way round."""
+    """Check that the handle's position has no leaps, as of swapped bytes, and that the force is against its motion."""
     host.pass_time(LISTENED_S, Beat.OFF)
     places = [sense.handle_position_mm for _, sense in host.all_of(Sense)]
     half = HANDLE_SPAN_MM / 2.0
     steps = [(after - before + half) % HANDLE_SPAN_MM - half for before, after in pairwise(places)]
-    most_mm, way_mm = max(map(abs, steps), default=0.0), abs(sum(steps))
-    seen = unless(most_mm > HANDLE_MM, f"turned by {way_mm:.2f} mm, {most_mm:.3f} mm a step at most")
-    if way_mm < HANDLE_MM:
+    most_mm, way_mm = max(map(abs, steps), default=0.0), sum(steps)
+    force_N = usual([sense.force_N for _, sense in host.all_of(Sense)])
+    seen = f"turned by {way_mm:+.2f} mm, {most_mm:.3f} mm a step at most, {force_N:+.2f} N"
+    unless(most_mm > HANDLE_MM or (abs(way_mm) > HANDLE_MM and force_N * way_mm < 0.0), seen)
+    if abs(way_mm) < HANDLE_MM:
         raise Untested(f"{seen}; turn the handle by hand meanwhile, --only handle_runs_on")
     return seen
 
@@ -222,16 +229,16 @@ def drive_counter_shown(host: Host) -> str:
     return seen
 
 
-@check(Hazard.SHUT, DRIVE, "a Drive OFF, then five more with the same counter", "one State")
+@check(Hazard.SHUT, DRIVE, "a Drive OFF, then five more with the same counter, of other duties too", "one State")
 def repeated_drive(host: Host) -> str:
     """Check that a repeated Drive is not answered: it is not accepted."""
     host.pass_time(2 * PERIOD_S, Beat.OFF)
     host.pass_time(ANSWER_S)
     host.forget()
     host.beat(Beat.OFF)
-    for _ in range(5):
+    for more in range(5):
         host.counter = (host.counter - 1) % 256
-        host.drive(DriveMode.OFF)
+        host.drive(DriveMode.OFF, 0.1 * more)
         host.pass_time(3 * PERIOD_S)
     host.pass_time(ANSWER_S)
     count = len(host.all_of(State))

@@ -9,6 +9,7 @@ from firmware_protocol.conformance.check import Hazard, check
 from firmware_protocol.conformance.host import (
     PERIOD_S,
     SEEN_S,
+    STATUS_S,
     Beat,
     Host,
     Unmet,
@@ -37,6 +38,8 @@ MIDDLE_MM: Final = 10.0
 PULSE_S: Final = 0.3
 SETTLED_S: Final = 0.15
 LEAST_GAIN: Final = 0.6
+STARTED_S: Final = 0.02
+STARTED_MM: Final = 0.05
 STARTING_A: Final = (0.5, 10.0)
 """What a motor draws that starts at the whole duty: under this the unit is wrong, over it too."""
 
@@ -91,11 +94,11 @@ def _edges_mm(host: Host, side: int, switch: Switches) -> list[float]:
     Hazard.MISLED,
     "Drive",
     f"in RUN, {MIDDLE_MM:g} mm in, duties of -{DUTIES[0]:g}, +{DUTIES[0]:g} .. -1, +1 for {PULSE_S:g} s each",
-    f"each step of {DUTIES[1] - DUTIES[0]:.1f} adds {LEAST_GAIN:g} of its share of the speed",
+    f"each step of {DUTIES[1] - DUTIES[0]:.1f} adds {LEAST_GAIN:g} of its share of the speed; Status goes on",
     moves=True,
 )
 def duty_makes_speed(host: Host) -> str:
-    """Check that speed rises with the duty up to the whole, both ways, and no supply gives way."""
+    """Check that speed rises with the duty up to the whole, both ways, and nothing gives way."""
     host.running(MIDDLE_MM)
     seen = []
     for sign in (-1.0, 1.0):
@@ -114,19 +117,22 @@ def duty_makes_speed(host: Host) -> str:
 @check(
     Hazard.MISLED,
     "Sense",
-    f"in RUN, {MIDDLE_MM:g} mm in, from rest a duty of +1, and again 10 ms later",
-    f"{STARTING_A[0]:g} to {STARTING_A[1]:g} A, positive, in the second Sense",
+    f"in RUN, {MIDDLE_MM:g} mm in, from rest a duty of +1, and again {STARTED_S * 1e3:g} ms later",
+    f"{STARTING_A[0]:g} to {STARTING_A[1]:g} A, positive, in the second Sense, and {STARTED_MM:g} mm of way in State",
     moves=True,
 )
-def currents_follow_duty(host: Host) -> str:
-    """Check that currents have their unit and sign, and are of the Drive that they answer."""
+def answers_are_of_now(host: Host) -> str:
+    """Check that currents and positions are of the Drive that they answer, currents with their unit and sign."""
     host.running(MIDDLE_MM)
+    start_mm = places(host.last(State))
     for _ in range(2):  # the second one measures what the first began; an answer that lags shows a motor at rest
-        host.beat(Beat.RUN, 1.0, 1.0, 10 * PERIOD_S)
+        host.beat(Beat.RUN, 1.0, 1.0, STARTED_S)
     sense = host.last(Sense)
     currents_A = sense.left_current_A, sense.right_current_A
-    seen = ", ".join(f"{current_A:+.2f} A" for current_A in currents_A)
-    return unless(not all(STARTING_A[0] < current_A < STARTING_A[1] for current_A in currents_A), seen)
+    way_mm = min(after - before for before, after in zip(start_mm, places(host.last(State)), strict=True))
+    seen = f"{', '.join(f'{current_A:+.2f} A' for current_A in currents_A)}, {way_mm:+.2f} mm"
+    is_right = all(STARTING_A[0] < current_A < STARTING_A[1] for current_A in currents_A)
+    return unless(not is_right or way_mm < STARTED_MM, seen)
 
 
 def _speed_mm_s(host: Host, duty: float) -> float:
@@ -137,6 +143,8 @@ def _speed_mm_s(host: Host, duty: float) -> float:
     for _ in range(round((PULSE_S - SETTLED_S) / PERIOD_S)):
         host.beat(Beat.RUN, duty, duty)
     end = places(host.last(State))
+    if host.now_s - host.newest[Status].time_s > 2.5 * STATUS_S:
+        raise Unmet(f"no Status at a duty of {duty:g}")
     ways_mm = [(after - before) * (1.0 if duty > 0.0 else -1.0) for before, after in zip(start, end, strict=True)]
     return min(ways_mm) / (PULSE_S - SETTLED_S)
 
@@ -196,4 +204,4 @@ def end_stop_opens(host: Host) -> str:
     return "; ".join(seen)
 
 
-CHECKS: Final = (zero_is_at_switch, duty_makes_speed, currents_follow_duty, skew_opens, end_stop_opens)
+CHECKS: Final = (zero_is_at_switch, duty_makes_speed, answers_are_of_now, skew_opens, end_stop_opens)

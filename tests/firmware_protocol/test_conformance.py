@@ -175,6 +175,7 @@ class Rogue(CompiledFirmware):
         self.was_homed = False
         self.zeroed_s = -1.0
         self.since_s = 0.0
+        self.state: State | None = None
         self.sense: Sense | None = None
         self.boots()
 
@@ -507,6 +508,19 @@ def big_endian(sense: Sense) -> Sense:
 def one_old(device: Rogue, _time_s: float, measured: Measured) -> Measured:
     before, device.sense = device.sense or measured[1], measured[1]
     return measured[0], before
+
+
+def place_old(device: Rogue, time_s: float, measured: Measured) -> Measured:
+    before, device.state = device.state or measured[0], measured[0]
+    return before.replaced(counter=measured[0].counter, device_time_s=measured[0].device_time_s), measured[1]
+
+
+def other_payload(device: Rogue, time_s: float, message: Message) -> None:
+    if isinstance(message, Drive) and message.left_duty != device.asked.left_duty:
+        device.real._drive_counter = None
+
+
+RUNS = bytes((DriveMode.RUN.value,))
 
 
 def only_one_a_tick(device: Rogue, message: Message) -> Message | None:
@@ -955,14 +969,14 @@ PLANTED = (
     rogue("handle big-endian", "handle_runs_on", measures=sensed(big_endian)),
     rogue(
         "currents in tenths",
-        "currents_follow_duty",
+        "answers_are_of_now",
         measures=sensed(
             lambda sense: sense.replaced(
                 left_current_A=0.1 * sense.left_current_A, right_current_A=0.1 * sense.right_current_A
             )
         ),
     ),
-    rogue("Sense one Drive old", "currents_follow_duty", measures=one_old),
+    rogue("Sense one Drive old", "answers_are_of_now", measures=one_old),
     rogue(
         "time in milliseconds",
         "device_time_is_fine",
@@ -986,6 +1000,34 @@ PLANTED = (
         hears=lambda device, message: (
             fitting(message, schema_hash=SCHEMA_HASH) if device.real.mode is DeviceMode.HOMING else message
         ),
+    ),
+    # and what a second look found missing
+    rogue(
+        "no Status at high duty",
+        "duty_makes_speed",
+        shows=lambda device, _, status: (
+            None if is_running(device) and abs(device.real.output.left_duty) > 0.8 else status
+        ),
+    ),
+    rogue("equal counters with other duties", "repeated_drive", before=other_payload),
+    rogue("force reversed", "handle_runs_on", measures=sensed(lambda sense: sense.replaced(force_N=-sense.force_N))),
+    rogue("positions one Drive old", "answers_are_of_now", measures=place_old),
+    rogue(
+        "commands run out",
+        "every_nonce",
+        hears=lambda device, message: None if isinstance(message, Clear) and device.count[Clear] > 255 else message,
+    ),
+    rogue(
+        "OFF with a duty is RUN",
+        "off_opens_fully",
+        hears=lambda device, message: (
+            message.replaced(mode=DriveMode.RUN)
+            if isinstance(message, Drive) and is_running(device) and message.left_duty
+            else message
+        ),
+    ),
+    wire(
+        "clamps duties in RUN", "drive_range", mended=mending(lambda body: clamped(body) if body[6:7] == RUNS else body)
     ),
     rogue("one Drive a tick", "drives_at_once", hears=only_one_a_tick),
     rogue("nonce of 7 bits", "every_nonce", hears=with_nonce(lambda _, nonce: nonce % 128)),
