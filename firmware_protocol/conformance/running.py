@@ -29,6 +29,7 @@ from firmware_protocol.conformance.host import (
     positions,
     shown,
     told,
+    unless,
 )
 
 PAGE: Final = "Modes"
@@ -71,7 +72,7 @@ def run_is_entered(host: Host) -> str:
     Hazard.CLOSES,
     "Drive",
     f"in RUN, a left duty that falls from 0 to -{MOST_DUTY:g} at most, right 0",
-    f"the left carriage goes in by {MOVED_MM:g} mm, the right one stays",
+    f"the left carriage goes in by {MOVED_MM:g} mm, the right one stays; the left motor draws more",
     moves=True,
     is_gate=True,
 )
@@ -84,7 +85,7 @@ def left_duty(host: Host) -> str:
     Hazard.CLOSES,
     "Drive",
     f"in RUN, a right duty that falls from 0 to -{MOST_DUTY:g} at most, left 0",
-    f"the right carriage goes in by {MOVED_MM:g} mm, the left one stays",
+    f"the right carriage goes in by {MOVED_MM:g} mm, the left one stays; the right motor draws more",
     moves=True,
     is_gate=True,
 )
@@ -102,9 +103,14 @@ def _duty_moves(host: Host, *, is_left: bool) -> str:
         host.beat(Beat.RUN, duty if is_left else 0.0, 0.0 if is_left else duty)
         left_mm, right_mm = _moved_mm(host, start)
         moved_mm, other_mm = (left_mm, right_mm) if is_left else (right_mm, left_mm)
-        seen = f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm at a duty of {duty:.2f}"
+        sense = host.last(Sense)
+        currents_A = abs(sense.left_current_A), abs(sense.right_current_A)
+        seen = (
+            f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm at a duty of {duty:.2f}, "
+            f"{currents_A[0]:.2f} A and {currents_A[1]:.2f} A"
+        )
         if moved_mm <= -MOVED_MM and abs(other_mm) < MOVED_MM / 2:
-            return seen
+            return unless((currents_A[0] > currents_A[1]) is not is_left, seen)
         if max(abs(moved_mm), abs(other_mm)) >= MOVED_MM:
             raise Unmet(seen)
     raise Unmet(f"{seen}, {shown(host.status)}")
@@ -213,6 +219,7 @@ def has_to_let_go(host: Host) -> str:
 
     Raises Unmet where RUN comes before the Drive OFF, or not after it.
     """
+    host.hello(beat=Beat.RUN)  # a host says one every second
     start = host.last(State)
     for _ in range(round(SEEN_S / PERIOD_S)):
         host.beat(Beat.RUN, REFUSED_DUTY, REFUSED_DUTY)

@@ -46,6 +46,7 @@ from firmware_protocol.conformance.examination import CHECKS, checks_on
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 from firmware_protocol.conformance.overall import left_open
+from firmware_protocol.conformance.running import mismatch_in_every_mode
 from firmware_protocol.conformance.silence import any_uptime
 from firmware_protocol.framing import DELIMITER, FrameDecoder, cobs_decode, cobs_encode, encode_frame
 from tormagd.simulation.can_device import DEVICE, CanDevice
@@ -141,7 +142,7 @@ def passed(line: Line, checks: Sequence[Check] = CHECKS) -> set[str]:
     return {result.check.name for result in results}
 
 
-LONG = (*stroke.CHECKS, *opening.CHECKS, any_uptime, left_open)
+LONG = (mismatch_in_every_mode, *stroke.CHECKS, *opening.CHECKS, any_uptime, *bench.CHECKS, left_open)
 """What takes long, and is the same on every carrier and, to the bit, in either language."""
 SHORT = [one for one in CHECKS if one not in LONG or one is left_open]
 
@@ -928,7 +929,7 @@ PLANTED = (
     rogue("timeout not armed before a duty", "silence_is_noticed", ticks=blind_while(has_no_duty_yet)),
     rogue("timeout judged with Status", "silence_is_noticed", ticks=blind_while(every_20_ms)),
     rogue("opens half the way", "off_opens_fully", ticked=stops_after(0.8)),
-    rogue("opens at 3 mm/s", "off_opens_fully", before=sets(object, _retract_mm_s=3.0)),
+    rogue("opens at 5 mm/s", "off_opens_fully", before=sets(object, _retract_mm_s=5.0)),
     rogue(
         "opens at full duty",
         "retract_opens_fully",
@@ -1007,6 +1008,14 @@ PLANTED = (
         "duty_makes_speed",
         shows=lambda device, _, status: (
             None if is_running(device) and abs(device.real.output.left_duty) > 0.8 else status
+        ),
+    ),
+    rogue("a Hello lets go", "let_go_after_retract", before=sets(Hello, _may_run=True)),
+    rogue(
+        "currents swapped",
+        "left_duty",
+        measures=sensed(
+            lambda sense: sense.replaced(left_current_A=sense.right_current_A, right_current_A=sense.left_current_A)
         ),
     ),
     rogue("equal counters with other duties", "repeated_drive", before=other_payload),
