@@ -25,6 +25,7 @@ MAY_IMPORT = {
     "output": set(),
     "command_line": {"named_file", "output"},
     "exact": set(),
+    "following": {"messages"},
     "keeping": set(),
     "slices": set(),
     "interrupt": set(),
@@ -40,15 +41,16 @@ MAY_IMPORT = {
     "assembly": DECIDES | {"messages", "exact", "keeping", "control"},
     "daemon": LOWEST
     | FILES
-    | {"command_line", "output", "keys", "keeping", "slices"}
+    | {"command_line", "following", "output", "keys", "keeping", "slices"}
     | {"inverse", "scenes", "safety", "hardware", "control", "assembly"},
-    "recording": FILES | {"messages", "output", "keeping"},
+    "recording": FILES | {"following", "messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
-    "dashboard": {"client", "messages", "output", "recording", "safety"},
+    "dashboard": {"client", "following", "messages", "output", "recording", "safety"},
     "ctl": FILES
     | {
         "command_line",
         "dashboard",
+        "following",
         "force_file",
         "client",
         "config",

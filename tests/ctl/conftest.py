@@ -240,7 +240,8 @@ class FakeDaemon(threading.Thread):
             telemetry_out.send(encode(telemetry(seq, t_ns)))
             telemetry_out.send_multipart([MOTION_TOPIC, encode(MOTION)])
             telemetry_out.send_multipart([VERDICT_TOPIC, encode(VERDICT)])
-            rows = [(t_ns + k * 1_000_000, 1.5, 1.5, 1.5 + 0.1 * math.sin(k), 35.0, 36.0, 0.1, -0.1) for k in range(20)]
+            felt_N = [1.5 + 0.1 * math.sin(seq + k) for k in range(20)]
+            rows = [(t_ns + k * 1_000_000, 1.5, 1.5, felt_N[k], 35.0, 36.0, 0.1, -0.1) for k in range(20)]
             recording.send(msgpack.packb({"v": VERSION, "columns": COLUMNS, "rows": rows}))
             for data in self.rubbish:
                 recording.send(data)

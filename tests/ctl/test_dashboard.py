@@ -181,11 +181,11 @@ async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Rec
 
 def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     about = recorded.about
-    assert (about["kind"], about["scene"], about["duration_s"], about["following"]["rms_N"]) == (
+    assert (about["kind"], about["scene"], about["duration_s"], about["followed"]) == (
         "recording",
         "pulse",
         pytest.approx(SECONDS, abs=0.1),
-        pytest.approx(0.01),
+        "to 10 mN RMS, without a delay",
     )
     assert msgspec.to_builtins(about["portrait"]) == {name: tuple(values) for name, values in PORTRAIT.items()}
     assert (about["overview"]["limits"], about["overview"]["marks"]) == ([pytest.approx((5.0, 7.0))], [])

@@ -21,7 +21,7 @@ def file(tmp_path):
 
 def test_record_then_plot(fake_daemon, tmp_path, ctl):
     file, picture = tmp_path / "a.mcap", tmp_path / "a.png"
-    result = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "0.3").ended(0).result
+    result = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "2").ended(0).result
     recording = RecordingFile(file)
     assert recording.is_complete
     assert recording.overview.ticks == result["ticks"] > 0
@@ -36,7 +36,9 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl):
 def test_the_plot_of_a_cut_recording_says_so(fake_daemon, tmp_path, ctl, file):
     assert main(["--endpoint", fake_daemon.control, "record", str(file), "--duration", "0.3"]) == 0
     file.write_bytes(file.read_bytes()[:-40])
-    assert "a.mcap was cut short" in ctl("plot", str(file), "-o", str(tmp_path / "a.png")).ended(0).out
+    assert (
+        "cut short: its recorder did not end it" in ctl("plot", str(file), "-o", str(tmp_path / "a.png")).ended(0).out
+    )
 
 
 def test_a_daemon_that_does_not_say_what_it_runs_is_not_recorded(fake_daemon, tmp_path, ctl):
@@ -121,6 +123,20 @@ def test_a_report_is_one_page_of_one_recording_or_of_two(fake_daemon, tmp_path, 
     assert ["<b>" in both, "&lt;b&gt;" in both, *re.findall("https?://|<script", both)] == [False, True]
     assert ctl("--json", "report", str(file), str(tmp_path / "no.mcap"), "-o", str(page)).ended(2).error["hint"]
     assert ctl("--json", "report", *[str(file)] * 3, "-o", str(page)).ended(2).error["hint"]
+
+
+def test_a_recording_whose_key_is_not_here_is_shown_and_does_not_pass_for_sound(fake_daemon, tmp_path, ctl):
+    folder, key, keyed = tmp_path / "r", tmp_path / "key", tmp_path / "keyed.toml"
+    folder.mkdir()
+    key.write_bytes(b"k" * 16)
+    keyed.write_text(f'[recordings]\nkey = "{key}"\n')
+    made = ctl("--config", str(keyed), *fake_daemon.at, "--json", "record", str(folder), "--duration", "0.3").ended(0)
+    file, page, picture = made.result["file"], tmp_path / "a.html", str(tmp_path / "a.png")
+    for command in (("report", file, "-o", str(page)), ("plot", file, "-o", picture)):
+        assert "sealed with a key that is not here: it was not checked" in ctl(*command).ended(1).out
+        assert "whole: all" in ctl("--config", str(keyed), *command).ended(0).out
+    assert "it cannot be checked" in ctl("recordings", "list", str(folder)).ended(0).out
+    assert "checked" not in ctl("--config", str(keyed), "recordings", "list", str(folder)).ended(0).out
 
 
 def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, ctl):

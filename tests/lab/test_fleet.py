@@ -29,11 +29,11 @@ SCENE = json.dumps({"insert": {"name": "MRE-50-40"}})
 
 
 def write(path: Path, serial_number: int, day: int, error_N: float, trim: float) -> None:
-    """100 ms: RATE for the first half of it."""
+    """2 s: RATE for the first half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     begin_ns = (START_S + day * DAY_S) * 10**9
     rows = tuple(
-        (begin_ns + k * 10**6, 1.5, 1.5 + error_N, "ENABLED", ("RATE",) if k < 50 else (), (), trim, 0.5)
+        (begin_ns + k * 20 * 10**6, 1.5, 1.5 + error_N, "ENABLED", ("RATE",) if k < 50 else (), (), trim, 0.5)
         for k in range(100)
     )
     with RecordingWriter(path, {"serial_number": str(serial_number), "scene": SCENE}) as writer:
@@ -97,7 +97,7 @@ def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
     first, second = (read(str(tmp_path / f"{error_N}.mcap")) for error_N in (0.01, 0.03))
     assert not isinstance(first, str)
     assert not isinstance(second, str)
-    (console,) = consoles([msgspec.structs.replace(first, enabled_s=0.3), second])
+    (console,) = consoles([msgspec.structs.replace(first, enabled_s=6.0), second])
     assert (console.tracking_rms_N, console.worst_rms_N) == pytest.approx((((3 * 0.01**2 + 0.03**2) / 4) ** 0.5, 0.03))
     assert console.trim == Drift(1.0, 1.0, None)
 
@@ -164,7 +164,8 @@ def test_the_time_enabled_is_what_counts(written):
         True,
         START_NS * 1e-9,
     )
-    assert (found.duration_s, found.enabled_s, found.tracking_rms_N) == pytest.approx((0.119, 0.05, 0.02))
+    # too little was followed to say how well
+    assert (found.duration_s, found.enabled_s, found.tracking_rms_N) == pytest.approx((0.119, 0.05, None))
     assert (found.limits_s, found.faults_at_s, found.trim, found.late_p99_us) == (
         {"RATE": pytest.approx(0.01)},
         {"SKEW": pytest.approx(0.1)},

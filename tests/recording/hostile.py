@@ -15,6 +15,7 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex
 from mcap.writer import Writer
 
 from tormagd.recording.stream import MAGIC
+from tormagd.recording.writer import OVERVIEW
 
 NESTED = b"[" * 100_000 + b"]" * 100_000
 
@@ -101,12 +102,12 @@ FILES: dict[str, Callable[[], bytes]] = {
     "an index that points into itself": lambda: ended(
         CHANNEL,
         Channel(1, "/ticks", "json", {}, 0),
-        AttachmentIndex(8, 9, 0, 0, 1, "overview", "x"),
+        AttachmentIndex(8, 9, 0, 0, 1, OVERVIEW, "x"),
         ChunkIndex(9, 8, "", 1, 9, 0, {}, 0, 9),
     ),
     "an overview of rubbish": lambda: ended(
-        record(Attachment(0, 0, "overview", "x", b"\xdd\xff\xff\xff\xff" * 1_000)),
-        AttachmentIndex(8, 9, 0, 0, 1, "overview", "x"),
+        record(Attachment(0, 0, OVERVIEW, "x", b"\xdd\xff\xff\xff\xff" * 1_000)),
+        AttachmentIndex(8, 9, 0, 0, 1, OVERVIEW, "x"),
     ),
     "a summary that is the file": lambda: ended(CHANNEL * 3, at=8),
     "a message without a chunk, too short": lambda: MAGIC + CHANNEL + struct.pack("<BQ", Opcode.MESSAGE, 3) + b"abc",

@@ -7,11 +7,15 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from sent import START_NS, back, batch, telemetry
 
-from tormagd.recording.overview import MOST_STRETCHES, Codes, Curves, Glance, OverviewBuilder, unpacked
+from tormagd.recording.overview import MOST_STRETCHES, Codes, Curves, Glance, Overview, OverviewBuilder, unpacked
+from tormagd.recording.plot import figure
 from tormagd.recording.reader import RecordingFile
-from tormagd.recording.writer import THINNED, RecordingWriter
+from tormagd.recording.seal import State
+from tormagd.recording.writer import OVERVIEW, THINNED, RecordingWriter
 from tormagd_client.messages import Mark
 
 COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "left_mm", "right_mm", "operating_state", "limits", "faults", "tick")
@@ -58,12 +62,45 @@ def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path:
     assert overview.spans_s("operating_state")["FAULT"] == [pytest.approx((25.0, 30.0), abs=1e-6)]
 
 
+def rewritten(path: Path, target: Path, overview: Overview) -> Path:
+    """The same messages by the usual writer, without seals, and with another overview."""
+    with path.open("rb") as source, target.open("wb") as made:
+        writer, channels = Writer(made), {}
+        writer.start()
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.add_attachment(0, 0, OVERVIEW, "application/msgpack", overview.packed())
+        writer.finish()
+    return target
+
+
+def test_an_overview_that_nothing_vouches_for_is_not_shown(path: Path, tmp_path: Path) -> None:
+    own = RecordingFile(path).overview
+    no_fault = msgspec.structs.replace(own, codes=own.codes | {"faults": {}}, end_ns=own.start_ns)
+    unsealed = rewritten(path, tmp_path / "unsealed.mcap", no_fault)
+    spoilt = tmp_path / "spoilt.mcap"
+    assert own.packed() != no_fault.packed()
+    spoilt.write_bytes(path.read_bytes().replace(b"\xa4SKEW", b"\xa4SHOW"))
+    for file, state in ((unsealed, State.UNSEALED), (spoilt, State.ALTERED)):
+        known = RecordingFile(file)
+        assert (known.seal.state, list(known.overview.codes["faults"])) == (state, ["SKEW"])
+        assert known.overview.end_ns == own.end_ns
+    assert RecordingFile(spoilt).notes[0].startswith("altered or damaged: the bytes ")
+
+
 def test_neither_approach_nor_decay_is_in_how_well_a_force_was_followed(path: Path) -> None:
     """A sine of 0.3 N that is 20 ms late is 2 sin(pi * 0.02) * 0.3 / sqrt(2) off."""
-    known = RecordingFile(path).overview.following
+    overview = RecordingFile(path).overview
+    known = overview.following
     assert known.rms_N == pytest.approx(0.6 * math.sin(0.02 * math.pi) / math.sqrt(2.0), rel=0.01)
-    assert (known.seconds, known.delay_ms) == (pytest.approx(24.0, abs=0.1), 20.0)
+    assert (overview.followed_s, known.delay_ms) == (pytest.approx(23.6, abs=0.1), 20.0)
     assert known.aligned_rms_N == pytest.approx(0.0, abs=1e-9)
+    # the sensor's noise is in the figure, and whoever reads it has to know
+    said = "followed to 27 mN RMS, 0 mN with a delay of 20 ms taken out (sensor noise included)"
+    assert said in figure(overview, "").get_suptitle()
 
 
 def test_any_seconds_of_it_are_those_of_the_whole(path: Path) -> None:

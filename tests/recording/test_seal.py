@@ -3,6 +3,7 @@
 import random
 from pathlib import Path
 
+import hostile
 import pytest
 from mcap.reader import make_reader
 from sent import batch, telemetry
@@ -103,7 +104,12 @@ def test_who_has_no_key_cannot_seal(tmp_path: Path, sealed: Path) -> None:
     keyed = write(tmp_path / "k.mcap", 1.5, KEY)
     assert verified(keyed, KEY).state is State.WHOLE
     assert verified(keyed, KEY[::-1]).state is State.ALTERED
-    assert verified(keyed).state is State.OTHER_KEY
+    unchecked = verified(keyed)
+    assert (unchecked.state, unchecked.is_sound) == (State.OTHER_KEY, False)
+    assert "it was not checked" in unchecked.text()
+    # whose seals were taken away
+    (tmp_path / "bare.mcap").write_bytes(hostile.messages(b"{}"))
+    assert [verified(tmp_path / "bare.mcap", key).is_sound for key in (KEY, b"")] == [False, True]
     # sealed anew by somebody who changed it
     assert verified(sealed, KEY).state is State.NO_KEY
     (tmp_path / "key").write_bytes(KEY + b"\n")

@@ -309,8 +309,8 @@ COMMANDS = {
     ),
     "plot": Command(
         "draw a recording: forces, gap, duty, limits and faults",
-        "plot.plot",
-        (),
+        "report.plot",
+        ("config",),
         (
             option("source", type=Path, metavar="FILE.mcap"),
             option("-o", "--output", dest="target", type=Path, required=True, metavar="FILE.png"),
@@ -328,7 +328,7 @@ COMMANDS = {
     "dashboard": Command(
         "a page for the browser on this machine: the daemon live, or a recording to scrub through",
         "dashboard.dashboard",
-        ("endpoints", "wait_s"),
+        ("config", "endpoints", "wait_s"),
         (
             option("path", type=Path, nargs="?", metavar="FILE.mcap", help="the recording; live without"),
             option("--port", type=port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: one that is free"),

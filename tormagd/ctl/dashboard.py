@@ -6,24 +6,25 @@ import sys
 import time
 from pathlib import Path
 
+from tormagd.config import Config
 from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
+from tormagd.ctl.report import opened
 from tormagd.dashboard.live import Live
 from tormagd.dashboard.recorded import Recorded
 from tormagd.dashboard.server import LOOPBACK, serve
 from tormagd.output import write_line
-from tormagd.recording.reader import RecordingFile
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import Endpoints
 
 
-def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
+def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
     """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording.
 
     Raises CommandError (USAGE) where the port is taken or the recording cannot be read, and as `AsyncClient.status`.
     """
     start_s = time.monotonic()
     try:
-        asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(path, port))
+        asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(config, path, port))
     except OSError as error:
         raise usage_error(
             f"{LOOPBACK}:{port}: {error.strerror}", "give another --port; 0 takes one that is free"
@@ -44,9 +45,10 @@ async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
             listening.cancel()
 
 
-async def _recorded(path: Path, port: int) -> None:
-    with as_usage_error(ValueError, hint="give a file that tormagctl record has made"):
-        shown = Recorded(RecordingFile(path))
+async def _recorded(config: Config, path: Path, port: int) -> None:
+    (file,) = opened(config, [path])
+    with as_usage_error(ValueError, hint="give a recording with data"):
+        shown = Recorded(file)
     await serve(shown, port, _ready)
 
 

@@ -9,8 +9,8 @@ from tormagd.config import Config
 from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.record import budget_of, key_of
 from tormagd.recording.folder import RecordingFolder, Segment, mark as mark_segment
-from tormagd.recording.reader import RecordingError, RecordingFile
-from tormagd.recording.seal import verified
+from tormagd.recording.reader import RecordingError, summary_of
+from tormagd.recording.seal import State, verified
 from tormagd_client.blocking import Client
 
 
@@ -35,7 +35,7 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
             folder = RecordingFolder(path or Path(config.recordings.folder), budget_of(config.recordings))
             if not folder.path.is_dir():
                 raise usage_error(f"{folder.path}: no such folder", "name the folder, or set [recordings] folder")
-            return _list(folder) if action == "list" else _prune(folder)
+            return _list(folder, config.recordings.key) if action == "list" else _prune(folder)
         if path is None:
             raise usage_error(f"{action}: no recording is named", f"tormagctl recordings {action} FILE.mcap")
         if action == "mark":
@@ -44,9 +44,12 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
         return _export(path, target, key_of(config))
 
 
-def _list(folder: RecordingFolder) -> Outcome:
-    """Describe each segment of the folder, and say their total size; damaged ones are listed with the reason."""
-    rows = [_row(segment) for segment in folder.segments()]
+def _list(folder: RecordingFolder, key: str) -> Outcome:
+    """Describe each segment of the folder, and say their total size; damaged ones are listed with the reason.
+
+    Seals are not checked: that takes reading all. Where no `key` is configured, those that have one say so.
+    """
+    rows = [_row(segment, bool(key)) for segment in folder.segments()]
     size_MB = sum(row["MB"] for row in rows)
     lines = [
         f"{row['name']:<44} {row['MB']:9.1f} MB {row['seconds'] or 0.0:9.1f} s  "
@@ -57,27 +60,31 @@ def _list(folder: RecordingFolder) -> Outcome:
     return Outcome({"folder": str(folder.path), "recordings": rows, "MB": size_MB}, "\n".join([*lines, total]))
 
 
-def _row(segment: Segment) -> dict[str, Any]:
-    """Describe one segment by its overview: size, duration, faults, marks; where it cannot be read, `said` tells
-    why."""
-    row: dict[str, Any] = {
+def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
+    """Describe one segment by its overview; without one, `said` tells why."""
+    seconds, faults, marks = None, [], []
+    try:
+        known = summary_of(segment.path)
+    except RecordingError as error:
+        said = [str(error).removeprefix(f"{segment.path}: ")]
+    else:
+        said = ["no overview: its recorder did not end it, or is older"]
+        if known is not None:
+            contents, overview = known
+            seconds = round(overview.duration_s, 3)
+            faults, marks = list(overview.spans_s("faults")), [each.text for each in overview.marks]
+            unchecked = [f"{State.OTHER_KEY}: it cannot be checked"] if contents.is_keyed and not has_key else []
+            said = [*unchecked, *faults, *(f"“{text}”" for text in marks)]
+    return {
         "name": segment.path.name,
         "began_s": segment.began_s,
         "MB": round(segment.bytes / 1e6, 3),
         "is_marked": segment.is_marked,
-        "seconds": None,
-        "faults": [],
-        "marks": [],
-        "said": "",
+        "seconds": seconds,
+        "faults": faults,
+        "marks": marks,
+        "said": ", ".join(said),
     }
-    try:
-        known = RecordingFile(segment.path, is_scanned=False)
-    except RecordingError as error:
-        return row | {"said": str(error).removeprefix(f"{segment.path}: ")}
-    overview = known.overview
-    faults, marks = list(overview.spans_s("faults")), [each.text for each in overview.marks]
-    said = ", ".join([*faults, *(f"“{text}”" for text in marks)])
-    return row | {"seconds": round(overview.duration_s, 3), "faults": faults, "marks": marks, "said": said}
 
 
 def _prune(folder: RecordingFolder) -> Outcome:

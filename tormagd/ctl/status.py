@@ -6,12 +6,12 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
+from tormagd.following import in_words
 from tormagd_client.blocking import Client
 from tormagd_client.messages import (
     BeliefReport,
     ClockReport,
     Explained,
-    FollowingReport,
     LinkReport,
     PeersReport,
     RateReport,
@@ -61,7 +61,7 @@ def status_text(known: Status, colour: Colour) -> str:
         f"force     asked {_number(known.setpoint_cf, 'N')}{_long_ago(known)}, "
         f"governed {_number(known.governed_cf, 'N')}, measured {_number(known.measured_cf, 'N')}"
         f"{torque(known.measured_cf, known.roller_radius_mm)}",
-        *_said("followed  ", followed(known.following), str),
+        *_said("followed  ", in_words(known.following), str),
         f"gap       {_number(known.gap_mm, 'mm', 2)}, wanted {_number(known.gap_setpoint_mm, 'mm', 2)}, "
         f"skew {_number(known.skew_mm, 'mm', 3)}",
         f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
@@ -120,14 +120,6 @@ def _long_ago(known: Status) -> str:
     """Say how long ago the setpoint came, where that is over OLD_MS; empty for a recent one, or none."""
     age_ms = known.setpoint_age_ms
     return "" if known.setpoint_cf is None or age_ms is None or age_ms < OLD_MS else f" {age_ms * 1e-3:.0f} s ago"
-
-
-def followed(report: FollowingReport | None) -> str:
-    """Say how well the force was followed lately; empty for None."""
-    if report is None:
-        return ""
-    aligned = f"{report.aligned_rms_N * 1e3:.0f} mN with a delay of {report.delay_ms:.0f} ms taken out"
-    return f"to {report.rms_N * 1e3:.0f} mN RMS, {aligned if report.delay_ms else 'without a delay'}"
 
 
 def refused(not_granted: Iterable[str]) -> dict[str, str]:

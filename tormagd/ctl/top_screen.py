@@ -11,7 +11,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from tormagd.ctl.status import believed, followed, refused, torque
+from tormagd.ctl.status import believed, refused, torque
+from tormagd.following import in_words
 from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 
@@ -171,7 +172,7 @@ def _timing(status: Status, width: int) -> Table:
     if status.not_granted:
         lacking = f"did not grant {', '.join(map(printable, refused(status.not_granted)))}; next: tormagctl doctor"
         table.add_row(Text("kernel", "bold"), Text(lacking, "yellow"))
-    if how := followed(status.following):
+    if how := in_words(status.following):
         table.add_row(Text("followed", "bold"), how)
     table.add_row(
         Text("believed", "bold"), Text(printable(believed(status.belief)).replace("±", "+-") or "nothing that acts")

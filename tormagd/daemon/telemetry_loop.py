@@ -22,7 +22,6 @@ from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
-from tormagd.daemon.following import Following
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import Histogram, RateGroup
@@ -31,6 +30,7 @@ from tormagd.daemon.service import READY, Service, notify, status_line
 from tormagd.daemon.telemetry import snapshot, tick_record
 from tormagd.daemon.topics import Topics
 from tormagd.daemon.way import Way
+from tormagd.following import Following
 from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd_client.messages import (
@@ -56,6 +56,8 @@ TELL_S = 0.1
 "How often systemd, log and black box are seen to."
 REFRESHED = 2
 "Histograms whose percentiles are made anew each time."
+FORGETS_S = 5.0
+"After this time an error in following a force counts a third (1/e)."
 PORTRAIT_STEP = 5
 "Every fifth point of the portrait is told: it is smooth."
 
@@ -99,7 +101,7 @@ class TelemetryLoop:
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
         self._way = Way()
-        self._following = Following(1.0 / config.rates.telemetry_hz, core.scene.force.tolerance_rms_N)
+        self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
         self.topics = Topics(config, core, control, inference, endpoint)
         self.scene_change: SceneChange | None = None
         "What changes the scene; None until the daemon sets it."
@@ -115,7 +117,7 @@ class TelemetryLoop:
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
         """Publish and report on `core` from now on, with its configuration and profiles; reports are made anew."""
         self.config, self._core, self.topics.core, self._profiles = config, core, core, profiles
-        self._following = Following(1.0 / config.rates.telemetry_hz, core.scene.force.tolerance_rms_N)
+        self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
         self._status, self._reported_s = None, -math.inf
 
     def record(self, _beat: Beat) -> None:
@@ -154,7 +156,9 @@ class TelemetryLoop:
         self._left = max(self._left + self._beats_per_snapshot, 1)
         start_ns = time.monotonic_ns()
         endpoint, connections = self._endpoint, self._endpoint.admission.connections()
-        self._following.look(self._ticks[-1])
+        tick = self._ticks[-1]
+        forces_N, handle = (tick.setpoint_cf, tick.measured_cf), (tick.handle_mm, tick.handle_rate_mm_s)
+        self._following.look(tick.operating_state, tick.limits, *forces_N, *handle)
         # requests that wait now are answered with this snapshot; later ones wait for the next
         self._status, self._answers = None, min(endpoint.requests.count, REQUESTS)
         # no snapshot is packed without a listener

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from tormagd.dashboard.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
+from tormagd.following import in_words
 from tormagd.recording.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, Glance, codes_of, quantities
 from tormagd.recording.reader import RecordingFile, Seen
 from tormagd.safety.codes import FAULTS, LIMITS
@@ -97,16 +98,15 @@ class Recorded:
     def about(self) -> dict[str, Any]:
         """Return what the page begins with: name, times, scene, the force over the whole length, and what each code
         means."""
-        file, following = self._file, self._overview.following
+        file = self._file
         return {
             "kind": "recording",
             "name": file.path.name,
             "start_s": self._start_ns * 1e-9,
             "duration_s": self.duration_s,
-            "is_complete": file.is_complete,
-            "following": msgspec.to_builtins(following),
+            "notes": file.notes,
+            "followed": in_words(self._overview.following),
             "version": file.metadata.get("version", ""),
-            "thinned": file.metadata.get("thinned", ""),
             "scene": (file.described("scene", dict[str, Any]) or {}).get("name", ""),
             "portrait": file.described("portrait", PortraitReport),
             "overview": self._glance(),

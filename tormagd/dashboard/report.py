@@ -6,16 +6,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from tormagd.dashboard.recorded import believed, moments
+from tormagd.following import in_words
 from tormagd.recording.overview import BREAK_NS, LATE_US, Codes
-from tormagd.recording.plot import figure, followed, picture
+from tormagd.recording.plot import figure, picture
 from tormagd.recording.reader import RecordingFile
-from tormagd.recording.seal import Verdict
-from tormagd.recording.writer import CUT, THINNED
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation
 
 STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:80rem;margin:2rem auto;padding:0 1rem}
@@ -26,17 +25,10 @@ MAX_TOLD = 20
 "How many moments of one fault are listed."
 
 
-class Reported(NamedTuple):
-    """A recording, and the verdict of its seals."""
-
-    file: RecordingFile
-    seal: Verdict
-
-
-def report(of: Sequence[Reported]) -> str:
+def report(of: Sequence[RecordingFile]) -> str:
     """Return one HTML page on these recordings, side by side. Raises ValueError for a recording without messages, also
     where its end cannot be read again."""
-    names = [each.file.path.name for each in of]
+    names = [each.path.name for each in of]
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
         *(_sealed(each) for each in of),
@@ -59,75 +51,72 @@ def report(of: Sequence[Reported]) -> str:
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>\n'
 
 
-def _sealed(of: Reported) -> str:
-    """Say in HTML what the seals tell, and why a recording was cut or thinned; one that is not sound is marked as
-    bad."""
+def _sealed(of: RecordingFile) -> str:
+    """Say in HTML what the seals tell, and what else is noted."""
     kind = "" if of.seal.is_sound else ' class="bad"'
-    cut = of.file.metadata.get(CUT, "")
-    notes = [cut and f"cut by: {cut}", of.file.metadata.get(THINNED, "") and f"thinned: {of.file.metadata[THINNED]}"]
-    said = ". ".join([f"{of.file.path.name} is {of.seal.text()}", *filter(None, notes)])
-    return f"<p{kind}>{escape(said)}.</p>"
+    said = ". ".join(dict.fromkeys([of.seal.text(), *of.notes]))
+    return f"<p{kind}>{escape(f'{of.path.name} is {said}')}.</p>"
 
 
-def _succession(of: Sequence[Reported]) -> list[str]:
+def _succession(of: Sequence[RecordingFile]) -> list[str]:
     """Say in HTML which recordings follow each other, by the seals' digests; empty where none do."""
-    names = {each.seal.last: each.file.path.name for each in of if each.seal.last}
-    known = [(each.file.path.name, names[each.seal.follows]) for each in of if each.seal.follows in names]
+    names = {each.seal.last: each.path.name for each in of if each.seal.last}
+    known = [(each.path.name, names[each.seal.follows]) for each in of if each.seal.follows in names]
     return [f"<p>{escape(name)} begins where {escape(before)} ends.</p>" for name, before in known]
 
 
-def _figures(of: Sequence[Reported]) -> list[list[str]]:
+def _figures(of: Sequence[RecordingFile]) -> list[list[str]]:
     """Return the table's rows: for each recording its times, forces, counts, scene and device."""
 
-    def known(each: Reported) -> dict[str, str]:
-        overview, file = each.file.overview, each.file
-        scene = file.described("scene", dict[str, Any]) or {}
+    def known(each: RecordingFile) -> dict[str, str]:
+        overview = each.overview
+        scene = each.described("scene", dict[str, Any]) or {}
         began = datetime.fromtimestamp(overview.start_ns * 1e-9, UTC)
         states = overview.codes["operating_state"]
         return {
             "began": f"{began:%Y-%m-%d %H:%M:%S} UTC",
             "lasts": f"{overview.duration_s:.1f} s",
             "enabled": f"{states['ENABLED'].held_ns * 1e-9:.1f} s" if "ENABLED" in states else "never",
-            "followed for": f"{overview.following.seconds:.1f} s",
-            "how well": followed(overview.following) or "nothing was followed",
+            "followed for": f"{overview.followed_s:.1f} s",
+            "how well": in_words(overview.following) or "nothing was followed",
             "asked": _range(each, "setpoint_cf"),
             "felt": _range(each, "measured_cf"),
             "ticks, snapshots": f"{overview.ticks:,}, {overview.snapshots:,}",
             "scene": str(scene.get("name", "")),
-            "device": file.metadata.get("serial_number", ""),
-            "tormagd": f"{file.metadata.get('version', '')} {file.metadata.get('build', '')}",
+            "device": each.metadata.get("serial_number", ""),
+            "tormagd": f"{each.metadata.get('version', '')} {each.metadata.get('build', '')}",
         }
 
     return _rows([known(each) for each in of])
 
 
-def _range(of: Reported, name: str) -> str:
+def _range(of: RecordingFile, name: str) -> str:
     """Say the range of a quantity over the recording, N."""
-    known = of.file.overview.series(name)
+    known = of.overview.series(name)
     if known is None:
         return "not recorded"
     return f"{np.nanmin(known.low):.3f} to {np.nanmax(known.high):.3f} N"
 
 
-def _picture(of: Reported) -> str:
-    name = of.file.path.stem
-    png = base64.b64encode(picture(figure(of.file.overview, name, of.file.is_complete), "png")).decode()
+def _picture(of: RecordingFile) -> str:
+    name = of.path.stem
+    png = base64.b64encode(picture(figure(of.overview, name, of.notes), "png")).decode()
     return f'<p><img alt="force, gap, duty, limits and faults of {escape(name)}" src="data:image/png;base64,{png}"></p>'
 
 
 def _codes(
-    of: Sequence[Reported], kind: str, explained: Mapping[Any, Explanation], told: Callable[[Codes, float], str]
+    of: Sequence[RecordingFile], kind: str, explained: Mapping[Any, Explanation], told: Callable[[Codes, float], str]
 ) -> str:
     """Return a table of the codes of a kind: for each recording when or how long (`told`), then why, and what to do."""
-    names = dict.fromkeys(code for each in of for code in each.file.overview.codes[kind])
+    names = dict.fromkeys(code for each in of for code in each.overview.codes[kind])
     texts = {str(code): known for code, known in explained.items()}
     rows = []
     for code in names:
-        known = [(each.file.overview.codes[kind].get(code), each.file.overview.duration_s) for each in of]
+        known = [(each.overview.codes[kind].get(code), each.overview.duration_s) for each in of]
         why = texts.get(code)
         when = ["" if codes is None else told(codes, lasts_s) for codes, lasts_s in known]
         rows.append([code, *when, why.cause if why else "", why.remedy if why else ""])
-    return _table(["", *(each.file.path.name for each in of), "why", "what to do"], rows)
+    return _table(["", *(each.path.name for each in of), "why", "what to do"], rows)
 
 
 def _held(codes: Codes, lasts_s: float) -> str:
@@ -142,24 +131,24 @@ def _moments(codes: Codes, _lasts_s: float) -> str:
     return "at " + ", ".join(f"{begin * 1e-9:.2f}" for begin, _ in codes.spans_ns[:MAX_TOLD]) + f" s{more}"
 
 
-def _marks(of: Sequence[Reported]) -> list[list[str]]:
+def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
     """Return a row for each mark, its text in its recording's column."""
     rows = []
     for place, each in enumerate(of):
-        for mark in each.file.overview.marks:
+        for mark in each.overview.marks:
             cells = [""] * len(of)
             cells[place] = mark.text
-            rows.append([f"{(mark.t_ns - each.file.overview.start_ns) * 1e-9:.2f} s", *cells])
+            rows.append([f"{(mark.t_ns - each.overview.start_ns) * 1e-9:.2f} s", *cells])
     return rows
 
 
-def _belief(of: Sequence[Reported]) -> list[list[str]]:
+def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
     """Return a row for each quantity that was believed and acted at a recording's end."""
     found = []
     for each in of:
-        end_ns = each.file.overview.end_ns
-        _, snapshots = moments(each.file, end_ns - BREAK_NS, end_ns)
-        told = believed(snapshots, each.file.overview.duration_s)
+        end_ns = each.overview.end_ns
+        _, snapshots = moments(each, end_ns - BREAK_NS, end_ns)
+        told = believed(snapshots, each.overview.duration_s)
         found.append(
             {
                 name: f"{it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'} {it.unit}"
@@ -170,10 +159,10 @@ def _belief(of: Sequence[Reported]) -> list[list[str]]:
     return _rows(found)
 
 
-def _lateness(of: Sequence[Reported]) -> list[list[str]]:
+def _lateness(of: Sequence[RecordingFile]) -> list[list[str]]:
     """Return a row for each bar of the lateness histogram."""
     bars = [f"under {LATE_US[0]:g}", *(f"{a:g} to {b:g}" for a, b in pairwise(LATE_US))]
-    counts = [each.file.overview.late_counts for each in of]
+    counts = [each.overview.late_counts for each in of]
     return [[bar, *(f"{of_one[i]:,}" for of_one in counts)] for i, bar in enumerate([*bars, f"over {LATE_US[-1]:g}"])]
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from tormagd.recording.following import Followed, Following
-from tormagd_client.messages import Mark
+from tormagd.following import PERIOD_S, Following
+from tormagd_client.messages import FollowingReport, Mark
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +41,7 @@ CODE = re.compile(r"[A-Za-z0-9_.:?-]{1,64}")
 ODD = re.compile(r"[^A-Za-z0-9_.:?-]")
 OTHER = "OTHER"
 "Stands for codes beyond MOST_CODES."
+_LOOK_NS = round(PERIOD_S * 1e9)
 LATE_US = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1_000.0, 2_000.0, 5_000.0)
 "Where one bar of the lateness histogram ends and the next begins."
 
@@ -67,6 +68,9 @@ class Glance(TypedDict, total=False):
     operating_state: Word | None
     limits: Words | None
     faults: Words | None
+    handle_mm: float | None
+    handle_rate_mm_s: float | None
+    handle_mm_s: float | None
     lateness_us: float | None
     mark: Mark | None
 
@@ -112,7 +116,9 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     of_snapshots: Curves
     codes: dict[str, dict[str, Codes]]
     "By kind, then by code in the order of their first appearance."
-    following: Followed
+    following: FollowingReport | None
+    followed_s: float
+    "Time over which it was followed; `following` is None where that is too short."
     late_counts: list[int]
     marks: list[Mark]
 
@@ -181,7 +187,7 @@ class OverviewBuilder:
         self._end_ns = 0
         self._stretches = {True: _Stretches(), False: _Stretches()}
         self._spans = {True: _Codes(), False: _Codes()}
-        self._following = {True: Following(), False: Following()}
+        self._following = {True: _Followed(), False: _Followed()}
         self._counts = {True: 0, False: 0}
         self._late = [0] * (len(LATE_US) + 1)
         self._marks: list[Mark] = []
@@ -219,6 +225,7 @@ class OverviewBuilder:
         for each in self._stretches.values():
             each.widen(width_ns)
         ticks, snapshots = self._spans[True].made(), self._spans[False].made()
+        followed = self._following[self._following[True].counted_s > 0.0]
         return Overview(
             start_ns=self._start_ns or 0,
             end_ns=self._end_ns,
@@ -228,7 +235,8 @@ class OverviewBuilder:
             of_ticks=self._stretches[True].made(),
             of_snapshots=self._stretches[False].made(),
             codes={kind: ticks[kind] or snapshots[kind] for kind in KINDS},
-            following=self._following[True].made() or self._following[False].made() or Followed(),
+            following=followed.report(),
+            followed_s=followed.counted_s,
             late_counts=self._late,
             marks=self._marks,
         )
@@ -276,6 +284,24 @@ def _codes(told: object) -> tuple[str, ...]:
 
 def _numbers(data: bytes) -> Floats:
     return np.array(np.frombuffer(data, np.float32), np.float64)
+
+
+class _Followed(Following):
+    """How well the force of one kind of message was followed, looked at every PERIOD_S."""
+
+    _number = 0
+
+    def add(self, since_ns: int, asked_N: float | None, measured_N: float | None, message: Mapping[str, Any]) -> None:
+        """Look at a message where the next look is due; over BREAK_NS after the last one the way begins anew."""
+        number = since_ns // _LOOK_NS
+        if number == self._number:
+            return
+        if not 0 < number - self._number <= BREAK_NS // _LOOK_NS:
+            self.begin()
+        self._number, get = number, message.get
+        rate_mm_s = get("handle_rate_mm_s", get("handle_mm_s"))
+        limits = get("limits") or ()
+        self.look(get("operating_state"), limits, asked_N, measured_N, get("handle_mm"), rate_mm_s)
 
 
 class _Stretches:

@@ -1,6 +1,7 @@
 """One picture of a recording: what was asked, what was rendered, and what held the force back."""
 
 import io
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import cycle
 from pathlib import Path
@@ -11,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tormagd.bounded_file import in_place_of
-from tormagd.recording.following import Followed
+from tormagd.following import in_words
 from tormagd.recording.overview import BREAK_S, Overview, Series
 
 FORMATS = (".png", ".svg", ".pdf")
@@ -42,10 +43,10 @@ Spans = dict[str, list[tuple[float, float]]]
 "By code, the stretches of time it was there, seconds from the start."
 
 
-def figure(overview: Overview, title: str, is_complete: bool = True) -> Figure:
+def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
     """Draw a recording as four panels over one time axis: force, gap, duty, and lanes for state, limits and faults.
 
-    `is_complete` False adds "recording cut short" to the title. Raises ValueError for a recording without messages.
+    The headline has `title`, and a line for each of `notes`. Raises ValueError for a recording without messages.
     """
     overview.require_messages()
     states, limits, faults = (overview.spans_s(kind) for kind in ("operating_state", "limits", "faults"))
@@ -78,7 +79,7 @@ def figure(overview: Overview, title: str, is_complete: bool = True) -> Figure:
 
     when = datetime.fromtimestamp(overview.start_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     lane.set_xlabel(f"seconds since {when}")
-    fig.suptitle(_headline(overview, title, is_complete), x=0.01, ha="left", fontsize=13, fontweight="bold")
+    fig.suptitle(_headline(overview, title, notes), x=0.01, ha="left", fontsize=13, fontweight="bold")
     lane.set_xlim(0.0, max(overview.duration_s, 1e-3))
     return fig
 
@@ -101,26 +102,12 @@ def save_plot(drawn: Figure, path: Path) -> None:
         unfinished.write_bytes(data)
 
 
-def followed(known: Followed) -> str:
-    """Say in words how well the force was followed; empty where nothing was."""
-    if known.rms_N is None:
-        return ""
-    text = f"measured minus asked while following {known.rms_N * 1e3:.0f} mN rms"
-    if known.aligned_rms_N is not None:
-        text += f", {known.aligned_rms_N * 1e3:.0f} aligned by {known.delay_ms:.0f} ms"
-    return text
-
-
-def _headline(overview: Overview, title: str, is_complete: bool) -> str:
-    """Name title, faults, a cut recording, and on a second line how well the force was followed."""
+def _headline(overview: Overview, title: str, notes: Sequence[str]) -> str:
+    """Name title and faults; on lines of their own how well the force was followed, and what is noted."""
     names = ", ".join(overview.spans_s("faults"))
-    told = followed(overview.following)
-    parts = [
-        title,
-        f"faults: {names}" if names else "no fault",
-        *([] if is_complete else ["recording cut short"]),
-    ]
-    return "  ·  ".join(parts) + (f"\n{told} (sensor noise included)" if told else "")
+    how = in_words(overview.following)
+    followed = [f"followed {how} (sensor noise included)"] if how else []
+    return "\n".join([f"{title}  ·  {f'faults: {names}' if names else 'no fault'}", *followed, *notes])
 
 
 def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:

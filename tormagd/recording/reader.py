@@ -13,8 +13,9 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex
 from zstandard import ZstdError
 
 from tormagd.recording.overview import Glance, Overview, OverviewBuilder, unpacked
+from tormagd.recording.seal import KEYED, SEALED, State, verified
 from tormagd.recording.stream import END, HEAD, MAGIC, Record, Sent, Unpacker, contents, following, record_at
-from tormagd.recording.writer import ABOUT, CUT, OVERVIEW, TELEMETRY_TOPIC, TICKS_TOPIC
+from tormagd.recording.writer import ABOUT, CUT, OVERVIEW, TELEMETRY_TOPIC, THINNED, TICKS_TOPIC
 from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
@@ -107,6 +108,8 @@ class Contents:
         self._topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
+        self.is_keyed = False
+        "Whether it says that it is sealed with a key."
         self.is_complete = True
         "False where the recorder was killed or the disk was full: messages up to then are there."
 
@@ -120,6 +123,7 @@ class Contents:
             known = record.read(Metadata)
             if known.name == ABOUT:
                 self.metadata.update(known.metadata)
+            self.is_keyed = self.is_keyed or (known.name == SEALED and known.metadata.get("by") == KEYED)
         elif record.opcode == Opcode.CHUNK and len(self.places) < MAX_INDEX:
             chunk = record.read(Chunk)
             self.places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
@@ -177,26 +181,28 @@ def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Con
 class RecordingFile:
     """A recording on the disk, of any length: its `overview`, `metadata`, `is_complete`, and any seconds of it.
 
-    A file whose recorder was killed, or is older, has no overview: it is made from all messages. With `is_scanned`
-    False such a file is refused. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd.
+    The overview is its recorder's where its seals, checked with `key`, are whole; else it is made from all messages.
+    Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd.
     """
 
-    def __init__(self, path: Path, *, is_scanned: bool = True) -> None:
+    def __init__(self, path: Path, key: bytes = b"") -> None:
         self.path = path
-        with opened(path) as file:
-            with readable(str(path)):
-                found = _from_summary(file)
-            if found is None and not is_scanned:
-                raise RecordingError(f"{path}: it has no overview: its recorder did not end it, or is older")
-            if found is None:
-                file.seek(0)
-                builder = OverviewBuilder()
-                known = read_open(file, str(path), Glance, lambda seen: builder.add(*seen))
-                found = known, builder.made()
+        with opened(path):
+            self.seal = verified(path, key)
+        found = summary_of(path) if self.seal.state is State.WHOLE else None
+        if found is None:
+            builder = OverviewBuilder()
+            found = read_recording(path, Glance, lambda seen: builder.add(*seen)), builder.made()
         self._contents, self.overview = found
-        self._contents.require(str(path))
         self.metadata, self.described = self._contents.metadata, self._contents.described
         self.is_complete = self._contents.is_complete
+        known = self.metadata
+        self.notes = [
+            *([] if self.seal.is_sound else [self.seal.text()]),
+            *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
+            *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
+        ]
+        "What whoever looks at it has to know, in words."
 
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, both included, in the file's order, decoded as
@@ -219,6 +225,18 @@ class RecordingFile:
                 if place.from_ns <= to_ns and place.to_ns >= from_ns:
                     for _ in unpacker.records(_at(file, place.at, Opcode.CHUNK), reading.message):
                         pass
+        return found
+
+
+def summary_of(path: Path) -> tuple[Contents, Overview] | None:
+    """Read contents and overview from the end of the file in `path`, without checking its seals.
+
+    None for a cut file, or one without an overview. Raises RecordingError: not readable, damaged, or not ours.
+    """
+    with opened(path) as file, readable(str(path)):
+        found = _from_summary(file)
+        if found is not None:
+            found[0].require(str(path))
         return found
 
 

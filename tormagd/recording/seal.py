@@ -26,6 +26,7 @@ SEALED = "tormagd.seal"
 "The metadata record of a sealed file; `by` is PLAIN or KEYED, `follows` the last digest of the segment before."
 PLAIN, KEYED = "blake2b", "keyed blake2b"
 LEAST_KEY, MOST_KEY = 16, 64
+KEY_HINT = "[recordings] key in the configuration names the key's file"
 DIGEST_BYTES = 32
 _FOOTER_BYTES = HEAD.size + 20
 _BODY = struct.Struct(f"<B{DIGEST_BYTES}s")
@@ -123,9 +124,11 @@ class Verdict(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Return False for an altered file, or one sealed without the configured key; True for any other, also without
-        seals."""
-        return self.state not in (State.ALTERED, State.NO_KEY)
+        """Return False for an altered file, one whose key is not here, or one sealed without the configured key.
+
+        True for any other, also without seals where no key is configured.
+        """
+        return self.state not in (State.ALTERED, State.OTHER_KEY, State.NO_KEY)
 
     def text(self) -> str:
         """Return state and reason in one sentence."""
@@ -249,11 +252,10 @@ class _Check:
         configured; UNFINISHED for a file cut short; else WHOLE.
         """
         if not self._by and not self._seals and (self._is_over or not self._head):
-            return Verdict(
-                State.UNSEALED, "nothing says whether it was changed: an older tormagd, or another program, wrote it"
-            )
+            why = "nothing says whether it was changed: an older tormagd, or another program, wrote it"
+            return Verdict(State.NO_KEY if self._key else State.UNSEALED, why)
         if self._by == KEYED and not self._key:
-            return Verdict(State.OTHER_KEY, "[recordings] key in the configuration names the key's file", self._follows)
+            return Verdict(State.OTHER_KEY, f"it was not checked; {KEY_HINT}", self._follows)
         unsealed = size - self._sealed_to
         if not self._odd and not self._is_over and (ends or unsealed > 2 * MAX_CHUNK_BYTES):
             self._note("a record reaches beyond the end", self._sealed_to)

@@ -248,11 +248,9 @@ function recording() {
   at("recording").hidden = false;
   explained = about.explained;
   at("scene").textContent = about.scene && `scene ${about.scene}`;
-  const {rms_N, aligned_rms_N, delay_ms} = about.following;
-  const aligned = aligned_rms_N === null ? "" : ` (${(1e3 * aligned_rms_N).toFixed(0)} with ${delay_ms.toFixed(0)} ms taken out)`;
-  const error = rms_N === null ? "" : `, while following measured minus asked ${(1e3 * rms_N).toFixed(0)} mN rms${aligned}`;
-  at("source").textContent = `${about.name}, ${new Date(1e3 * about.start_s).toLocaleString()}${error}${about.thinned && `; ${about.thinned}`}`;
-  at("silence").textContent = about.is_complete ? "" : "cut short: the end of this recording is missing";
+  const followed = about.followed && `, followed ${about.followed}`;
+  at("source").textContent = `${about.name}, ${new Date(1e3 * about.start_s).toLocaleString()}${followed}`;
+  at("silence").textContent = about.notes.join("; ");
   at("rates").textContent = "Of the ticks recorded in the 20 s shown, bars as logarithms.";
   portrait = about.portrait;
   const strip = chart("overview", 120, {

@@ -93,7 +93,7 @@ def summarise(file: BinaryIO, name: str) -> Summary:
         duration_s=overview.duration_s,
         enabled_s=codes["operating_state"]["ENABLED"].held_ns * 1e-9 if "ENABLED" in codes["operating_state"] else 0.0,
         is_complete=recording.is_complete,
-        tracking_rms_N=overview.following.rms_N,
+        tracking_rms_N=None if overview.following is None else overview.following.rms_N,
         late_p99_us=figure("lateness_us", lambda values: np.percentile(values, 99.0)),
         limits_s={name: each.held_ns * 1e-9 for name, each in codes["limits"].items()},
         faults_at_s={name: each.spans_ns[0][0] * 1e-9 for name, each in codes["faults"].items()},

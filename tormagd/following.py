@@ -1,0 +1,121 @@
+"""How well the force is followed: the RMS of measured less asked force, with and without the delay that explains most.
+
+Only ticks at which the force could be followed count: ENABLED, a setpoint that the device can give, and a handle that
+slides. The way to the first force does not count, nor does the decay after the last.
+"""
+
+import math
+from collections import deque
+from collections.abc import Collection
+from typing import Final
+
+from tormagd_client.messages import MAX_DISPLACEMENT_MM, FollowingReport
+
+PERIOD_S: Final = 0.02
+"Time between two looks, unless another is stated."
+MOST_DELAY_S: Final = 0.4
+"Greatest delay that is taken out: the budget of the whole way."
+NEAR_N: Final = 0.1
+"The way to the first force ends this near to it."
+LEAST_S: Final = 1.0
+"No figure is told of fewer looks than fill this time."
+SLIDES_MM_S: Final = 1.0
+SLID_MM: Final = MAX_DISPLACEMENT_MM
+"A slower handle sticks, and one that has turned feels all of the brake's force only so much further."
+NOT_FOLLOWED: Final = frozenset({"RANGE", "STANDBY", "F_MIN", "F_MAX", "TAKEOVER"})
+"Limits under which another force is rendered than was asked."
+
+
+class Following:
+    """Measures how well the force is followed: RMS error, and the delay that explains most of it.
+
+    Looks every `period_s`. Keeps the forces asked for in the last MOST_DELAY_S, and a sum of squared errors for each
+    delay.
+    """
+
+    def __init__(self, period_s: float = PERIOD_S, forgets_s: float = math.inf) -> None:
+        """Begin without figures. After `forgets_s` an error counts a third (1/e); infinite: all count alike."""
+        self._period_s = period_s
+        self._kept = math.exp(-period_s / forgets_s)
+        count = round(MOST_DELAY_S / period_s) + 1
+        self._asked_N: deque[float] = deque(maxlen=count)
+        self._squares, self._weight = [0.0] * count, 0.0
+        self._has_arrived = False
+        self._rate_mm_s = self._turned_mm = 0.0
+
+    @property
+    def counted_s(self) -> float:
+        """Return the time that counted, s, less what was forgotten."""
+        return self._weight * self._period_s
+
+    def look(
+        self,
+        state: str | None,
+        limits: Collection[str],
+        asked_N: float | None,
+        measured_N: float | None,
+        handle_mm: float | None,
+        rate_mm_s: float | None,
+    ) -> None:
+        """Look once, and add the error for each delay where it counts.
+
+        It counts ENABLED (or where no state is known), with a sliding handle, a measured force, and no limit of
+        NOT_FOLLOWED, after MOST_DELAY_S of setpoints. Out of ENABLED or without a setpoint, the way begins anew.
+        """
+        if self._kept < 1.0:
+            self._weight *= self._kept
+            self._squares = [self._kept * known for known in self._squares]
+        if state not in ("ENABLED", None) or asked_N is None:
+            self.begin()
+            return
+        self._asked_N.appendleft(asked_N)
+        slides = self._slides(rate_mm_s, handle_mm)
+        if not slides or measured_N is None or not NOT_FOLLOWED.isdisjoint(limits):
+            return
+        self._has_arrived = self._has_arrived or abs(measured_N - asked_N) <= NEAR_N
+        if not self._has_arrived:
+            self._asked_N.clear()
+        elif len(self._asked_N) == len(self._squares):
+            self._weight += 1.0
+            self._squares = [
+                known + (measured_N - then_N) ** 2 for known, then_N in zip(self._squares, self._asked_N, strict=True)
+            ]
+
+    def begin(self) -> None:
+        """Forget what was asked, and that the force has arrived: what follows is on its way to a first force again."""
+        self._asked_N.clear()
+        self._has_arrived = False
+
+    def _slides(self, rate_mm_s: float | None, place_mm: float | None) -> bool:
+        """Tell whether the handle has slid SLID_MM since it last turned or was slower than about SLIDES_MM_S.
+
+        True for a handle that is not measured. Remembers where it turned.
+        """
+        if rate_mm_s is None or place_mm is None:
+            return True
+        if rate_mm_s * self._rate_mm_s < SLIDES_MM_S**2:
+            self._turned_mm = place_mm
+        self._rate_mm_s = rate_mm_s
+        return abs(place_mm - self._turned_mm) >= SLID_MM
+
+    def report(self) -> FollowingReport | None:
+        """Return the RMS error, N, the RMS error with the best delay taken out, N, and that delay, ms.
+
+        None where fewer looks count than fill LEAST_S: at first, and where they are forgotten.
+        """
+        if self.counted_s < LEAST_S:
+            return None
+        least = min(self._squares)
+        return FollowingReport(
+            rms_N=round(math.sqrt(self._squares[0] / self._weight), 4),
+            aligned_rms_N=round(math.sqrt(least / self._weight), 4),
+            delay_ms=round(1e3 * self._period_s * self._squares.index(least), 1),
+        )
+
+
+def in_words(known: FollowingReport | None) -> str:
+    """Say how well the force was followed; empty for None."""
+    if known is None:
+        return ""
+    aligned = f"{known.aligned_rms_N * 1e3:.0f} mN with a delay of {known.delay_ms:.0f} ms taken out"
+    return f"to {known.rms_N * 1e3:.0f} mN RMS, {aligned if known.delay_ms else 'without a delay'}"
