@@ -115,9 +115,14 @@ def test_a_good_sweep_gives_a_model_that_knows_what_it_was_judged_on(table):
 
 
 def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, capsys):
-    write_sweeps(tmp_path / "sweep.csv", sweeps)
+    write_sweeps(tmp_path / "sweep.csv", sweeps[:2])
     out, data = tmp_path / "m.safetensors", tmp_path / "t.csv"
     arguments = [str(tmp_path / "sweep.csv"), "--insert", INSERT, "--out", str(out), "--csv", str(data)]
+    # one that is refused leaves nothing that would be in the way of the same command
+    assert calibration.main(arguments) == 1
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "few_sweeps"
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.csv"]
+    write_sweeps(tmp_path / "sweep.csv", sweeps)
     assert calibration.main(arguments) == 0
     result = json.loads(capsys.readouterr().out)["result"]
     assert result["metrics"] == load_model(out, element="torque", insert=INSERT).metadata.metrics

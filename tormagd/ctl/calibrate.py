@@ -49,10 +49,9 @@ def calibrate_insert(
 ) -> Outcome:
     """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`.
 
-    `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. The outcome holds the
-    fitter's answer. Raises as `reach`, `armed`, `Run.play` and `Run.wait_for_handle`. Raises CommandError (REFUSED) for
-    an unknown insert, before anything moves, and for a daemon without a range of force. REFUSED are also sweeps or a
-    fit that are not good enough: then there is no model file.
+    `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. Raises as `armed` and
+    `Run.play`. Raises CommandError (REFUSED) for an unknown insert, a still handle, another publisher, or a sweep or
+    fit that is not good enough. Then there is neither file.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:

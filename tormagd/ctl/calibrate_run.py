@@ -41,7 +41,7 @@ HANDLE_PATIENCE_S = 30.0
 def interrupted_run() -> CommandError:
     """Return the error (REFUSED) for a run that the person ended: no model and no log is saved.
 
-    The daemon may keep what it learned of the device, and a file of training data may have been written.
+    Nor training data; the daemon may keep what it learned of the device.
     """
     return CommandError(
         Exit.REFUSED,

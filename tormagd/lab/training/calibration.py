@@ -14,6 +14,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from tormagd.bounded_file import in_place_of
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.tables import read_columns
@@ -252,16 +254,16 @@ def calibrate(
 ) -> dict[str, Any]:
     """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file).
 
-    Both replace files that are there. Returns their names, the insert, the date, the number of rows, the features'
-    ranges and the fit's metrics. Raises CalibrationError, LabError, DomainError and OSError. No model is written then,
-    but the training data may be.
+    Returns what was saved. Raises CalibrationError, LabError, DomainError and OSError; neither file is there then, so
+    that the same command can be given again.
     """
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
-    if training_csv is not None:
-        write_csv(training_csv, data)
     require_usable(data)
     model = fit(data, insert_name, created)
-    save_model(out, model)
+    with nullcontext() if training_csv is None else in_place_of(training_csv) as beside:
+        if beside is not None:
+            write_csv(beside, data)
+        save_model(out, model)
     return {
         "model": str(out),
         "csv": None if training_csv is None else str(training_csv),
