@@ -16,7 +16,7 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.recording.writer import TELEMETRY_TOPIC, TICK_KINDS, TICKS_TOPIC, plain_schema, tick_schema
+from tormagd.recording.writer import TELEMETRY_TOPIC, TICK_SCHEMA, TICKS_TOPIC, plain_schema
 from tormagd_client.messages import Setpoint, Telemetry, decode
 
 ROOT = Path(__file__).parents[2]
@@ -144,7 +144,7 @@ def test_it_says_how_to_call_it(publisher):
 # -- layouts for PlotJuggler and Foxglove show what recordings and telemetry have, by their names ----------------------
 
 
-SCHEMAS = {TELEMETRY_TOPIC: plain_schema(Telemetry), TICKS_TOPIC: tick_schema(TICK_KINDS)}
+SCHEMAS = {TELEMETRY_TOPIC: plain_schema(Telemetry), TICKS_TOPIC: TICK_SCHEMA}
 PAIRS = ("duty", "measured_jp")
 "Lists of a number for each carriage; the others are of codes, as many as there are."
 

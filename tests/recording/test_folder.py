@@ -13,7 +13,7 @@ import pytest
 from sent import START_NS, batch, telemetry
 
 from tormagd.config import Recordings
-from tormagd.ctl.record import Recorder, budget_of
+from tormagd.ctl.record import budget_of
 from tormagd.recording.folder import Budget, RecordingFolder, mark, segment_of
 from tormagd.recording.reader import RecordingFile
 from tormagd.recording.seal import State, verified
@@ -37,12 +37,11 @@ class Clock:
 
 def write(folder: RecordingFolder, clock: Clock, *, is_marked: bool = False) -> Path:
     """A small recording of this moment."""
-    path = folder.new()
-    with RecordingWriter(path, room=folder.room) as writer:
+    with RecordingWriter(folder) as writer:
         ms = (clock.now_s - START_NS * 1e-9) * 1e3
         rng = random.Random(ms)
         writer.ticks(batch(*((ms + i, rng.random(), rng.random(), 35.0, 36.0, 0.25) for i in range(200))))
-    return mark(path) if is_marked else path
+    return mark(writer.path) if is_marked else writer.path
 
 
 def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> None:
@@ -108,11 +107,11 @@ def test_the_former_name_is_a_segment_too(tmp_path: Path) -> None:
 
 def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Path) -> None:
     clock = Clock()
-    recorder = Recorder(tmp_path, {}, SETTINGS, b"", clock)
-    mark(recorder.writer.path)  # by somebody else: the recorder goes on
+    recorder = RecordingWriter(RecordingFolder(tmp_path, budget_of(SETTINGS), clock))
+    mark(recorder.path)  # by somebody else: the recorder goes on
     (tmp_path / "another.mcap").write_bytes(b"x" * 1_900_000)
     newest = Mark(t_ns=START_NS + 10, text="here")
-    with pytest.raises(OSError, match="nothing unmarked is left"), recorder.writer as writer:  # noqa: PT012
+    with pytest.raises(OSError, match="nothing unmarked is left"), recorder as writer:  # noqa: PT012
         recorder.telemetry(telemetry(0, 0, mark=newest))
         recorder.ticks(batch((0, 1.0, 1.0, 35.0, 36.0, 0.25), (3.7e6, 1.0, 1.0, 35.0, 36.0, 0.25)))
     known = RecordingFile(writer.path)
@@ -122,9 +121,8 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
 
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
     """Through the recorder, as it goes on for so long: a batch a minute, now and then a mark; the marks."""
-    recorder = Recorder(path, {}, SETTINGS, b"", clock)
     told, newest = [], None
-    with recorder.writer:
+    with RecordingWriter(RecordingFolder(path, budget_of(SETTINGS), clock)) as recorder:
         for minute in range(hours * 60):
             clock.now_s += 60.0
             ms = (clock.now_s - START_NS * 1e-9) * 1e3
@@ -176,7 +174,7 @@ def deadly(function, is_before):
     return call
 from tormagd.recording import folder, seal, writer
 room, name = {
-    "rotate": (writer.RecordingWriter, "rotate"), "begin": (writer.RecordingWriter, "_begin"),
+    "rotate": (writer.RecordingWriter, "_rotate"), "begin": (writer.RecordingWriter, "_begin"),
     "prune": (Path, "unlink"), "mark": (Path, "rename"), "seal": (seal.SealingFile, "seal"),
     "finish": (seal.SealingFile, "finish"),
 }[what]

@@ -36,7 +36,7 @@ def write(path: Path, **settings: Any) -> Path:
             writer.ticks(batch(*(row(k + i) for i in range(20)), columns=COLUMNS))
             mark = Mark(t_ns=START_NS + 15_000_000_000, text="here") if k >= 15_000 else None
             writer.telemetry(telemetry(k, k // 20, mark=mark))
-    assert (writer.ticks_lost, writer.gaps) == (0, 0)
+    assert writer.ticks_lost == 0
     return path
 
 

@@ -63,7 +63,7 @@ def test_other_tools_find_json_messages_with_schemas(written):
         assert {channel.message_encoding for channel in topics.values()} == {"json"}
         schemas = {topic: summary.schemas[channel.schema_id] for topic, channel in topics.items()}
         assert {schema.encoding for schema in schemas.values()} == {"jsonschema"}
-        assert set(json.loads(schemas["/ticks"].data)["properties"]) == set(COLUMNS)
+        assert set(json.loads(schemas["/ticks"].data)["properties"]) >= set(COLUMNS)
         assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
         _, _, message = next(iter(reader.iter_messages(topics="/ticks")))
         assert message.log_time == START_NS
@@ -178,19 +178,13 @@ def test_half_a_second_is_written_at_once(tmp_path):
     assert len(back(path).ticks) == 150
 
 
-def test_gaps_and_losses_are_counted(tmp_path):
+def test_losses_are_counted(tmp_path):
     with RecordingWriter(tmp_path / "a.mcap") as writer:
-        columns = ("t_ns", "x")
-        for ms in (0, 1, 2, 11.9, 40, 41, 30, 31):  # one merged wait (not a gap), one of 28.1 ms, one back in time
-            writer.ticks(batch((ms, 0.0), columns=columns))
+        for tick in (3, 4, 8, 0, 1):
+            writer.ticks(batch((tick, tick), columns=("t_ns", "tick")))
         for seq in (3, 4, 7, 8, 0, 1):  # 5 and 6 are lost; then the daemon restarts
             writer.telemetry(telemetry(seq, seq))
-    assert (writer.tick_count, writer.gaps, writer.telemetry_lost, writer.longest_gap_ms) == (
-        8,
-        2,
-        2,
-        pytest.approx(28.1),
-    )
+    assert (writer.tick_count, writer.ticks_lost, writer.telemetry_lost) == (5, 3, 2)
 
 
 def test_columns_may_change_while_recording(tmp_path):

@@ -1,5 +1,6 @@
 """Seals: any byte changed, cut, put elsewhere or of another file is named; an end that is missing is told apart."""
 
+import itertools
 import random
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from sent import batch, telemetry
 
+from tormagd.recording.folder import Budget, RecordingFolder
 from tormagd.recording.seal import State, read_key, verified
 from tormagd.recording.stream import HEAD, MAGIC, SEAL, records
 from tormagd.recording.writer import RecordingWriter
@@ -120,12 +122,11 @@ def test_who_has_no_key_cannot_seal(tmp_path: Path, sealed: Path) -> None:
 
 
 def test_segments_follow_each_other(tmp_path: Path) -> None:
-    writer = RecordingWriter(tmp_path / "0.mcap")
-    for k in range(3):
-        writer.ticks(batch(*((2_000 * k + i, 1.5, 1.5, 35.0, 36.0, 0.25) for i in range(20))))
-        if k < 2:
-            writer.rotate(tmp_path / f"{k + 1}.mcap")
-    writer.close()
-    said = [verified(tmp_path / f"{k}.mcap") for k in range(3)]
+    budget = Budget(segment_bytes=1_000_000, segment_s=1.0, most_bytes=100_000_000, most_s=1e9, free_bytes=0)
+    with RecordingWriter(RecordingFolder(tmp_path, budget, itertools.count(1_790_000_000).__next__)) as writer:
+        for k in range(5):
+            writer.ticks(batch(*((2_000 * k + i, 1.5, 1.5, 35.0, 36.0, 0.25) for i in range(20))))
+    said = [verified(path) for path in sorted(tmp_path.iterdir())]
+    assert len(said) == 3
     assert {each.state for each in said} == {State.WHOLE}
     assert [each.follows for each in said] == ["", said[0].last, said[1].last]

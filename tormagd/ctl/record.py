@@ -16,8 +16,8 @@ from tormagd.interrupt import interrupted_by
 from tormagd.output import write_line
 from tormagd.recording.folder import Budget, RecordingFolder
 from tormagd.recording.seal import read_key
-from tormagd.recording.ticks import TickBatch, decode_ticks, listening
-from tormagd.recording.writer import RecordingWriter, disk_room
+from tormagd.recording.ticks import decode_ticks, listening
+from tormagd.recording.writer import RecordingWriter
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
@@ -30,51 +30,6 @@ LONGEST_END_S = 60.0
 "Longest time at the end for writing what has already arrived."
 SILENT_S = 1.0
 "A daemon that is silent for this long at the end has gone."
-
-
-class Recorder:
-    """Writes a recording to the file `path`; or, where `path` is a folder, to segments in it within the folder's
-    budget.
-
-    `writer` is the open file, or the present segment, and counts what was written; whoever made the recorder closes it.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        about: dict[str, str],
-        settings: Recordings,
-        key: bytes,
-        clock: Callable[[], float] = time.time,
-    ) -> None:
-        """Create the first file. Raises OSError where it exists, cannot be made, or the folder has no room."""
-        self._folder = RecordingFolder(path, budget_of(settings), clock) if path.is_dir() else None
-        room = disk_room if self._folder is None else self._folder.room
-        file = path if self._folder is None else self._folder.new()
-        self.writer = RecordingWriter(file, about, key, room, settings.one_tick_of)
-
-    def ticks(self, batch: TickBatch) -> None:
-        """Write ticks, and begin a new segment where one is due; ends the recording where there is no room. Raises
-        OSError."""
-        writer, folder = self.writer, self._folder
-        writer.ticks(batch)
-        if folder is not None and folder.is_due(writer.size, writer.lasted_s):
-            try:
-                path = folder.new()
-            except OSError as error:
-                writer.give_up(str(error.strerror))
-            writer.rotate(path)
-
-    def telemetry(self, message: Telemetry) -> None:
-        """Write a snapshot. Raises OSError.
-
-        In a folder, a new mark renames the segment, and a recent one before, so that pruning keeps them.
-        """
-        before = self.writer.mark
-        self.writer.telemetry(message)
-        new = None if self.writer.mark == before else self.writer.mark
-        if new is not None and new.t_ns >= (self.writer.begin_ns or 0) and self._folder is not None:
-            self.writer.path = self._folder.mark_around(self.writer.path)
 
 
 def budget_of(settings: Recordings) -> Budget:
@@ -116,15 +71,15 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
             about = _about(endpoints, wait_s)
             try:
-                recorder = Recorder(path, about, config.recordings, key)
+                place = RecordingFolder(path, budget_of(config.recordings)) if path.is_dir() else path
+                writer = RecordingWriter(place, about, key, config.recordings.one_tick_of)
             except FileExistsError as error:
                 raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
             except OSError as error:
                 raise usage_error(f"{path}: {error.strerror}", "give a file in a directory you may write to") from error
-            writer = recorder.writer
             try:
                 with writer:
-                    outcome = _record(recorder, telemetry, ticks, duration_s, is_interrupted)
+                    outcome = _record(writer, telemetry, ticks, duration_s, is_interrupted)
                     with contextlib.suppress(ClientError):  # the daemon has gone: what was true at the start stands
                         writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
                     return outcome
@@ -166,19 +121,14 @@ def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_inter
 
 
 def _record(
-    recorder: Recorder,
+    writer: RecordingWriter,
     telemetry: "zmq.Socket[bytes]",
     ticks: "zmq.Socket[bytes]",
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
-    """Write what arrives until `duration_s` or an interrupt ends it, then what still waits, and return the outcome.
-
-    The last takes LONGEST_END_S at most. A message that cannot be read is counted, and the first told on stderr. The
-    outcome counts what was written and lost: UNREACHABLE where ticks were missing for over SILENT_S at the end, REFUSED
-    where ticks were lost. Raises OSError where nothing more can be written.
-    """
-    writer, unreadable = recorder.writer, 0
+    """Write what arrives until the time or an interrupt ends it, then what still waits, and return the outcome."""
+    unreadable = 0
     start_s = heard_s = time.monotonic()
     is_over = False
     while not is_over:
@@ -193,9 +143,9 @@ def _record(
                 data = socket.recv_multipart()[-1]
                 try:
                     if socket is telemetry:
-                        recorder.telemetry(decode(data, Telemetry))
+                        writer.telemetry(decode(data, Telemetry))
                     else:
-                        recorder.ticks(decode_ticks(data))
+                        writer.ticks(decode_ticks(data))
                         heard_s = time.monotonic()
                 except MessageError as error:
                     unreadable += 1
@@ -203,7 +153,6 @@ def _record(
                         write_line(f"tormagctl record: left out a message: {printable(str(error))}", sys.stderr)
     end_s = time.monotonic()
     silent_s = end_s - heard_s
-    is_silent = writer.note_silence(round(silent_s * 1e9))
     result = {
         "file": str(writer.path),
         "seconds": round(end_s - start_s, 3),
@@ -211,17 +160,12 @@ def _record(
         "telemetry_lost": writer.telemetry_lost,
         "ticks": writer.tick_count,
         "ticks_lost": writer.ticks_lost,
-        "gaps": writer.gaps,
-        "longest_gap_ms": round(writer.longest_gap_ms, 3),
-        "silent_ms": round(silent_s * 1e3, 3) if is_silent else 0.0,
+        "silent_ms": round(silent_s * 1e3, 3),
         "unreadable": unreadable,
     }
-    losses = (
-        f"{writer.gaps} gaps (longest {writer.longest_gap_ms:.0f} ms), {writer.ticks_lost} ticks and "
-        f"{writer.telemetry_lost} snapshots lost"
-    )
-    text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots; {losses}"
-    if is_silent and silent_s > SILENT_S:
+    text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots"
+    text += f"; {writer.ticks_lost} ticks and {writer.telemetry_lost} snapshots lost"
+    if silent_s > SILENT_S:
         text += f"; nothing came in the last {silent_s:.1f} s: the daemon has gone, or does not run any more"
         return Outcome(result, text, Exit.UNREACHABLE)
     return Outcome(result, text, Exit.REFUSED if writer.ticks_lost else Exit.DONE)

@@ -15,24 +15,13 @@ from typing import Any, NamedTuple
 import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata
-from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
 from tormagd.bounded_file import in_place_of
 from tormagd.keeping import READ, WROTE, Part
 from tormagd.recording.reader import RecordingError, opened, scan
-from tormagd.recording.seal import KEYED, PLAIN, SEALED, SealingFile
 from tormagd.recording.stream import Record, Sent
-from tormagd.recording.writer import (
-    ABOUT,
-    CHUNK_BYTES,
-    TICK_KINDS,
-    TICKS_TOPIC,
-    known_values,
-    plain_schema,
-    registered,
-    tick_schema,
-)
+from tormagd.recording.writer import TICK_SCHEMA, TICKS_TOPIC, known_values, plain_schema, registered, sealed_mcap
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"
@@ -139,24 +128,14 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], k
 
 
 def _write(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes) -> int:
-    """Write the black box to `path`, replacing what is there, sealed with `key`, and return how many ticks are in it.
-
-    Raises OSError, and as `Derived.of`.
-    """
-    columns = tuple(json.loads(header["columns"]))
-    derived = Derived(columns)
+    """Write the file in place, sealed, and return how many ticks are in it."""
+    derived = Derived(tuple(json.loads(header["columns"])))
     with path.open("wb") as file:
-        sealing = SealingFile(file, key)
-        mcap = Writer(sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
-        mcap.start(profile="", library=f"tormagd {__version__}")
-        mcap.add_metadata(SEALED, {"by": KEYED if key else PLAIN})
+        sealing, mcap = sealed_mcap(file, key, {}, {"version": __version__, "kind": HEADER})
         mcap.add_metadata(HEADER, header)
-        mcap.add_metadata(ABOUT, {"version": __version__, "kind": HEADER})
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
-        kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
-        tick_channel = registered(mcap, TICKS_TOPIC, tick_schema(kinds))
-        frame_channel = registered(mcap, FRAMES_TOPIC, plain_schema(Frame))
-        channels = {TICKS_TOPIC: tick_channel, FRAMES_TOPIC: frame_channel}
+        schemas = {TICKS_TOPIC: TICK_SCHEMA, FRAMES_TOPIC: plain_schema(Frame)}
+        channels = {topic: registered(mcap, topic, schema) for topic, schema in schemas.items()}
         for number, part in enumerate(parts):
             mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
             offset_ns = part.t_ns - round(part.time_s * 1e9)

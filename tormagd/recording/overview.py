@@ -368,6 +368,25 @@ def _joined(spans: list[list[int]]) -> list[list[int]]:
     return [*joined, spans[-1]]
 
 
+class _Held:
+    """When one code was present, while it is counted."""
+
+    def __init__(self) -> None:
+        self.spans: list[list[int]] = []
+        self.ns = 0
+
+    def hold(self, from_ns: int, to_ns: int) -> None:
+        """Add a span, or extend the last one, which reaches `from_ns`; beyond MOST_SPANS the nearest are joined."""
+        if self.spans and from_ns <= self.spans[-1][1] <= to_ns:
+            self.ns += to_ns - self.spans[-1][1]
+            self.spans[-1][1] = to_ns
+            return
+        self.ns += to_ns - from_ns
+        self.spans.append([from_ns, to_ns])
+        if len(self.spans) > MOST_SPANS:
+            self.spans = _joined(self.spans)
+
+
 class _Codes:
     """The codes of one kind of message, and when each was present.
 
@@ -375,60 +394,32 @@ class _Codes:
     """
 
     def __init__(self) -> None:
-        self._known: dict[str, dict[str, list[list[int]]]] = {kind: {} for kind in KINDS}
-        self._held: dict[tuple[str, str], int] = {}
-        self._last: dict[str, tuple[str, ...]] = dict.fromkeys(KINDS, ())
-        self._last_ns: int | None = None
-        self._step_ns = 0
+        self._known: dict[str, dict[str, _Held]] = {kind: {} for kind in KINDS}
+        self._now: list[tuple[str, str]] = []
+        self._now_ns = self._step_ns = 0
 
     def add(self, since_ns: int, message: Mapping[str, Any]) -> None:
-        """Extend the last message's codes to this one, or, over a break, by one usual step; then begin this
-        message's."""
-        passed_ns = 0 if self._last_ns is None else since_ns - self._last_ns
+        """Hold the last message's codes up to this one, or, over a break, for one usual step; then take this one's."""
+        passed_ns = since_ns - self._now_ns
         if 0 < passed_ns <= BREAK_NS:
             self._step_ns = passed_ns
-        else:
-            passed_ns = min(max(passed_ns, 0), self._step_ns)
-        before_ns = since_ns if self._last_ns is None else self._last_ns
-        for kind in KINDS:
-            self._extend(kind, before_ns + passed_ns, passed_ns)
-            told = message.get(kind)
-            if told or self._last[kind]:
-                self._begin(kind, since_ns, _codes(told))
-        self._last_ns = since_ns
+        self._hold(min(max(passed_ns, 0), self._step_ns))
+        self._now = [(kind, code) for kind in KINDS if (told := message.get(kind)) for code in _codes(told)]
+        self._now_ns = since_ns
 
-    def _extend(self, kind: str, to_ns: int, by_ns: int) -> None:
-        """Let the last message's codes of `kind` end at `to_ns`, and count `by_ns` more for each."""
-        known = self._known[kind]
-        for code in self._last[kind]:
-            known[code][-1][1] = to_ns
-            self._held[kind, code] += by_ns
-
-    def _begin(self, kind: str, since_ns: int, codes: tuple[str, ...]) -> None:
-        """Continue spans that reach `since_ns`, begin new ones, and remember `codes` as the last message's.
-
-        New codes beyond a third of MOST_CODES count as OTHER; spans beyond MOST_SPANS are joined.
-        """
-        known = self._known[kind]
-        if len(known) >= MOST_CODES // len(KINDS) - 1:
-            codes = tuple(code if code in known else OTHER for code in codes)
-        for code in codes:
-            spans = known.setdefault(code, [])
-            self._held.setdefault((kind, code), 0)
-            # what goes on from the last message is one
-            if not spans or code not in self._last[kind] or spans[-1][1] != since_ns:
-                spans.append([since_ns, since_ns])
-                if len(spans) > MOST_SPANS:
-                    known[code] = _joined(spans)
-        self._last[kind] = codes
+    def _hold(self, for_ns: int) -> None:
+        """Let the last message's codes hold so long; new ones beyond a third of MOST_CODES count as OTHER."""
+        for kind, code in self._now:
+            known = self._known[kind]
+            is_kept = code in known or len(known) < MOST_CODES // len(KINDS) - 1
+            held = known.setdefault(code if is_kept else OTHER, _Held())
+            held.hold(self._now_ns, self._now_ns + for_ns)
 
     def made(self) -> dict[str, dict[str, Codes]]:
-        """Extend the last codes by one step, forget them, and return all spans by kind and code."""
-        for kind in KINDS:
-            if self._last_ns is not None:
-                self._extend(kind, self._last_ns + self._step_ns, self._step_ns)
-            self._last[kind] = ()
+        """Hold the last codes for one step, forget them, and return all spans by kind and code."""
+        self._hold(self._step_ns)
+        self._now = []
         return {
-            kind: {code: Codes([(a, b) for a, b in spans], self._held[kind, code]) for code, spans in known.items()}
+            kind: {code: Codes([(a, b) for a, b in held.spans], held.ns) for code, held in known.items()}
             for kind, known in self._known.items()
         }

@@ -97,14 +97,10 @@ class Place(NamedTuple):
 
 
 class Contents:
-    """Collects what a file's records tell: metadata, chunks, and each tick or snapshot, which it hands to `each`.
+    """Collects what a file's records tell: topics, metadata, and places of chunks. `take` raises UNREADABLE for
+    damage."""
 
-    Holds the channels' topics, `metadata`, the chunks' `places`, and `is_complete`. Messages are decoded as the type
-    `wanted`, which may leave fields out. `take` and `message` raise UNREADABLE for damage.
-    """
-
-    def __init__(self, wanted: Any, each: Callable[[Seen], None]) -> None:
-        self._decoder, self._each = msgspec.json.Decoder(wanted), each
+    def __init__(self) -> None:
         self._topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
@@ -128,17 +124,19 @@ class Contents:
             chunk = record.read(Chunk)
             self.places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
 
-    def message(self, sent: Sent) -> None:
-        """Decode a tick or a snapshot and hand it to `each`; a message of another topic is passed over."""
-        topic = self._topics.get(sent.channel)
-        if topic in TOPICS:
-            self._each(Seen(sent.t_ns, topic == TICKS_TOPIC, self._decoder.decode(sent.data)))
+    def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Sent], None]:
+        """Return what hands each tick and snapshot to `each`, decoded as the type `wanted`, which may leave fields out.
 
-    def again(self, wanted: Any, each: Callable[[Seen], None]) -> "Contents":
-        """Return new Contents with the same topics, for reading messages of the same file as another type."""
-        other = Contents(wanted, each)
-        other._topics = self._topics
-        return other
+        Messages of other topics are passed over. What it returns raises UNREADABLE for damage.
+        """
+        decoder = msgspec.json.Decoder(wanted)
+
+        def message(sent: Sent) -> None:
+            topic = self._topics.get(sent.channel)
+            if topic in TOPICS:
+                each(Seen(sent.t_ns, topic == TICKS_TOPIC, decoder.decode(sent.data)))
+
+        return message
 
     def require(self, name: str) -> None:
         """Raise RecordingError, naming the file `name`, where the file has neither telemetry nor ticks."""
@@ -161,8 +159,8 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
     Returns metadata, chunk places and completeness; `wanted` is the type to decode messages as. Raises RecordingError:
     not MCAP, damaged, or not written by tormagd; and OSError.
     """
-    found = Contents(wanted, each)
-    is_whole = scan(file, name, found.take, found.message)
+    found = Contents()
+    is_whole = scan(file, name, found.take, found.reading(wanted, each))
     found.require(name)
     found.is_complete = is_whole and CUT not in found.metadata
     return found
@@ -219,11 +217,11 @@ class RecordingFile:
                 if len(found) > MAX_SEEN:
                     raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
 
-        reading, unpacker = self._contents.again(wanted, keep), Unpacker()
+        message, unpacker = self._contents.reading(wanted, keep), Unpacker()
         with opened(self.path) as file, readable(str(self.path)):
             for place in self._contents.places:
                 if place.from_ns <= to_ns and place.to_ns >= from_ns:
-                    for _ in unpacker.records(_at(file, place.at, Opcode.CHUNK), reading.message):
+                    for _ in unpacker.records(_at(file, place.at, Opcode.CHUNK), message):
                         pass
         return found
 
@@ -252,7 +250,7 @@ def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
     file.seek(at)
     footer = record_at(file, at)
     start = footer.read(Footer).summary_start if footer is not None and footer.opcode == Opcode.FOOTER else 0
-    found = Contents(None, lambda seen: None)
+    found = Contents()
     overview_at, told = None, []
     file.seek(start)
     for record in following(file, start) if start else ():

@@ -10,15 +10,17 @@ import errno
 import fcntl
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import repeat
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn, Self
+from typing import Any, BinaryIO, NoReturn, Self
 
 import msgspec
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
+from tormagd.recording.folder import RecordingFolder
 from tormagd.recording.overview import OverviewBuilder
 from tormagd.recording.seal import KEYED, PLAIN, SEALED, SealingFile
 from tormagd.recording.thinning import AROUND_S, Thinning
@@ -44,11 +46,6 @@ LEAST_FREE_BYTES = 16_000_000
 "A recording ends before the disk is full: the last chunk needs room, and the index, which grows with the file."
 INDEX_SHARE = 64
 "The index is at most 1/INDEX_SHARE of the file."
-GAP_NS = 10_000_000
-"A step between two ticks that counts as a gap. Under one lost batch (20 ms), above a few merged ticks."
-
-Room = Callable[[Path, int], str]
-"Makes room for bytes on a file's disk; returns why there is none, empty where there is."
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
@@ -60,11 +57,12 @@ def disk_room(path: Path, needed_bytes: int) -> str:
 
 
 class RecordingWriter:
-    """Writes an MCAP recording, or with `rotate` several one after the other, until `close`; also a context manager.
+    """Writes an MCAP recording, or in a folder several one after the other, until `close`; also a context manager.
 
-    `key` seals the file, `room` makes room on its disk, and of `every` ticks one is written where nothing happens.
-    Public counters tell what came: `telemetry_lost` counts missing `seq`, `ticks_lost` missing tick numbers, and `gaps`
-    steps between ticks above GAP_NS or back in time.
+    `place` is a file, or a folder, whose budget says when a new file begins and what makes room for it. A new mark
+    renames its segment in a folder, and a recent one before, so that pruning keeps them. `key` seals the file, and of
+    `every` ticks one is written where nothing happens. Public counters tell what came: `telemetry_lost` counts missing
+    `seq`, `ticks_lost` missing tick numbers.
 
     Raises FileExistsError rather than overwrite a recording, and OSError where the file cannot be made or written.
     Without room the file is ended in order first. Where the disk fails without warning, the file reads up to its last
@@ -73,29 +71,23 @@ class RecordingWriter:
 
     def __init__(
         self,
-        path: Path,
-        metadata: dict[str, str] | None = None,
+        place: Path | RecordingFolder,
+        metadata: Mapping[str, str] | None = None,
         key: bytes = b"",
-        room: Room = disk_room,
         every: int = 1,
     ) -> None:
-        self._key, self._room, self._thinning = key, room, Thinning(every)
+        self._key, self._thinning = key, Thinning(every)
+        self._folder = place if isinstance(place, RecordingFolder) else None
+        self._room = disk_room if self._folder is None else self._folder.room
         self._about = {"version": __version__, **(metadata or {})}
         if every > 1:
             self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
         self._last_seq: int | None = None
         self._last_tick: int | None = None
-        self._last_tick_ns: int | None = None
-        self._batch_ns = 0
-        self.mark: Mark | None = None
-        "The newest mark in a snapshot; None before the first."
-        self.telemetry_count = 0
-        self.telemetry_lost = 0
-        self.tick_count = 0
-        self.ticks_lost = 0
-        self.gaps = 0
-        self.longest_gap_ms = 0.0
-        self._begin(path, "")
+        self._mark: Mark | None = None
+        self.telemetry_count = self.telemetry_lost = 0
+        self.tick_count = self.ticks_lost = 0
+        self._begin(place.new() if isinstance(place, RecordingFolder) else place, "")
 
     def _begin(self, path: Path, follows: str) -> None:
         """Open a new file, lock it against pruning, and write its head; `follows` is the digest that ends the segment
@@ -107,42 +99,29 @@ class RecordingWriter:
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody takes it away while it is written
-        self._sealing = SealingFile(self._file, self._key)
         self._overview = OverviewBuilder()
-        self._mcap = Writer(self._sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
-        self._mcap.start(profile="", library=f"tormagd {__version__}")
-        self._mcap.add_metadata(SEALED, {"by": KEYED if self._key else PLAIN, "follows": follows})
-        self._mcap.add_metadata(ABOUT, self._about)
+        self._sealing, self._mcap = sealed_mcap(self._file, self._key, {"follows": follows}, self._about)
         self._sealing.flush()
         self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
-        self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
-        self._columns: tuple[str, ...] = ()
-        self._kinds: dict[str, str] = {}
-        "JSON types of the columns, by name; a column that has always been null is absent."
-        self._tick_channel = 0
-        self._chunk_ns: int | None = None
-        self.begin_ns: int | None = None
-        "When the first message of this file was, ns since 1970."
+        self._tick_channels: dict[bool, int] = {}
+        self._begin_ns = self._chunk_ns = 0
+        "When the first message of this file was, and that of its present chunk, ns since 1970; 0 before the first."
 
-    @property
-    def size(self) -> int:
-        """Return the file's present size, bytes."""
-        return self._sealing.tell()
+    def _rotate(self, folder: RecordingFolder) -> None:
+        """End the file and go on in a new one where one is due, chained by its last seal.
 
-    @property
-    def lasted_s(self) -> float:
-        """Return the time from the file's first message to its present chunk, s; 0 before the first message."""
-        return 0.0 if self.begin_ns is None or self._chunk_ns is None else (self._chunk_ns - self.begin_ns) * 1e-9
-
-    def rotate(self, path: Path) -> None:
-        """End the file in order and go on in a new one, chained by its last seal. Ticks that wait go into the new one.
-
-        Raises FileExistsError, OSError.
+        Ticks that wait go into the new one. Raises FileExistsError, OSError.
         """
+        if not folder.is_due(self._sealing.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
+            return
+        try:
+            path = folder.new()
+        except OSError as error:
+            self._give_up(str(error.strerror))
         self._end()
         self._begin(path, self._sealing.digest)
 
-    def give_up(self, reason: str) -> NoReturn:
+    def _give_up(self, reason: str) -> NoReturn:
         """End the file in order, with `reason` in its metadata, and raise OSError with ENOSPC and that reason."""
         self.describe({CUT: reason})
         self._end()
@@ -156,38 +135,28 @@ class RecordingWriter:
     def telemetry(self, message: Telemetry) -> None:
         """Write one snapshot, and count missing `seq`; a `seq` that starts over (a restarted daemon) is not a loss.
 
-        A new mark keeps all ticks around it. Raises OSError.
+        A new mark keeps all ticks around it, and its segment. Raises OSError.
         """
         if self._last_seq is not None and message.seq > self._last_seq + 1:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
-        if message.mark is not None and message.mark != self.mark:
-            self.mark = message.mark
+        mark, before, self._mark = message.mark, self._mark, message.mark or self._mark
+        if mark is not None and mark != before:
             self._thinning.happened(message.t_ns)
         known = _known(msgspec.to_builtins(message))
         self._add(self._telemetry_channel, message.t_ns, msgspec.json.encode(known), self.telemetry_count)
-        self._overview.add(message.t_ns, False, known | {"mark": message.mark})
+        self._overview.add(message.t_ns, False, known | {"mark": mark})
         self.telemetry_count += 1
+        # every snapshot tells the newest mark, also one from before
+        if mark is not None and mark != before and mark.t_ns >= self._begin_ns and self._folder is not None:
+            self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message, thinned, and count gaps and missing numbers; numbers may start over.
-
-        Other columns than before, or values of another type, get a channel of their own under the same topic. Raises
-        OSError.
-        """
-        if not batch.rows:
-            return
-        if batch.columns != self._columns:
-            self._columns, self._tick_channel = batch.columns, 0
-            self._kinds = {name: TICK_KINDS[name] for name in batch.columns if name in TICK_KINDS}
+        """Write each row as one message, thinned, and count missing numbers; numbers may start over. Raises OSError."""
         number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
-        before_ns = self._last_tick_ns
         for row in batch.rows:
             t_ns = row[0]
             assert isinstance(t_ns, int)  # TickBatch has checked it
-            if self._last_tick_ns is not None and not 0 <= t_ns - self._last_tick_ns <= GAP_NS:
-                self._note_gap(abs(t_ns - self._last_tick_ns))
-            self._last_tick_ns = t_ns
             if number_at is not None and isinstance(number := row[number_at], int):
                 if self._last_tick is not None and number > self._last_tick + 1:
                     self.ticks_lost += number - self._last_tick - 1
@@ -196,15 +165,8 @@ class RecordingWriter:
             self._write(self._thinning.take((t_ns, message)))
             self._overview.add(t_ns, True, message)
             self.tick_count += 1
-        if before_ns is not None and self._last_tick_ns is not None:
-            self._batch_ns = self._last_tick_ns - before_ns
-
-    def note_silence(self, silence_ns: int) -> bool:
-        """Count `silence_ns` without a batch as a gap, and return True; False up to two batch intervals plus GAP_NS."""
-        if silence_ns <= 2 * self._batch_ns + GAP_NS:
-            return False
-        self._note_gap(silence_ns)
-        return True
+        if self._folder is not None:
+            self._rotate(self._folder)
 
     def close(self) -> None:
         """Write waiting ticks, overview, index and last seal, and close the file; nothing on a closed one.
@@ -235,43 +197,45 @@ class RecordingWriter:
         else:
             self.close()
 
-    def _note_gap(self, gap_ns: int) -> None:
-        self.gaps += 1
-        self.longest_gap_ms = max(self.longest_gap_ms, gap_ns / 1e6)
-
     def _write(self, ticks: Sequence[tuple[int, dict[str, Value]]]) -> None:
         for t_ns, message in ticks:
             self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
 
     def _channel_of(self, message: dict[str, Value]) -> int:
-        """Return the tick channel whose schema `message` obeys; registers one where a column's type is new."""
-        kinds = self._kinds
-        if not self._tick_channel or any(kinds.get(name) != _KINDS[type(value)] for name, value in message.items()):
-            kinds |= {name: _KINDS[type(value)] for name, value in message.items()}
-            key = tuple(kinds.items())
-            if key not in self._tick_channels:
-                self._tick_channels[key] = registered(self._mcap, TICKS_TOPIC, tick_schema(kinds))
-            self._tick_channel = self._tick_channels[key]
-        return self._tick_channel
+        """Return the tick channel whose schema `message` obeys: TICK_SCHEMA, or for other columns and types, none."""
+        fits = all(TICK_KINDS.get(name) == _KINDS[type(value)] for name, value in message.items())
+        if fits not in self._tick_channels:
+            self._tick_channels[fits] = registered(self._mcap, TICKS_TOPIC, TICK_SCHEMA if fits else OTHER_SCHEMA)
+        return self._tick_channels[fits]
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
         """Write a message. At a new chunk, first flush, seal the chunk before, and end the file where there is no
         room."""
-        if self._chunk_ns is None or abs(t_ns - self._chunk_ns) > CHUNK_NS:
-            self.begin_ns = self.begin_ns or t_ns
+        if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
-            self._require_room()
-            if self._chunk_ns is not None:
+            reason = self._room(self.path, self._sealing.tell() // INDEX_SHARE)
+            if reason:
+                self._give_up(reason)
+            if self._chunk_ns:
                 self._sealing.seal()
                 self._sealing.flush()
-            self._chunk_ns = t_ns
+            self._begin_ns, self._chunk_ns = self._begin_ns or t_ns, t_ns
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 
-    def _require_room(self) -> None:
-        """End the file and raise OSError where `room` names a reason."""
-        reason = self._room(self.path, self.size // INDEX_SHARE)
-        if reason:
-            self.give_up(reason)
+
+def sealed_mcap(
+    file: BinaryIO, key: bytes, sealed: Mapping[str, str], about: dict[str, str]
+) -> tuple[SealingFile, Writer]:
+    """Begin an MCAP file that says it is sealed, with a non-empty `key` by it, and what `about` tells of it.
+
+    `sealed` goes into the record that says so. Returns what seals the file, and what writes to it. Raises OSError.
+    """
+    sealing = SealingFile(file, key)
+    mcap = Writer(sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+    mcap.start(profile="", library=f"tormagd {__version__}")
+    mcap.add_metadata(SEALED, {"by": KEYED if key else PLAIN, **sealed})
+    mcap.add_metadata(ABOUT, about)
+    return sealing, mcap
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
@@ -306,15 +270,6 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
     return {"type": schema["type"]}
 
 
-def tick_schema(kinds: dict[str, str]) -> dict[str, Any]:
-    """Return the JSON schema of a tick message with columns of these JSON types, by name; an array holds strings."""
-    properties = {
-        name: {"type": "array", "items": {"type": "string"}} if kind == "array" else {"type": kind}
-        for name, kind in kinds.items()
-    }
-    return {"title": "tormagd.Tick", "type": "object", "properties": properties}
-
-
 def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Value]:
     """Return a tick's row as a message: by column, without values that are None, NaN or infinite.
 
@@ -328,19 +283,20 @@ def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Valu
     }
 
 
-def _tick_kinds() -> dict[str, str]:
-    """Return the JSON types of the columns that this version's daemon publishes; integers count as numbers."""
+def _tick_schema() -> dict[str, Any]:
+    """Return the JSON schema of a tick message with the columns of this version's daemon; integers are numbers."""
     (schema,), definitions = msgspec.json.schema_components([TickRecord], ref_template="{name}")
-    items = definitions[schema["$ref"]]["prefixItems"]
-    kinds = {
-        name: _plain(item, definitions)["type"] for name, item in zip(TickRecord.__struct_fields__, items, strict=True)
-    }
-    return {name: "number" if kind == "integer" else kind for name, kind in kinds.items()}
+    items = map(_plain, definitions[schema["$ref"]]["prefixItems"], repeat(definitions))
+    columns = dict(zip(TickRecord.__struct_fields__, items, strict=True))
+    whole = {name: {"type": "number"} for name, kind in columns.items() if kind["type"] == "integer"}
+    return {"title": "tormagd.Tick", "type": "object", "properties": columns | whole}
 
 
 _KINDS = {bool: "boolean", str: "string", tuple: "array", int: "number", float: "number"}
-TICK_KINDS = _tick_kinds()
+TICK_SCHEMA = _tick_schema()
+TICK_KINDS = {name: kind["type"] for name, kind in TICK_SCHEMA["properties"].items()}
 "By name, the JSON type of each column that this version's daemon publishes."
+OTHER_SCHEMA = {"title": "tormagd.OtherTick", "type": "object"}
 
 
 def _known(value: Any) -> Any:
