@@ -101,27 +101,16 @@ def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFi
     assert done.frames > 2 * done.ticks
 
 
-def test_what_came_damaged_is_counted_and_measured_alike(core: Core, on_can: Flight, can_path: Path) -> None:
+def test_what_came_damaged_is_measured_alike(core: Core, on_can: Flight, can_path: Path) -> None:
     entries = read_black_box(can_path).entries
     assert on_can.loop.stepper.safety.faults[0] is Fault.MEASUREMENT_STALE
-    done = again(core, entries)
-    assert (done.difference, done.damaged, done.first_damage.time_s, done.first_damage.why) == (
-        None,
-        pytest.approx(300, abs=2),
-        pytest.approx(DAMAGED_FROM_S, abs=0.003),
-        "State: CRC-8",
-    )
-    assert frames(can_path)[done.first_damage.frame - 1]["identifier"] == can_identifier(FUNCTION[State])
+    assert again(core, entries).difference is None
 
 
 def test_a_damaged_frame_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "read", DAMAGED_TICK)
     done = again(core, with_raw(box.entries, place, damaged(box.entries[place][2])), SNAPSHOT_S)
-    assert (done.damaged, done.ticks, done.first_damage.frame) == (
-        1,
-        DAMAGED_TICK - 1 - round(1e3 * SNAPSHOT_S),
-        number_of(box.entries, place - 1) + 1,
-    )
+    assert done.ticks == DAMAGED_TICK - 1 - round(1e3 * SNAPSHOT_S)
     found = done.difference
     assert (found.tick, found.field, found.frame) == (DAMAGED_TICK, "measurement.number", number_of(box.entries, place))
 

@@ -63,12 +63,7 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
     The text also tells gaps, damaged frames and, of a difference, its tick, field and both values.
     """
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
-    first, difference = done["first_damage"], done["difference"]
-    if first is not None:
-        notes += (
-            f"; {done['damaged']:,} of them came damaged ({done['resynchronised']:,} resynchronisations), the first is "
-            f"frame {first['frame']:,} at {first['time_s']:.3f} s: {first['why']}"
-        )
+    difference = done["difference"]
     span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
     if difference is None:
         frames = f"{done['frames']:,} frames give the measurements again" if done["frames"] else "no frames are in it"

@@ -46,29 +46,80 @@ def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None
     return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
 
 
-class Damage(msgspec.Struct, frozen=True):
-    """The first damaged frame: its number in the file, when it was read, and why it was refused."""
+class Conversation:
+    """The replayed connection between two entries of a black box, and its backend: reads what the file holds.
 
-    frame: int
-    time_s: float
-    why: str
-
-
-class RecordedWire:
-    """A backend that reads what the file holds, and keeps what the connection writes for comparison.
-
-    Makes `connection`, whose port it is, opened at 0 s.
+    What the connection writes is kept for comparison. Without a snapshot, or while no port was open, there is no
+    connection: reading and comparing then do nothing.
     """
 
-    def __init__(self, stream: Stream) -> None:
-        self.stream = stream
-        self.unread: Sequence[Any] = ()
+    def __init__(self, frame: int) -> None:
+        self._connection: Connection | None = None
+        self.stream: Stream = FrameStream()
+        self._unread: Sequence[Any] = ()
         "What to read next: one piece of bytes, or frames of a bus."
-        self.damaged: list[int] = []
-        "Indices of the corrupt pieces in the last read."
-        self.written: list[Sent] = []
-        self.connection = Connection(Device(), lambda: self, lambda: None)
-        self.connection.open(0.0)
+        self._written: list[Sent] = []
+        self.frame = frame
+        "Number of the newest frame in the file, from 1; set by the caller."
+        self.frames = 0
+
+    def begin(self, memory: Any) -> None:
+        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; None means no open port.
+
+        Raises InexactError, TypeError or LookupError for a memory that no connection writes: then there is no
+        connection.
+        """
+        self._connection = None
+        if memory is not None:
+            told = memory["stream"]
+            is_serial = FrameStream.__name__ in told
+            self.stream = FrameStream() if is_serial else CanStream(told[CanStream.__name__]["node"])
+            connection = Connection(Device(), lambda: self, lambda: None)
+            connection.open(0.0)
+            connection.remember(memory, KNOWN)
+            self._connection = connection
+
+    def compare_memory(self, recorded: Any) -> Found | None:
+        """Return where the connection's memory differs from the recorded one.
+
+        None where it does not differ, or no port was open.
+        """
+        own = self._connection
+        return None if own is None else differing("state.connection", recorded, own.memory(), self.frame)
+
+    def compare(self, recorded: Measurement | None) -> Found | None:
+        """Return where the connection's measurement differs from the one that the recorded step was given.
+
+        None where it does not differ, or no port was open.
+        """
+        own = self._connection
+        return None if own is None else differing("measurement", plain(recorded), plain(own.measurement), self.frame)
+
+    def read(self, entry: Any) -> None:
+        """Feed the connection a READ entry, and count its frames."""
+        if self._connection is not None:
+            _, now_s, raw = entry
+            self._unread = pieces = raw if isinstance(raw, list) else [raw]
+            self._connection.receive(now_s)
+            self.frames += len(pieces)
+
+    def wrote(self, entry: Any, output: Duty) -> Found | None:
+        """Send a step's `output` again, and return the first frame that differs from the WROTE entry.
+
+        None where none differs, which adds to the count of frames, or where no port was open.
+        """
+        if self._connection is None:
+            return None
+        _, now_s, recorded, unsent = entry
+        self._written, self.statistics.unsent = [], unsent
+        self._connection.exchange(
+            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
+        )
+        for number, (told, own) in enumerate(zip_longest(recorded, self._written), self.frame - len(recorded) + 1):
+            if packed(told) != packed(own):
+                return Found("written", _shown(told), _shown(own), number)
+        self.frames += len(recorded)
+        return None
 
     @property
     def statistics(self) -> LinkStatistics:
@@ -76,18 +127,9 @@ class RecordedWire:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Decode the pieces in `unread` and empty it; `damaged` then lists the pieces with a corrupt frame.
-
-        Raises BackendError where another host drives the CAN node.
-        """
-        messages: list[Message] = []
-        pieces, self.unread, self.damaged = self.unread, (), []
-        for place, piece in enumerate(pieces):
-            corrupt = self.stream.statistics.corrupt
-            messages += self._unpack(piece)
-            if self.stream.statistics.corrupt > corrupt:
-                self.damaged.append(place)
-        return messages
+        """Decode what is to be read next. Raises BackendError where another host drives the CAN node."""
+        pieces, self._unread = self._unread, ()
+        return [message for piece in pieces for message in self._unpack(piece)]
 
     def _unpack(self, piece: Any) -> list[Message]:
         """Decode one piece: bytes of a serial port, or a frame of a bus. Raises BackendError where another host drives
@@ -100,95 +142,11 @@ class RecordedWire:
             raise BackendError("another host drives the node") from error
 
     def send(self, message: Message) -> None:
-        """Encode a message, and keep its bytes or frame in `written`."""
-        self.written.append(self.stream.pack(message))
+        """Encode a message, and keep its bytes or frame."""
+        self._written.append(self.stream.pack(message))
 
     def close(self) -> None:
         """Do nothing: no port is open."""
-
-
-class Conversation:
-    """The replayed connection between two entries of a black box, with its counts of frames.
-
-    Without a snapshot, or while no port was open, there is no connection: reading and comparing then do nothing.
-    """
-
-    def __init__(self, frame: int) -> None:
-        self._wire: RecordedWire | None = None
-        self.frame = frame
-        "Number of the newest frame in the file, from 1; set by the caller."
-        self.frames = self.damaged = self.resynchronised = 0
-        self.first_damage: Damage | None = None
-
-    def begin(self, memory: Any) -> None:
-        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; None means no open port.
-
-        Raises InexactError, TypeError or LookupError for a memory that no connection writes: then there is no
-        connection.
-        """
-        self._wire = None
-        if memory is not None:
-            told = memory["stream"]
-            serial = FrameStream.__name__ in told
-            wire = RecordedWire(FrameStream() if serial else CanStream(told[CanStream.__name__]["node"]))
-            wire.connection.remember(memory, KNOWN)
-            self._wire = wire
-
-    def compare_memory(self, recorded: Any) -> Found | None:
-        """Return where the connection's memory differs from the recorded one.
-
-        None where it does not differ, or no port was open.
-        """
-        if self._wire is None:
-            return None
-        return differing("state.connection", recorded, self._wire.connection.memory(), self.frame)
-
-    def compare(self, recorded: Measurement | None) -> Found | None:
-        """Return where the connection's measurement differs from the one that the recorded step was given.
-
-        None where it does not differ, or no port was open.
-        """
-        if self._wire is None:
-            return None
-        return differing("measurement", plain(recorded), plain(self._wire.connection.measurement), self.frame)
-
-    def read(self, entry: Any) -> None:
-        """Feed the connection a READ entry, add to the counts of frames, damaged ones and resynchronisations.
-
-        The first damaged frame is kept in `first_damage`. Raises TypeError or ValueError for a malformed entry.
-        """
-        wire = self._wire
-        if wire is None:
-            return
-        _, now_s, raw = entry
-        wire.unread = pieces = raw if isinstance(raw, list) else [raw]
-        seen, found_again = wire.statistics, wire.statistics.resynchronisations
-        wire.connection.receive(now_s)
-        self.frames += len(pieces)
-        self.damaged += len(wire.damaged)
-        self.resynchronised += seen.resynchronisations - found_again
-        if wire.damaged and self.first_damage is None:
-            why = ", ".join(f"{name}: {each}" for name, each in seen.refused.items()) or "unreadable"
-            self.first_damage = Damage(self.frame - len(pieces) + 1 + wire.damaged[0], now_s, why)
-
-    def wrote(self, entry: Any, output: Duty) -> Found | None:
-        """Send a step's `output` again, and return the first frame that differs from the WROTE entry.
-
-        None where none differs, which adds to the count of frames, or where no port was open.
-        """
-        wire = self._wire
-        if wire is None:
-            return None
-        _, now_s, recorded, unsent = entry
-        wire.written, wire.statistics.unsent = [], unsent
-        wire.connection.exchange(
-            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
-        )
-        for number, (told, own) in enumerate(zip_longest(recorded, wire.written), self.frame - len(recorded) + 1):
-            if packed(told) != packed(own):
-                return Found("written", _shown(told), _shown(own), number)
-        self.frames += len(recorded)
-        return None
 
 
 def _shown(frame: Any) -> str:

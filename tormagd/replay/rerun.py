@@ -22,7 +22,7 @@ from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.inverse.solution import Answer
 from tormagd.recording.black_box import frames_in, is_tick
-from tormagd.replay.conversation import Conversation, Damage, Found, differing
+from tormagd.replay.conversation import Conversation, Found, differing
 from tormagd.replay.rebuild import ReplayError
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import RefusedError
@@ -85,8 +85,7 @@ class Rerun(msgspec.Struct, frozen=True):
     """What a replay gave: `ticks` that agree to the bit, from `from_s` to `to_s` after the file's first tick.
 
     `snapshots` of the whole state were compared, too. At each of `gaps` something is missing, and the replay went on
-    from the next snapshot. `frames` went through the same link; `damaged` and `resynchronised` count what was wrong
-    with those read, and `first_damage` is the first. `difference` is None where none was found.
+    from the next snapshot. `frames` went through the same link. `difference` is None where none was found.
     """
 
     ticks: int
@@ -95,9 +94,6 @@ class Rerun(msgspec.Struct, frozen=True):
     snapshots: int
     gaps: int
     frames: int
-    damaged: int
-    resynchronised: int
-    first_damage: Damage | None
     difference: Difference | None
 
 
@@ -158,12 +154,7 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
             number += 1
             if running.is_known:
                 ticks, to_s = ticks + 1, time_s
-    passed = running.conversation
-    damage = passed.first_damage and msgspec.structs.replace(
-        passed.first_damage, time_s=passed.first_damage.time_s - first_s
-    )
-    link = passed.frames, passed.damaged, passed.resynchronised, damage
-    return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, *link, difference)
+    return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, running.conversation.frames, difference)
 
 
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
