@@ -217,7 +217,9 @@ def test_settings_that_are_none_are_refused(setting: str, said: str) -> None:
         changed(Config(), [setting])
 
 
-def test_the_commands_of_tormagctl(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands_of_tormagctl(
+    ended: Flight, path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["replay", str(path), "--from", "3"]) == 0
     seal, said, *_ = capsys.readouterr().out.splitlines()
     assert seal.startswith("whole: ")
@@ -227,6 +229,9 @@ def test_the_commands_of_tormagctl(path: Path, tmp_path: Path, capsys: pytest.Ca
     assert main(["replay", str(damaged), "--from", "3"]) == 1
     seal, said, *_ = capsys.readouterr().out.splitlines()
     assert (seal.partition(":")[0], said.partition(",")[0]) == ("altered or damaged", "bit-exact")
+    keyed = ended.write(tmp_path / "keyed.mcap", b"k" * 16)
+    assert main(["replay", str(keyed), "--from", "3"]) == 1
+    assert "sealed with a key that is not here: it was not checked" in capsys.readouterr().out
     rubbish = tmp_path / "rubbish.mcap"
     rubbish.write_bytes(b"rubbish")
     assert main(["--json", "replay", str(rubbish)]) == 2

@@ -2,9 +2,10 @@
 
 import asyncio
 import contextlib
+import itertools
 import time
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
 import msgspec
@@ -17,8 +18,8 @@ from tormagd_client.printable import printable
 
 FRAME_S = 0.1
 STATUS_S = 1.0
-PORTRAIT_S = 10.0
-"Period of asking what the device can render, which changes slowly."
+PORTRAIT_EVERY = 10
+"Of so many times, once it is asked too what the device can render, which changes slowly."
 SILENT_S = 0.5
 KEPT = 1_000
 "Snapshots kept: those of `frame.SHOWN_S`."
@@ -49,12 +50,7 @@ class Live:
     async def run(self) -> None:
         """Listen and publish without end; a daemon that is gone is waited for."""
         async with asyncio.TaskGroup() as tasks:
-            for each in (
-                self._listen(),
-                self._tell(),
-                self._every(STATUS_S, self._look_at_status),
-                self._every(PORTRAIT_S, self._look_at_portrait),
-            ):
+            for each in (self._listen(), self._tell(), self._ask()):
                 tasks.create_task(each)
 
     @contextlib.contextmanager
@@ -100,25 +96,21 @@ class Live:
             elif silent_s > SILENT_S:
                 self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
 
-    async def _every(self, period_s: float, look: Callable[[], Awaitable[None]]) -> None:
-        """Call `look` every `period_s`, without end, while the daemon is heard; a client's error is passed over.
+    async def _ask(self) -> None:
+        """Ask for status every STATUS_S, and each PORTRAIT_EVERY-th time for the portrait, while the daemon is heard.
 
-        Requests to a silent daemon would wait, and come at once.
+        A client's error is passed over. Requests to a silent daemon would wait, and come at once.
         """
-        while True:
-            await asyncio.sleep(period_s)
+        for number in itertools.count(1):
+            await asyncio.sleep(STATUS_S)
             if time.monotonic() - self._heard_s < SILENT_S:
                 with contextlib.suppress(ClientError):  # the page says that nothing is heard
-                    await look()
-
-    async def _look_at_status(self) -> None:
-        self._status = await self._client.status()
-        self._learn(self._status)
-        self._publish("status", self._shown_status())
-
-    async def _look_at_portrait(self) -> None:
-        self._portrait = {"portrait": (await self._client.describe()).portrait}
-        self._publish("portrait", self._portrait)
+                    self._status = await self._client.status()
+                    self._learn(self._status)
+                    self._publish("status", self._shown_status())
+                    if number % PORTRAIT_EVERY == 0:
+                        self._portrait = {"portrait": (await self._client.describe()).portrait}
+                        self._publish("portrait", self._portrait)
 
     def _publish(self, name: str, value: object) -> None:
         """Queue an event for every browser; a full queue loses its oldest."""

@@ -106,7 +106,6 @@ class Recorded:
             "duration_s": self.duration_s,
             "notes": file.notes,
             "followed": in_words(self._overview.following),
-            "version": file.metadata.get("version", ""),
             "scene": (file.described("scene", dict[str, Any]) or {}).get("name", ""),
             "portrait": file.described("portrait", PortraitReport),
             "overview": self._glance(),

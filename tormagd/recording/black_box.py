@@ -91,12 +91,12 @@ class Derived:
 
     def __init__(self, columns: tuple[str, ...]) -> None:
         self._columns = columns
-        self.ticks = self._frames = 0
+        self._ticks = self._frames = 0
         self._offset_ns: int | None = None
         "From the monotonic clock to ns since 1970; None while unknown."
 
     def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
-        """Yield the messages derived from one part's entries, and count them in `ticks`.
+        """Yield the messages derived from one part's entries.
 
         `offset_ns` takes the monotonic clock to ns since 1970. The first one given times all frames, so that they stay
         in order; while it is None, frames count from 0 of the monotonic clock. Raises ValueError or TypeError for odd
@@ -107,30 +107,24 @@ class Derived:
         for entry in entries:
             if is_tick(entry):
                 data = msgspec.json.encode(known_values(self._columns, entry))
-                yield Shown(TICKS_TOPIC, entry[0], self.ticks, data)
-                self.ticks += 1
+                yield Shown(TICKS_TOPIC, entry[0], self._ticks, data)
+                self._ticks += 1
             for frame in frames_in(entry):
                 self._frames += 1
                 t_ns = round(frame.monotonic_s * 1e9) + (self._offset_ns or 0)
                 yield Shown(FRAMES_TOPIC, t_ns, self._frames, msgspec.json.encode(frame))
 
 
-def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> int:
-    """Write a new black box of these parts, whole or not at all, and return how many ticks are in it.
+def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> None:
+    """Write a new black box of these parts, whole or not at all.
 
     `header` needs `columns`: the names of a tick's values, a list in JSON. `key` seals the file; an empty one seals it
     without a key. Raises FileExistsError where `path` exists, OSError, and ValueError or TypeError for odd entries.
     """
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
-    with in_place_of(path) as beside:
-        return _write(beside, header, parts, key)
-
-
-def _write(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes) -> int:
-    """Write the file in place, sealed, and return how many ticks are in it."""
     derived = Derived(tuple(json.loads(header["columns"])))
-    with path.open("wb") as file:
+    with in_place_of(path) as beside, beside.open("wb") as file:
         sealing, mcap = sealed_mcap(file, key, {}, {"version": __version__, "kind": HEADER})
         mcap.add_metadata(HEADER, header)
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
@@ -143,7 +137,6 @@ def _write(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes
                 t_ns, channel = shown.t_ns, channels[shown.topic]
                 mcap.add_message(channel, t_ns, shown.data, publish_time=t_ns, sequence=shown.sequence)
         sealing.finish(mcap)
-    return derived.ticks
 
 
 def is_tick(entry: Any) -> bool:

@@ -106,10 +106,10 @@ class RecordingFolder:
         """Return whether a segment of this size (bytes) and length is to end."""
         return size >= self.budget.segment_bytes or lasted_s >= self.budget.segment_s
 
-    def room(self, segment: Path, needed_bytes: int) -> str:
+    def room(self, needed_bytes: int) -> str:
         """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty where there is.
 
-        A recorder asks this while it writes. `segment`, the file being written, plays no part.
+        A recorder asks this while it writes.
         """
         if shutil.disk_usage(self.path).free >= self.budget.free_bytes + needed_bytes:
             return ""

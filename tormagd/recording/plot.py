@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import cycle
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib import rcParams
@@ -107,7 +108,9 @@ def _headline(overview: Overview, title: str, notes: Sequence[str]) -> str:
     names = ", ".join(overview.spans_s("faults"))
     how = in_words(overview.following)
     followed = [f"followed {how} (sensor noise included)"] if how else []
-    return "\n".join([f"{title}  ·  {f'faults: {names}' if names else 'no fault'}", *followed, *notes])
+    return "\n".join(
+        [f"{title}  ·  {f'faults: {names}' if names else 'no fault'}", *followed, *(fill(note, 100) for note in notes)]
+    )
 
 
 def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:

@@ -78,7 +78,6 @@ class RecordingWriter:
     ) -> None:
         self._key, self._thinning = key, Thinning(every)
         self._folder = place if isinstance(place, RecordingFolder) else None
-        self._room = disk_room if self._folder is None else self._folder.room
         self._about = {"version": __version__, **(metadata or {})}
         if every > 1:
             self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
@@ -213,7 +212,8 @@ class RecordingWriter:
         room."""
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
-            reason = self._room(self.path, self._sealing.tell() // INDEX_SHARE)
+            index_bytes = self._sealing.tell() // INDEX_SHARE
+            reason = disk_room(self.path, index_bytes) if self._folder is None else self._folder.room(index_bytes)
             if reason:
                 self._give_up(reason)
             if self._chunk_ns:
