@@ -74,7 +74,7 @@ def _head() -> str:
         "| `[finger]` | of a pad, in place of the handle: how deep it is pressed, and how fast; refused alike |\n"
         "| `insert.gap_speed_mm_s` | the fastest that the gap may move, where that is less than the configuration's |\n"
         "| `budget.core_share` | `tormagctl scene check` refuses a scene where a daemon takes more |\n"
-        "| `budget.delay_ms` | older setpoints are `SOURCE_LATE` |\n"
+        "| `budget.delay_ms` | older setpoints are `SOURCE_LATE`; the budget of the whole way |\n"
         "| `bandwidth.control_hz`, `inference_hz` | the rates that the daemon runs at where its configuration states "
         "none, control at 500 Hz at the least; slower stated ones are refused |\n"
         "| `[solver]` | the search for the field ([which](guides/scene.md)) |\n"

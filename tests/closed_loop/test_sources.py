@@ -15,6 +15,7 @@ from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.source_clock import SETTLED_S
 from tormagd.daemon.way import Way
 from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import Budget
 from tormagd_client.messages import SourceReport
 
 START_NS = 1_800_000_000_000_000_000
@@ -92,7 +93,7 @@ def run(
     at: Callable[[SetpointInbox, float], None] = lambda inbox, now_s: None,
 ) -> Run:
     """The loop with these publishers; `at` is called in every tick, as an operator may."""
-    inbox, way, samples, start_s = SetpointInbox(priority), Way(), [], loop.now_s
+    inbox, way, samples, start_s = SetpointInbox(priority), Way(Budget()), [], loop.now_s
     coming = heapq.merge(*(each.messages(start_s, lasts_s) for each in publishers))
     following = next(coming, None)
     for _ in range(round(lasts_s * 1e3)):

@@ -19,7 +19,7 @@ from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
-from tormagd.scenes.scene import load_scene
+from tormagd.scenes.scene import Budget, load_scene
 from tormagd_client.messages import BeliefReport, Explained, Telemetry, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
@@ -240,7 +240,7 @@ def planned(stamp_s: float) -> Plan:
 
 
 def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -> None:
-    way = Way()
+    way = Way(Budget())
     way.ticked(0.5, planned(-math.inf))
     way.to_duty.refresh()
     found = way.report(400.0, 0.013)
@@ -261,7 +261,7 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
 
 
 def test_the_whole_way_is_the_sum_of_what_is_known_of_its_parts() -> None:
-    way = Way()
+    way = Way(Budget())
     for tick in range(1, 100):
         way.ticked(tick * 1e-2, planned(tick * 1e-2 - 0.02))
     way.to_duty.refresh()
@@ -272,3 +272,7 @@ def test_the_whole_way_is_the_sum_of_what_is_known_of_its_parts() -> None:
         pytest.approx(20.0 + 0.4 + 13.0, abs=0.7),
     )
     assert way.report(None, 0.013).total_ms is None
+
+
+def test_the_ways_budget_is_the_scenes_where_it_states_one() -> None:
+    assert [Way(each).report(None, 0.0).budget_ms for each in (Budget(delay_ms=150.0), Budget())] == [150.0, 400.0]

@@ -100,7 +100,7 @@ class TelemetryLoop:
         self._newest: Telemetry
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
-        self._way = Way()
+        self._way = Way(core.scene.budget)
         self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
         self.topics = Topics(config, core, control, inference, endpoint)
         self.scene_change: SceneChange | None = None
@@ -118,6 +118,7 @@ class TelemetryLoop:
         """Publish and report on `core` from now on, with its configuration and profiles; reports are made anew."""
         self.config, self._core, self.topics.core, self._profiles = config, core, core, profiles
         self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
+        self._way.budget = core.scene.budget
         self._status, self._reported_s = None, -math.inf
 
     def record(self, _beat: Beat) -> None:

@@ -7,12 +7,15 @@ the sensor's filters, cannot be seen here.
 
 import math
 
+from msgspec import UNSET
+
 from tormagd.control.records import Plan
 from tormagd.daemon.rate_group import Histogram
+from tormagd.scenes.scene import Budget
 from tormagd_client.messages import WayReport
 
 BUDGET_MS = 400.0
-"Delay above which a task becomes slower and its contacts harder."
+"Delay above which a task becomes slower and its contacts harder; of scenes that do not state `budget.delay_ms`."
 
 
 class Way:
@@ -21,7 +24,9 @@ class Way:
     `to_duty` has the delays, us.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, budget: Budget) -> None:
+        self.budget = budget
+        "The scene's."
         self.to_duty = Histogram()
         self._stamp_s = -math.inf
 
@@ -50,5 +55,5 @@ class Way:
             device_us=device_us,
             carriages_ms=round(carriages_ms, 2),
             total_ms=total_ms,
-            budget_ms=BUDGET_MS,
+            budget_ms=BUDGET_MS if self.budget.delay_ms is UNSET else self.budget.delay_ms,
         )

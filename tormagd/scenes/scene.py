@@ -110,7 +110,8 @@ class Budget(Strict, frozen=True):
     core_share: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
     "Of one processor's time, for steps and plans."
     delay_ms: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
-    "How old setpoints may be when they come: the limit `SOURCE_LATE`. Any age is allowed where it is not given."
+    """How old setpoints may be when they are followed (`SOURCE_LATE`), and the budget of the whole way. Where it is not
+    given, any age is allowed, and the way's budget is 400 ms."""
 
 
 class Terms(Strict, frozen=True):
