@@ -17,6 +17,8 @@ from tormagd_client.printable import require
 MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 MAX_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
+MOST_PLAYOUT_MS = 200.0
+"Half of what the whole way from sensor to force may take."
 
 
 class Device(Strict, frozen=True):
@@ -43,10 +45,12 @@ class Device(Strict, frozen=True):
 
 
 class Sources(Strict, frozen=True):
-    """Who may hold the brake before whom."""
+    """Who may hold the brake before whom, and how long setpoints are held back."""
 
     priority: tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...] = ()
     "Names of sources. Each takes the brake over from those after it, and from all that are not listed."
+    playout_ms: Annotated[float, Meta(ge=0.0, le=MOST_PLAYOUT_MS)] = 0.0
+    "Setpoints are followed so long after their stamps, as evenly as they were stamped. 0: as soon as they come."
 
     def __post_init__(self) -> None:
         names = self.priority

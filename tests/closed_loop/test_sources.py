@@ -11,7 +11,8 @@ import pytest
 
 from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop, Sample
-from tormagd.daemon.inbox import SetpointInbox
+from tormagd.config import Sources
+from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
 from tormagd.daemon.source_clock import SETTLED_S
 from tormagd.daemon.way import Way
 from tormagd.safety.codes import Limit
@@ -89,11 +90,11 @@ def run(
     loop: ClosedLoop,
     *publishers: Publisher,
     lasts_s: float = 3.0,
-    priority: tuple[str, ...] = (),
+    sources: Sources = EQUAL_SOURCES,
     at: Callable[[SetpointInbox, float], None] = lambda inbox, now_s: None,
 ) -> Run:
     """The loop with these publishers; `at` is called in every tick, as an operator may."""
-    inbox, way, samples, start_s = SetpointInbox(priority), Way(Budget()), [], loop.now_s
+    inbox, way, samples, start_s = SetpointInbox(sources), Way(Budget()), [], loop.now_s
     coming = heapq.merge(*(each.messages(start_s, lasts_s) for each in publishers))
     following = next(coming, None)
     for _ in range(round(lasts_s * 1e3)):
@@ -101,6 +102,7 @@ def run(
         while following is not None and following[0] <= now_s:
             inbox.take(following[1], now_s, START_NS + round(now_s * 1e9))
             following = next(coming, None)
+        inbox.playout.update(now_s)
         at(inbox, now_s - start_s)
         used = loop.planner.planned
         samples.append(loop.tick(inbox.newest))
@@ -136,7 +138,7 @@ def test_on_purpose_another_takes_over_along_the_ramp(armed: ClosedLoop, core: C
             inbox.give("b", armed.now_s)
 
     publishers = Publisher(constant(1.6)), Publisher(constant(0.8), "b", from_s=1.0 if priority else 0.5)
-    done = run(armed, *publishers, priority=priority, at=give)
+    done = run(armed, *publishers, sources=Sources(priority=priority), at=give)
     assert done.error_N(constant(1.6), 0.9, 1.0) < 0.05
     assert done.error_N(constant(0.8), 1.6) < 0.05
     assert done.fastest_loss_N_s() <= 1.25 * core.scene.force.release_N_s
@@ -225,3 +227,32 @@ def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
     assert found.total_ms == pytest.approx((found.to_duty_us.p99 + 400.0) * 1e-3 + found.carriages_ms, abs=0.02)
     assert found.total_ms is not None
     assert (found.total_ms < 400.0, found.budget_ms) == (True, 400.0)
+
+
+def aligned_rms_N(done: Run, from_s: float = 1.5) -> float:
+    """How well the plant's force follows the swell, with the delay that explains most taken out."""
+    known = [(each.time_s - done.start_s, each.truth.force_N) for each in done.samples]
+    counted = [(time_s, force_N) for time_s, force_N in known if time_s >= from_s]
+    return min(
+        math.sqrt(sum((force_N - swell_N(time_s - late_s)) ** 2 for time_s, force_N in counted) / len(counted))
+        for late_s in (0.002 * step for step in range(60))
+    )
+
+
+def test_a_playout_of_the_delays_p99_makes_jitter_as_good_as_a_steady_way(arm: Callable[[], ClosedLoop]) -> None:
+    def jittery() -> Publisher:
+        """20 ms, and exponentially distributed 10 ms on top."""
+        noise = random.Random(3)
+        return Publisher(swell_N, way_s=lambda t: 0.02 + noise.expovariate(1.0 / 0.01))
+
+    before = run(arm(), jittery())
+    playout_ms = before.of("a").delay_us.p99 * 1e-3
+    steady = run(arm(), Publisher(swell_N, way_s=lambda t: playout_ms * 1e-3))
+    played = run(arm(), jittery(), sources=Sources(playout_ms=playout_ms))
+    assert aligned_rms_N(played) <= 1.2 * aligned_rms_N(steady) < aligned_rms_N(before)
+    # and it is told what that costs: the rest of the playout, besides the delay
+    found = played.inbox.report(played.samples[-1].time_s).playout
+    assert found is not None
+    assert 0 < found.late <= 0.03 * found.setpoints
+    assert found.held_us.p50 == pytest.approx(playout_ms * 1e3 - before.of("a").delay_us.p50, rel=0.1)
+    assert played.way.to_duty.report.p50 == pytest.approx(playout_ms * 1e3 + 1_000.0, rel=0.05)

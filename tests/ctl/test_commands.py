@@ -365,6 +365,7 @@ def test_status_text_shows_each_source_and_the_way(status_with, source_with):
     silent = source_with(state="stale", silent_ms=2_340.0, **fine)
     delay_us = source["delay_us"]
     setpoints = status_with()["setpoints"] | {"by_source": {"a": source, "b\x1b[2J": other, "c": silent}}
+    setpoints["playout"] = {"playout_ms": 60.0, "held_us": delay_us, "jitter_us": 2_340.0, "setpoints": 900, "late": 7}
     way = {"to_duty_us": delay_us, "device_us": 400.0, "carriages_ms": 12.3, "total_ms": 16.1, "budget_ms": 400.0}
     known = msgspec.convert(status_with(setpoints=setpoints, way=way), Status)
     lines = status_text(known, Colour(sys.stderr)).splitlines()
@@ -377,6 +378,9 @@ def test_status_text_shows_each_source_and_the_way(status_with, source_with):
     assert lines[at + 3].endswith("clock not known yet")
     assert lines[at + 4].startswith("source    'c': silent for 2.3 s, ")
     assert lines[at + 5] == (
+        "playout   60 ms after the stamp: adds 1.2 ms (p50), takes out 2.3 ms of jitter, 7 of 900 came too late"
+    )
+    assert lines[at + 6] == (
         "way       16.1 ms of 400 ms, stamp to duty 1.2 ms (p50) 3.4 ms (p99), device 0.4 ms, carriages 12.3 ms"
     )
     silent = msgspec.structs.replace(known, setpoint_cf=None)

@@ -362,6 +362,7 @@ async def page_of(shown: Live | Recorded, tmp_path: Path, width: int, height: in
 
 DRAWN = """[...document.querySelectorAll("canvas")].every((it) => it.width * it.height > 0 &&
     it.getContext("2d").getImageData(0, 0, it.width, it.height).data.some((value) => value))"""
+HELD_US = {"p50": 1_200.0, "p99": 3_400.0, "p999": 4_000.0, "max": 4_100.0}
 FITS = "document.documentElement.scrollWidth <= window.innerWidth"
 needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium here")
 
@@ -381,11 +382,17 @@ async def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Pa
         fake_daemon.says(
             not_granted=["realtime.lock_memory: no"],
             following={"rms_N": 0.136, "aligned_rms_N": 0.044, "delay_ms": 180.0},
+            setpoints=fake_daemon.taken()
+            | {"playout": {"playout_ms": 60.0, "held_us": HELD_US, "jitter_us": 2_340.0, "setpoints": 900, "late": 7}},
         )
         await page.until("document.querySelector('#codes').textContent.includes('did not grant realtime.lock_memory')")
         assert await page.ask("document.querySelector('#following').textContent") == (
             "136 mN RMS off, 44 with a delay of 180 ms taken out"
         )
+        assert await page.ask("document.querySelector('#playout').textContent") == (
+            "Playout 60 ms after the stamp: adds 1.2 ms, takes out 2.3 ms of jitter, 7 of 900 came too late."
+        )
+        await page.until(FITS)
         fake_daemon.is_silent = True
         await page.until("document.querySelector('#silence').textContent.startsWith('nothing heard for')")
 

@@ -15,7 +15,7 @@ from hypothesis import given, strategies as st
 from rich.console import Console
 
 from tormagd.ctl.top_screen import CURVES, EIGHTHS, Seen, columns, screen, span, sparkline
-from tormagd_client.messages import Explained, FollowingReport, Status
+from tormagd_client.messages import ExecReport, Explained, FollowingReport, PlayoutReport, Status
 
 SIZES = ((80, 24), (160, 50))
 RATE = Explained("RATE", "the force was asked to change faster than the carriages travel", "ask for slower changes")
@@ -24,6 +24,8 @@ SKEW = Explained(
     "the carriages are 1.31 mm apart, 1 mm is allowed: one screw is slower than the other, or an encoder lost counts",
     "look for dirt or wear on the slower screw, then clear-fault and home",
 )
+HELD_US = ExecReport(p50=1_200.0, p99=3_400.0, p999=4_000.0, max=4_100.0)
+PLAYOUT = PlayoutReport(playout_ms=60.0, held_us=HELD_US, jitter_us=2_340.0, setpoints=900, late=7)
 EVIL = "\x1b[2J\x07\u202e"
 
 
@@ -97,10 +99,12 @@ def test_what_was_not_granted_and_how_the_force_is_followed_is_said(seen: Seen) 
         seen.status,
         not_granted=("realtime.fifo_priority = 50: not permitted", "realtime.lock_memory: no"),
         following=FollowingReport(rms_N=0.136, aligned_rms_N=0.044, delay_ms=180.0),
+        setpoints=msgspec.structs.replace(seen.status.setpoints, playout=PLAYOUT),
     )
     text = "\n".join(drawn(seen._replace(status=known), 120, 40))
     assert "kernel     did not grant realtime.fifo_priority, realtime.lock_memory; next: tormagctl doctor" in text
     assert "followed   to 136 mN RMS, 44 mN with a delay of 180 ms taken out" in text
+    assert "playout    60 ms after the stamp: adds 1.2 ms (p50), takes out 2.3 ms of jitter, 7 of 900 came" in text
 
 
 def test_before_the_first_snapshot_and_after_the_last_it_says_so(seen: Seen) -> None:

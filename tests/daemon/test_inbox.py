@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from tormagd.config import Sources
 from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
@@ -26,7 +27,7 @@ class Publishing:
     """An inbox on a clock that the test moves."""
 
     def __init__(self, priority: tuple[str, ...] = ()) -> None:
-        self.inbox = SetpointInbox(priority)
+        self.inbox = SetpointInbox(Sources(priority=priority))
         self.now_s = 0.0
         self.step_s = 0.0
         "By how much somebody has set the time of day forward."

@@ -12,6 +12,7 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
+from tormagd.daemon.playout import Taken
 from tormagd.physics.errors import DomainError
 
 US = 1_000
@@ -86,7 +87,8 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
     planner = Mock(**{"plan.side_effect": [error, None]})
     rig = Rig(planner)
     inbox = rig.inbox
-    rejected = inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)
+    rejected = TimedSetpoint(1.0, 0.0, 0.1)
+    inbox.playout.in_force = Taken(rejected, "a", 1)
     rig.beat(is_asked=True)
     assert (rig.failed.call_count, inbox.newest, inbox.refused) == (1, None, 1)
     assert "no gap could be planned" in str(inbox.last_refusal)

@@ -66,10 +66,11 @@ V1: dict[type[msgspec.Struct], str] = {
     "unanswered_share damaged_share",
     RoundTripReport: "least p50 p99",
     ClockReport: "offset_s drift_ppm residual_us windows outliers",
-    SetpointReport: "accepted refused dropped oversize last_refusal newest_source sources by_source",
+    SetpointReport: "accepted refused dropped oversize last_refusal newest_source sources by_source playout",
     SourceReport: "state silent_ms session seq accepted refused lost restarts delay_us jitter_us clock_behind_ms "
     "clock_steps clock cause remedy",
     WayReport: "to_duty_us device_us carriages_ms total_ms budget_ms",
+    messages.PlayoutReport: "playout_ms held_us jitter_us setpoints late",
     PeersReport: "connections refused dropped refusals drops",
     PeerReport: "endpoint address key reason count",
     RateReport: "grade hz runs merged overruns stalls lateness_us exec_us",

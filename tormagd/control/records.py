@@ -40,6 +40,7 @@ class TimedSetpoint(Value):
     holder                       number of the publisher that holds the brake; each new holder has a greater one
     limits                       what is wrong with how it came, or with who else sends setpoints
     withdraw_N                   for a handle that withdraws; None: the wall's friction, `force_N` without a wall
+    playout_s                    by how much later than its stamp it is meant to be followed, to take out jitter
     wall                         what the handle pushes against; None: nothing
     """
 
@@ -55,6 +56,7 @@ class TimedSetpoint(Value):
         holder: int = 0,
         limits: tuple[Limit, ...] = (),
         withdraw_N: float | None = None,
+        playout_s: float = 0.0,
         wall: Wall | None = None,
     ) -> None:
         self.force_N: Final = force_N
@@ -67,6 +69,7 @@ class TimedSetpoint(Value):
         self.holder: Final = holder
         self.limits: Final = limits
         self.withdraw_N: Final = withdraw_N
+        self.playout_s: Final = playout_s
         self.wall: Final = wall
 
     def asked_N(self, travel: "Travel") -> float:

@@ -14,6 +14,7 @@ from tormagd_client.messages import (
     Explained,
     LinkReport,
     PeersReport,
+    PlayoutReport,
     RateReport,
     RoundTripReport,
     SetpointReport,
@@ -66,6 +67,7 @@ def status_text(known: Status, colour: Colour) -> str:
         f"skew {_number(known.skew_mm, 'mm', 3)}",
         f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
         *(line for name, source in known.setpoints.by_source.items() for line in _source(name, source, colour)),
+        *_said("playout   ", played(known.setpoints.playout), str),
         *_way(None if known.setpoint_cf is None else known.way, colour),
         *_peers(known.peers, colour),
         *_device(known, colour),
@@ -120,6 +122,16 @@ def _long_ago(known: Status) -> str:
     """Say how long ago the setpoint came, where that is over OLD_MS; empty for a recent one, or none."""
     age_ms = known.setpoint_age_ms
     return "" if known.setpoint_cf is None or age_ms is None or age_ms < OLD_MS else f" {age_ms * 1e-3:.0f} s ago"
+
+
+def played(report: PlayoutReport | None) -> str:
+    """Say what the playout adds and takes out, and how many setpoints came too late for it; empty for None."""
+    if report is None:
+        return ""
+    return (
+        f"{report.playout_ms:g} ms after the stamp: adds {report.held_us.p50 * 1e-3:.1f} ms (p50), takes out "
+        f"{report.jitter_us * 1e-3:.1f} ms of jitter, {report.late} of {report.setpoints} came too late"
+    )
 
 
 def refused(not_granted: Iterable[str]) -> dict[str, str]:
@@ -202,7 +214,7 @@ def _way(way: WayReport | None, colour: Colour) -> list[str]:
     lines = [f"way       {', '.join(parts)}"]
     if total_ms is not None and total_ms > way.budget_ms:
         shares = {
-            "from the stamp to the duty: look at the delay of the source": to_duty.p99 * 1e-3,
+            "from the stamp to the duty: look at the delay of the source, and at the playout": to_duty.p99 * 1e-3,
             "at the device: look at the round trip in tormagctl firmware": (way.device_us or 0.0) * 1e-3,
             "in the carriages: ask for slower changes, or look at the motors": way.carriages_ms or 0.0,
         }

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from tormagd.ctl.status import believed, refused, torque
+from tormagd.ctl.status import believed, played, refused, torque
 from tormagd.following import in_words
 from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
@@ -169,6 +169,8 @@ def _timing(status: Status, width: int) -> Table:
     )
     heard = f"from {setpoints.newest_source!r}" if setpoints.accepted else "none yet"
     table.add_row(Text("setpoints", "bold"), f"{heard}, {setpoints.accepted} accepted, {setpoints.refused} refused")
+    if playout := played(setpoints.playout):
+        table.add_row(Text("playout", "bold"), playout)
     if status.not_granted:
         lacking = f"did not grant {', '.join(map(printable, refused(status.not_granted)))}; next: tormagctl doctor"
         table.add_row(Text("kernel", "bold"), Text(lacking, "yellow"))

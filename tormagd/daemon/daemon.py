@@ -79,7 +79,7 @@ class Daemon:
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, lambda: self._control.lose_link())
-        self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
+        self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources, keys)
         self._endpoint.inbox.begin_scene(core.scene)
         self._keys = keys
         rates = config.rates
@@ -274,7 +274,7 @@ class Daemon:
             return
         self._config = again.config
         self._telemetry.config = again.config
-        self._endpoint.inbox.priority = again.config.sources.priority
+        self._endpoint.inbox.sources = again.config.sources
         log.info(
             "configuration read again: %s", f"now in force: {', '.join(again.taken)}" if again.taken else "no news"
         )

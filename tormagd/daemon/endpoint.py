@@ -12,10 +12,11 @@ from typing import Any
 
 import zmq
 
+from tormagd.config import Sources
 from tormagd.daemon.admission import MAY, Admission
 from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.arrivals import Arrivals, is_readable
-from tormagd.daemon.inbox import SetpointInbox
+from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
 from tormagd.daemon.listeners import Listeners
 from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
@@ -67,9 +68,9 @@ Answer = Callable[[Request], Any]
 class Endpoint:
     """The daemon's four sockets: takes setpoints, publishes telemetry and recording, answers requests.
 
-    With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO. `priority` lists the sources
-    that may take the brake, the foremost first. `keys` is None where no endpoint is guarded. It holds the `inbox` of
-    setpoints, the waiting `requests`, the `admission` of peers, and the topics' `listeners`.
+    With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO. `sources` says who may take
+    the brake from whom, and how long setpoints are held back. `keys` is None where no endpoint is guarded. It holds the
+    `inbox` of setpoints, the waiting `requests`, the `admission` of peers, and the topics' `listeners`.
 
     Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
     """
@@ -78,13 +79,13 @@ class Endpoint:
         self,
         endpoints: Endpoints,
         io_priority: int = 0,
-        priority: tuple[str, ...] = (),
+        sources: Sources = EQUAL_SOURCES,
         keys: KeyRing | None = None,
     ) -> None:
         self._context = context(io_priority)
         self._files: list[SocketFile] = []
         self._guarded = {name for name in ENDPOINTS if endpoints.is_guarded(name)}
-        self.inbox = SetpointInbox(priority)
+        self.inbox = SetpointInbox(sources)
         self.arrivals = Arrivals()
         self.admission = Admission(self._context, keys, self.arrivals)
         try:
@@ -109,7 +110,7 @@ class Endpoint:
         self.listeners = Listeners()
 
     def take_setpoints(self) -> bool:
-        """Read the waiting setpoints, DRAIN messages at most; return True if one became the newest setpoint.
+        """Read the waiting setpoints, DRAIN messages at most; return True if another setpoint is in force.
 
         What a publisher sends beyond its allowance, or with a key that is off the list, is dropped and counted. A
         message of several parts is refused. Nothing is raised.
@@ -133,7 +134,7 @@ class Endpoint:
                 continue
             data = b"" if frame.more else frame.bytes
             is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
-        return is_newer
+        return self.inbox.playout.update(time.monotonic()) or is_newer
 
     def publish(self, telemetry: Telemetry) -> None:
         """Send one telemetry message to all subscribers. Never waits: a subscriber that is too slow misses it."""

@@ -3,6 +3,7 @@
 Five judgements are made of each message, a module each. Is it newer than the last of its source (`sequence`)? Do its
 stamps count ns (`stamp_unit`)? How old is it, by a clock that may be wrong (`source_clock`)? How does its source send
 (`source_manner`)? May its source hold the brake (`hold`)?
+What was taken may then wait (`playout`).
 """
 
 import logging
@@ -11,12 +12,14 @@ import shlex
 import time
 from collections import deque
 
+from tormagd.config import Sources
 from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.daemon.hold import Hold, is_passed
+from tormagd.daemon.playout import Playout, Taken
 from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
-from tormagd.daemon.source_manner import MOST_LATE_S, Needs, SourceManner, needs_of
+from tormagd.daemon.source_manner import MOST_LATE_S, Arrival, Needs, SourceManner, needs_of
 from tormagd.daemon.stamp_unit import LOOKED_AT, StampUnit
 from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
@@ -43,6 +46,9 @@ NEWS, NEWS_S = 4, 1.0
 "Lines for the log that wait, and how long each waits after the one before."
 STEP_NAMED_S = 60.0
 "A clock that was set is named for so long."
+
+EQUAL_SOURCES = Sources()
+"None goes before another, and nothing is held back."
 
 log = logging.getLogger(__name__)
 
@@ -79,11 +85,12 @@ class _Source:
     def is_stale(self, now_s: float) -> bool:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
-    def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, needs: Needs) -> None:
+    def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
         """Make `setpoint` the source's newest, heard at `now_s` and stamped by `delay_s`, its age on arrival.
 
         `delay_s` is by the corrected clock; below 0 counts as 0. Once the clock's offset is known, delay and manner of
-        sending are judged by the scene's `needs`.
+        sending are judged by the scene's `needs`. With `playout_s` it is judged by its age when
+        it is followed.
         """
         clock = self.clock
         if clock.is_settled:
@@ -91,19 +98,20 @@ class _Source:
             # a way of over 0.2 s counts as the clock's offset: the two cannot be told apart from here
             hidden_s = clock.offset_s if 0.0 < clock.offset_s < MOST_LATE_S and not clock.steps else 0.0
             preview_s = len(setpoint.preview_N or ()) * (setpoint.preview_dt_ms or 0.0) * 1e-3
-            self.manner.hear(now_s, hidden_s + delay_s, self.sequence.lost, preview_s, needs)
+            self.manner.hear(now_s, Arrival(delay_s, hidden_s, playout_s, self.sequence.lost, preview_s), needs)
         # a stamp in the future counts as now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 
 
 class SetpointInbox:
-    """Chooses the setpoint to plan for, `newest`: the newest valid one of the source that holds the brake (`hold`).
+    """Chooses the setpoint to plan for, `newest`: the newest valid one of the source that holds the brake,
+    once it is due.
 
-    No sockets, no clock. `priority` lists sources, the foremost first. It keeps up to SOURCES sources, counts messages
-    as `accepted`, `refused` or `dropped`, and keeps the `last_refusal`.
+    No sockets, no clock. It keeps up to SOURCES sources, counts messages as `accepted`, `refused` or `dropped`, and
+    keeps the `last_refusal`.
     """
 
-    def __init__(self, priority: tuple[str, ...] = ()) -> None:
+    def __init__(self, sources: Sources = EQUAL_SOURCES) -> None:
         self.has_way = True
         "Whether the scene's element is a brake, whose handle goes either way, and no pad."
         self.accepted = 0
@@ -111,11 +119,12 @@ class SetpointInbox:
         self.dropped = 0
         self.oversize = 0
         self.last_refusal: str | None = None
-        self.newest: TimedSetpoint | None = None
+        self.playout = Playout()
         self._needs = Needs()
         self.hold = Hold()
-        self.priority = priority
-        "May be set anew at any time; who holds the brake goes on holding it until another message comes."
+        self.sources = sources
+        """Who goes before whom, and how long setpoints wait. May be set anew at any time; holder and waiting setpoints
+        stay until another message comes."""
         self._sources: dict[str, _Source] = {}
         self._other, self._other_s = "", -SILENT_S
         "The source that was refused last, because another holds the brake, and when."
@@ -124,7 +133,7 @@ class SetpointInbox:
         self._turn = 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
-        """Decode and judge one message; return True if it became the newest setpoint. Nothing is raised.
+        """Decode and judge one message; return True if another setpoint is in force after it. Nothing is raised.
 
         Old or repeated messages count in `dropped`, refused ones in `refused`. `last_refusal` says why, unless another
         source holds the brake. `now_s` is the control clock, `realtime_ns` CLOCK_REALTIME of the same moment.
@@ -141,9 +150,9 @@ class SetpointInbox:
     def give(self, name: str, now_s: float) -> None:
         """Make the source `name` the holder of the brake, as an operator's choice.
 
-        Its newest setpoint becomes the one to plan for, and a log line is queued, unless it is the holder already.
-        Sources of higher priority do not take the brake from it. Raises RefusedError for a source that is not known, or
-        whose newest setpoint is no longer valid.
+        Its newest setpoint becomes the one to plan for when it is due, and a log line is queued, unless it is the
+        holder already. Sources of higher priority do not take the brake from it. Raises RefusedError for a source that
+        is not known, or whose newest setpoint is no longer valid.
         """
         source = self._sources.get(name)
         if source is None:
@@ -157,11 +166,20 @@ class SetpointInbox:
             self.hold = self.hold._replace(is_given=True)
             return
         self._hand_over(name, "an operator's choice", is_given=True)
-        self.newest = self._timed(source, now_s)
+        self._play(source, now_s)
+
+    @property
+    def newest(self) -> TimedSetpoint | None:
+        """Return the setpoint to plan for, the newest that is due; None before the first."""
+        in_force = self.playout.in_force
+        return None if in_force is None else in_force.setpoint
 
     def newest_is(self) -> tuple[str, int]:
-        """Return source and `seq` of the newest setpoint. Call only while `newest` is not None."""
-        return self.hold.source, self._sources[self.hold.source].setpoint.seq
+        """Return source and `seq` of the setpoint to plan for. Raises ValueError while there is none."""
+        in_force = self.playout.in_force
+        if in_force is None:
+            raise ValueError("no setpoint is in force: allowed is to ask while `newest` is one")
+        return in_force.source, in_force.seq
 
     def passed_over(self) -> tuple[str, int] | None:
         """Return source and newest `seq` of the source last refused because another one holds the brake.
@@ -176,12 +194,16 @@ class SetpointInbox:
 
         In a scene whose element is a pad, setpoints with `withdraw_cf` or `contact` are refused.
         """
-        self.newest, self.has_way, self._needs = None, scene.element == "torque", needs_of(scene)
+        self.playout.forget()
+        self.has_way, self._needs = scene.element == "torque", needs_of(scene)
 
     def withdraw(self, reason: str) -> None:
-        """Forget the newest setpoint and count it as refused for `reason`; without one do nothing."""
-        if self.newest is not None:
-            self.newest = None
+        """Forget the setpoint to plan for and those that wait, and count one as refused for `reason`.
+
+        Without a setpoint to plan for do nothing.
+        """
+        if self.playout.in_force is not None:
+            self.playout.forget()
             self._refuse(reason)
 
     def _refuse(self, reason: str) -> None:
@@ -207,9 +229,14 @@ class SetpointInbox:
         return why | holder.manner.found
 
     def refresh(self, now_s: float) -> None:
-        """Update the reported figures of one source, each in turn, and queue a log line if its clock is newly wrong."""
+        """Update the reported figures of the playout, and of one source, each in turn.
+
+        Queues a log line if that source's clock is newly wrong.
+        """
         if self._sources:
             self._turn += 1
+            if self.sources.playout_ms > 0.0:
+                self.playout.held.refresh()
             source = tuple(self._sources.values())[self._turn % len(self._sources)]
             if source.refresh(now_s):
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
@@ -231,10 +258,11 @@ class SetpointInbox:
             newest_source=self.hold.source,
             sources={name: source.sequence.seq for name, source in self._sources.items()},
             by_source={name: self._source_report(name, now_s) for name in newest[:REPORTED]},
+            playout=self.playout.report(self.sources.playout_ms),
         )
 
     def _judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> bool:
-        """Judge a decoded setpoint; return True if it became the newest.
+        """Judge a decoded setpoint; return True if another one is in force after it.
 
         A stray of its sequence is dropped and counted. One whose source may not take the brake, or that is stale itself
         beside another holder, is refused and counted; `last_refusal` stays. A new run of the holder's begins a ramp.
@@ -258,12 +286,13 @@ class SetpointInbox:
                 f"stamp_ns is {-delay_s * 1e3:.0f} ms ahead of this clock: allowed is {AHEAD_S * 1e3:.0f} ms, "
                 "until the clock of its source has shown itself"
             )
-        source.keep(setpoint, now_s, delay_s, self._needs)
+        source.keep(setpoint, now_s, delay_s, self.sources.playout_ms * 1e-3, self._needs)
         hold = self.hold
         if source.setpoint.source != hold.source:
-            is_free = self.newest is None or now_s - self.newest.stamp_s > self.newest.valid_for_s
+            taken = self.playout.newest
+            is_free = taken is None or now_s - taken.setpoint.stamp_s > taken.setpoint.valid_for_s
             if hold.source and (
-                source.is_stale(now_s) or not is_passed(hold, setpoint.source, self.priority, is_stale=is_free)
+                source.is_stale(now_s) or not is_passed(hold, setpoint.source, self.sources.priority, is_stale=is_free)
             ):
                 self._other, self._other_s = setpoint.source, now_s
                 source.refused += 1
@@ -274,8 +303,12 @@ class SetpointInbox:
             self.hold = hold._replace(number=hold.number + 1)  # another process sends as this source now
         source.accepted += 1
         self.accepted += 1
-        self.newest = self._timed(source, now_s)
-        return True
+        return self._play(source, now_s)
+
+    def _play(self, source: _Source, now_s: float) -> bool:
+        """Give the source's newest setpoint to the playout; return True if another one is in force after it."""
+        setpoint = source.setpoint
+        return self.playout.update(now_s, Taken(self._timed(source, now_s), setpoint.source, setpoint.seq))
 
     def _hand_over(self, name: str, why: str, *, is_given: bool = False) -> None:
         """Make the source `name` the holder, and queue a log line that says `why`, unless it is the first."""
@@ -306,28 +339,30 @@ class SetpointInbox:
             self.hold.number,
             (*others, *source.manner.found),
             setpoint.withdraw_cf,
+            self.sources.playout_ms * 1e-3,
             None if wall is None else Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
         )
 
     def _make_room(self, name: str, now_s: float) -> None:
         """Forget a source where SOURCES are kept, so that `name` can be added. Raises MessageError where none may go.
 
-        The source that was silent for longest goes, if for over SILENT_S. Otherwise one that is not in `priority` goes
-        for one that is. The holder stays.
+        The source that was silent for longest goes, if for over SILENT_S. Otherwise one that has no priority goes
+        for one that has. The holder stays.
         """
         if len(self._sources) < SOURCES:
             return
         others = [source for other, source in self._sources.items() if other != self.hold.source]
         silent = [source for source in others if now_s - source.heard_s > SILENT_S]
-        unlisted = [source for source in others if source.setpoint.source not in self.priority]
-        may_go = silent or (unlisted if name in self.priority else [])
+        listed = self.sources.priority
+        unlisted = [source for source in others if source.setpoint.source not in listed]
+        may_go = silent or (unlisted if name in listed else [])
         if not may_go:
             raise MessageError(f"source = {name!r}: allowed are {SOURCES} publishers at a time")
         oldest = min(may_go, key=lambda source: source.heard_s)
         del self._sources[oldest.setpoint.source]
 
     def _why_stale(self, holder: _Source, now_s: float) -> Explanation:
-        """Explain a stale setpoint: the holder has fallen silent, or its messages come late."""
+        """Explain a stale setpoint: the holder has fallen silent, its messages come late, or they wait too long."""
         name, silent_ms = self.hold.source, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
@@ -337,6 +372,12 @@ class SetpointInbox:
                 "check the publisher and the network",
             )
         late_ms = (holder.heard_s - holder.stamp_s) * 1e3
+        if late_ms <= valid_ms and self.sources.playout_ms > 0.0:
+            return Explanation(
+                f"setpoints of {name!r} are followed from {self.sources.playout_ms:g} ms after their stamp on, and are "
+                f"valid for {valid_ms:g} ms; the force decays to F_min before the next one",
+                "send a valid_for_ms of sources.playout_ms and two periods more, or lower sources.playout_ms",
+            )
         return Explanation(
             f"setpoints of {name!r} come {late_ms:.0f} ms late, and are valid for {valid_ms:g} ms; the force decays to "
             "F_min",

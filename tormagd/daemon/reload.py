@@ -7,7 +7,7 @@ import msgspec
 
 from tormagd.config import Config
 
-LIVE = frozenset({"sources.priority", "realtime.watchdog_ms"})
+LIVE = frozenset({"sources.priority", "sources.playout_ms", "realtime.watchdog_ms"})
 "Keys that nothing but the loop that looks at them knows. From all others something was built at the start."
 
 

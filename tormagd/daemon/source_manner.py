@@ -3,10 +3,12 @@
 No I/O and no clock: times are arguments.
 """
 
+import math
 from typing import NamedTuple
 
 from msgspec import UNSET
 
+from tormagd.config import MOST_PLAYOUT_MS
 from tormagd.control.ask.governor import AHEAD_S
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.scenes.scene import Scene
@@ -20,6 +22,8 @@ SLACK = 1.25
 "A publisher's own timer may be so much slower than it is meant to be."
 MOST_LATE_S = 1.0
 "A stamp that is older is of a wrong clock."
+PLAYOUT_STEP_MS = 10
+"A playout that is told as a remedy is rounded up to this."
 
 
 class Needs(NamedTuple):
@@ -42,6 +46,23 @@ def needs_of(scene: Scene) -> Needs:
     )
 
 
+class Arrival(NamedTuple):
+    """How one message came.
+
+    delay_s    after its stamp, by the corrected clock
+    hidden_s   the part of its way that counts as the clock's offset, and is not in `delay_s`
+    playout_s  how long after its stamp it is followed first
+    lost       messages missing so far, of all
+    preview_s  the length of its preview, 0 without one
+    """
+
+    delay_s: float
+    hidden_s: float
+    playout_s: float
+    lost: int
+    preview_s: float
+
+
 class SourceManner:
     """Judges once a second how the setpoints of one publisher come. Give it each message.
 
@@ -55,32 +76,30 @@ class SourceManner:
         self._lost = self._messages = 0
         self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
 
-    def hear(self, now_s: float, late_s: float, lost: int, preview_s: float, needs: Needs) -> None:
-        """Take a message, `late_s` after its stamp by the corrected clock; set `found` anew when a window is full.
+    def hear(self, now_s: float, arrival: Arrival, needs: Needs) -> None:
+        """Take a message; set `found` anew when a window is full. The first message only begins the window.
 
-        `lost` counts all messages missing so far. `preview_s` is the length of its preview, 0 without one. The first
-        message only begins the window.
+        Lateness is judged when a message is followed: after its delay or its playout, whichever is longer.
         """
         if self._began_s is None:
-            self._begin(now_s, lost)
+            self._begin(now_s, arrival.lost)
             return
+        late_s = max(arrival.delay_s, arrival.playout_s)
         self._messages += 1
         self._least_s, self._most_s = min(self._least_s, late_s), max(self._most_s, late_s)
         self._sum_s += late_s
         past_s = now_s - self._began_s
         if past_s >= WINDOW_S and self._messages >= LEAST_MESSAGES:
-            self.found = self._judged(past_s, lost - self._lost, preview_s, needs)
-            self._begin(now_s, lost)
+            self.found = self._judged(past_s, arrival, needs)
+            self._begin(now_s, arrival.lost)
 
     def _begin(self, now_s: float, lost: int) -> None:
         self._began_s, self._lost, self._messages = now_s, lost, 0
         self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
 
-    def _judged(self, past_s: float, lost: int, preview_s: float, needs: Needs) -> dict[Limit, Explanation]:
-        """Return what is wrong in a window of `past_s` in which `lost` messages were missing; empty where nothing is.
-
-        SOURCE_LOSS, SOURCE_SELDOM (not within `preview_s`), SOURCE_LATE and SOURCE_JITTER may be found.
-        """
+    def _judged(self, past_s: float, last: Arrival, needs: Needs) -> dict[Limit, Explanation]:
+        """Return what is wrong in a window of `past_s` that `last` has ended; empty where nothing is."""
+        lost = last.lost - self._lost
         sent = self._messages + lost
         found = {}
         if lost > MOST_LOST * sent:
@@ -88,20 +107,30 @@ class SourceManner:
                 f"{lost / sent:.0%} of its setpoints are lost on the way", "look for the lossy part of the network"
             )
         spacing_s = past_s / sent
-        if spacing_s > max(SLACK / needs.setpoint_hz, preview_s):
+        if spacing_s > max(SLACK / needs.setpoint_hz, last.preview_s):
             found[Limit.SOURCE_SELDOM] = Explanation(
                 f"it sends {1.0 / spacing_s:.1f} setpoints a second, and the scene needs {needs.setpoint_hz:g}",
                 "send more often, or a preview_N that reaches to the next one",
             )
-        mean_s = self._sum_s / self._messages
+        mean_s = self._sum_s / self._messages + last.hidden_s
         if mean_s > needs.delay_s:
+            is_held = last.playout_s > 0.0 and last.playout_s + last.hidden_s > needs.delay_s
             found[Limit.SOURCE_LATE] = Explanation(
-                f"its setpoints come {mean_s * 1e3:.0f} ms late, and the scene allows {needs.delay_s * 1e3:.0f}",
-                "take a shorter way, set the clocks by chrony, or send a preview_N of that length",
+                f"its setpoints are {mean_s * 1e3:.0f} ms late, and the scene allows {needs.delay_s * 1e3:.0f}",
+                f"{'lower sources.playout_ms, ' if is_held else ''}take a shorter way, set the clocks by chrony, or "
+                "send a preview_N of that length",
             )
         if self._most_s - self._least_s > SPREAD_S:
+            from_ms, to_ms = ((each_s + last.hidden_s) * 1e3 for each_s in (self._least_s, self._most_s))
             found[Limit.SOURCE_JITTER] = Explanation(
-                f"its setpoints come {self._least_s * 1e3:.0f} to {self._most_s * 1e3:.0f} ms late",
-                "send a preview_N that is longer than that differs, or take a steadier way",
+                f"its setpoints are {from_ms:.0f} to {to_ms:.0f} ms late", _steadied(self._most_s * 1e3)
             )
         return found
+
+
+def _steadied(most_ms: float) -> str:
+    """Return the remedy for jitter of up to `most_ms` after the stamp: the playout that takes it out, if one does."""
+    playout_ms = math.ceil(most_ms / PLAYOUT_STEP_MS) * PLAYOUT_STEP_MS
+    if playout_ms > MOST_PLAYOUT_MS:
+        return "send a preview_N that is longer than that differs, or take a steadier way"
+    return f"set sources.playout_ms = {playout_ms}, which delays every setpoint to that, or take a steadier way"

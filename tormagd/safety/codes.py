@@ -406,7 +406,7 @@ LIMITS: dict[Limit, Explanation] = {
     ),
     Limit.SOURCE_JITTER: Explanation(
         "setpoints are on the way for times that differ by over 20 ms",
-        "send a preview_N that is longer than that, or take a steadier way",
+        "set sources.playout_ms to the longest, send a preview_N longer than that, or take a steadier way",
         Reaction.HELD,
         2000.0,
         "over a second",

@@ -286,8 +286,25 @@ class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
     remedy: str
 
 
+class PlayoutReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What holding setpoints back until `playout_ms` after their stamps does, of the setpoints that were held.
+
+    `held_us` is the delay that it adds, `jitter_us` the jitter (RFC 3550) that it takes out. Of all `setpoints` since
+    the start, `late` came later than that and were followed at once.
+    """
+
+    playout_ms: float
+    held_us: ExecReport
+    jitter_us: float
+    setpoints: int
+    late: int
+
+
 class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts of setpoints since the daemon's start; `sources` has each publisher's newest `seq`."""
+    """Counts of setpoints since the daemon's start; `sources` has each publisher's newest `seq`.
+
+    `playout` is null where no setpoint is held back.
+    """
 
     accepted: int
     refused: int
@@ -297,6 +314,7 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
     newest_source: str
     sources: dict[str, int]
     by_source: dict[str, SourceReport] = msgspec.field(default_factory=dict)
+    playout: PlayoutReport | None = None
 
 
 class WayReport(msgspec.Struct, frozen=True, kw_only=True):

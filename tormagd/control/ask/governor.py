@@ -139,6 +139,7 @@ class Governor:
         _require_numbers(setpoint, age_s)
         if age_s > setpoint.valid_for_s:
             return self._decay(dt_s, lowest_N, age_s, (Limit.STALE, *setpoint.limits))
+        soon_s = max(age_s - setpoint.playout_s, 0.0)
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
         # slope and forecast are of what is asked: the least force of the device is learned, and varies
         asked_N = setpoint.asked_N(travel)
@@ -153,17 +154,17 @@ class Governor:
         foresight = 1.0
         wall = setpoint.wall
         if not travel.is_pushing and (wall is not None or setpoint.withdraw_N is not None):
-            self._foreseen(setpoint.stamp_s, heard_N, age_s)
+            self._foreseen(setpoint.stamp_s, heard_N, soon_s)
             self.sent_N, self.expected_N = None, None
             path_N = [force_N] * len(PATH_S)
         elif wall is not None:
-            self._foreseen(setpoint.stamp_s, heard_N, age_s)
+            self._foreseen(setpoint.stamp_s, heard_N, soon_s)
             path_N = self._against(wall, travel, dt_s, force_N, bounds, device, lag_s)
         elif setpoint.preview_N:
-            path_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
+            path_N = self._previewed(setpoint, soon_s, dt_s, force_N, bounds, device, lag_s)
         else:
-            foresight = self._foreseen(setpoint.stamp_s, heard_N, age_s)
-            path_N = self._continued(max(age_s, 0.0), dt_s, force_N, foresight, bounds, device, lag_s)
+            foresight = self._foreseen(setpoint.stamp_s, heard_N, soon_s)
+            path_N = self._continued(soon_s, dt_s, force_N, foresight, bounds, device, lag_s)
         if self.blend_N != 0.0 and wall is None:
             path_N = [within(each_N + self.blend_N, bounds) for each_N in path_N]
         governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
@@ -246,16 +247,16 @@ class Governor:
         most_N = [wall.force_N(place_mm + rate_mm_s * after_s) + over_N for after_s in PATH_S]
         return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
-    def _foreseen(self, stamp_s: float, allowed_N: float, age_s: float) -> float:
+    def _foreseen(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
         """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1.
 
-        0 without the term forecast, and for a setpoint older than MAX_STEP_S, which the forecast takes all the same.
+        0 without the term forecast, and for a setpoint that was meant to be followed `soon_s` > MAX_STEP_S ago.
         """
         if not self._has_forecast:
             return 0.0
         self.forecast.update(stamp_s, allowed_N)
         # a publisher that has fallen silent is not believed to go on as it did
-        return self.forecast.trust if age_s <= MAX_STEP_S else 0.0
+        return self.forecast.trust if soon_s <= MAX_STEP_S else 0.0
 
     def _previewed(
         self,
@@ -267,11 +268,11 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S on the best path for the setpoint's preview; now is `soon_s` after its stamp.
+        """Return the forces (7) at PATH_S on the best path for the setpoint's preview.
 
-        With the term forecast and a preview shorter than TIMES_S, the forecast goes on from the preview's end. The
-        preview's mean slope then becomes `slope_N_s`. Otherwise the forecast forgets. Updates `sent_N` and
-        `expected_N`.
+        Now is `soon_s` after its stamp and playout. With the term forecast and a preview shorter than TIMES_S, the
+        forecast goes on from the preview's end. The preview's mean slope then becomes `slope_N_s`. Otherwise the
+        forecast forgets. Updates `sent_N` and `expected_N`.
         """
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
@@ -319,9 +320,9 @@ class Governor:
     ) -> list[float]:
         """Return the forces (7) at PATH_S along the setpoints' slope, or the forecast, weighted by `foresight`, 0..1.
 
-        Now is `soon_s` after the newest stamp; the slope carries AHEAD_S at most. Off a ramp, where the gap gets there
-        within NEAR_S, a `foresight` above 0 mixes in the best path for these forces. Updates `sent_N` and `expected_N`:
-        None where no such path is followed.
+        Now is `soon_s` after the newest stamp and its playout; the slope carries AHEAD_S at most. Off a ramp, where the
+        gap gets there within NEAR_S, a `foresight` above 0 mixes in the best path for these forces. Updates `sent_N`
+        and `expected_N`: None where no such path is followed.
         """
         begins_s = soon_s + foresight * lag_s
         times_s = _FORECAST_S if foresight > 0.0 else PATH_S
@@ -398,8 +399,9 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         and -_LARGEST <= (setpoint.displacement_mm or 0.0) <= _LARGEST
         and -_LARGEST <= (setpoint.rate_mm_s or 0.0) <= _LARGEST
         and -_LARGEST <= (setpoint.withdraw_N or 0.0) <= _LARGEST
+        and -_LARGEST <= setpoint.playout_s <= _LARGEST
     ):
-        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N"):
+        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N", "playout_s"):
             require_number(name, getattr(setpoint, name) or 0.0)
         require_number("age_s", age_s)
     if setpoint.wall is not None:

@@ -221,6 +221,9 @@ function live() {
       at("aligned").textContent = how.delay_ms
         ? `${mN(how.aligned_rms_N)} with a delay of ${how.delay_ms.toFixed(0)} ms taken out` : "without a delay";
     }
+    const played = status.setpoints.playout, ms = (us) => (1e-3 * us).toFixed(1);
+    at("playout").textContent = played ? `Playout ${played.playout_ms} ms after the stamp: adds ${ms(played.held_us.p50)} ms, `
+      + `takes out ${ms(played.jitter_us)} ms of jitter, ${played.late} of ${played.setpoints} came too late.` : "";
     const {control} = status.rates, late = control?.lateness_us;
     at("rates").textContent = "Of every twentieth tick of 20 s, bars as logarithms. " + (control ? `Of all: ${control.hz.toFixed(0)} Hz, `
       + `p50 ${late.p50.toFixed(0)}, p99 ${late.p99.toFixed(0)}, longest ${late.max.toFixed(0)} µs; ${control.stalls} stalls.` : "");
