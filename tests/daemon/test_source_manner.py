@@ -28,6 +28,7 @@ CASES: list[tuple[float, Delay, float, tuple[Limit, ...]]] = [
     (500.0, steady(0.02), 0.0, ()),
     (500.0, steady(0.1), 0.0, ()),
     (500.0, steady(0.4), 0.0, (Limit.SOURCE_LATE,)),
+    (100.0, lambda noise: 0.4 + noise.uniform(0.0, 0.05), 0.0, (Limit.SOURCE_JITTER, Limit.SOURCE_LATE)),
     (500.0, lambda noise: 0.02 + noise.uniform(0.0, 0.005), 0.0, ()),
     (500.0, lambda noise: 0.02 + noise.uniform(0.0, 0.03), 0.0, (Limit.SOURCE_JITTER,)),
     (500.0, lambda noise: 0.02 + abs(noise.gauss(0.0, 0.05)), 0.0, (Limit.SOURCE_JITTER,)),

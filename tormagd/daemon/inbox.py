@@ -19,7 +19,7 @@ from tormagd.daemon.playout import Playout, Taken
 from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
-from tormagd.daemon.source_manner import MOST_LATE_S, Arrival, Needs, SourceManner, needs_of
+from tormagd.daemon.source_manner import Arrival, Needs, SourceManner, needs_of
 from tormagd.daemon.stamp_unit import LOOKED_AT, StampUnit
 from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
@@ -95,10 +95,8 @@ class _Source:
         clock = self.clock
         if clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
-            # a way of over 0.2 s counts as the clock's offset: the two cannot be told apart from here
-            hidden_s = clock.offset_s if 0.0 < clock.offset_s < MOST_LATE_S and not clock.steps else 0.0
             preview_s = len(setpoint.preview_N or ()) * (setpoint.preview_dt_ms or 0.0) * 1e-3
-            self.manner.hear(now_s, Arrival(delay_s, hidden_s, playout_s, self.sequence.lost, preview_s), needs)
+            self.manner.hear(now_s, Arrival(delay_s, clock.hidden_s, playout_s, self.sequence.lost, preview_s), needs)
         # a stamp in the future counts as now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 

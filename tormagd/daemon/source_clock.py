@@ -17,6 +17,9 @@ from tormagd.hardware.link_statistics import DeviceClock
 MOST_WAY_S = 0.2
 """A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take. More is
 the clock."""
+MOST_LATE_S = 1.0
+"""A least lateness between the two may be either: the clock is corrected by it, and the limits of sources count it as
+the way. More is a wrong clock."""
 AHEAD_S = 0.05
 "A stamp may be this far ahead before its clock has shown itself; a clock that is further off than this is wrong."
 SETTLED_S = 0.2
@@ -67,6 +70,11 @@ class SourceClock:
     def is_wrong(self) -> bool:
         """Whether the clock's offset is known and beyond AHEAD_S, so that the clock should be set."""
         return self.is_settled and not -AHEAD_S <= self.offset_s <= AHEAD_S
+
+    @property
+    def hidden_s(self) -> float:
+        """Return the part of `offset_s`, s, that may as well be the way; 0 once the clock was seen to be set."""
+        return self.offset_s if 0.0 < self.offset_s < MOST_LATE_S and not self.steps else 0.0
 
     def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
         """Take the message that came at `now_s`, and return its delay, s. `lateness_s` is our time less its stamp.
@@ -134,7 +142,7 @@ class SourceClock:
         """Lower offset and way by `fall_s`: the message was less late than both of them together.
 
         First goes what was granted to drift, then the way. What is left is the clock's: above STEP_S, a settled clock
-        was set forward.
+        was set forward, unless its offset may be the way, and still may be.
         """
         granted_s = min(fall_s, self._leaked_s)
         self.offset_s -= granted_s
@@ -142,8 +150,9 @@ class SourceClock:
         shorter_s = min(fall_s - granted_s, self.way_s)
         self.way_s -= shorter_s
         ahead_s = fall_s - granted_s - shorter_s
+        was_hidden = self.hidden_s > 0.0
         self.offset_s -= ahead_s
-        if ahead_s > STEP_S and self.is_settled:
+        if ahead_s > STEP_S and self.is_settled and not (was_hidden and self.hidden_s > 0.0):
             self._set(now_s, ahead_s)
 
     def _set(self, now_s: float, by_s: float) -> None:

@@ -10,6 +10,7 @@ from msgspec import UNSET
 
 from tormagd.config import MOST_PLAYOUT_MS
 from tormagd.control.ask.governor import AHEAD_S
+from tormagd.daemon.source_clock import MOST_LATE_S
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.scenes.scene import Scene
 
@@ -20,8 +21,6 @@ SPREAD_S = 0.02
 "By more than this from message to message a delay shows in the force: what the slope carries over is 50 ms."
 SLACK = 1.25
 "A publisher's own timer may be so much slower than it is meant to be."
-MOST_LATE_S = 1.0
-"A stamp that is older is of a wrong clock."
 PLAYOUT_STEP_MS = 10
 "A playout that is told as a remedy is rounded up to this."
 
