@@ -63,10 +63,10 @@ def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
         paths = sorted(path for path in folder.iterdir() if path.suffix == PUBLIC)
     except OSError as error:
         raise ConfigError(
-            f"{folder}: {error.strerror}: it is to hold the public keys of a role, none or more"
+            f"{folder}: {error.strerror}: make it, for the public keys of a role, none or more"
         ) from error
     if len(paths) > MAX_KEYS:
-        raise ConfigError(f"{folder} holds {len(paths)} keys: allowed are {MAX_KEYS}")
+        raise ConfigError(f"{folder} holds {len(paths)} keys: allowed are {MAX_KEYS}; take out those that nobody uses")
     _refuse_writable(folder, information.st_mode)
     for path in paths:
         _refuse_writable(path, regular(path).st_mode)

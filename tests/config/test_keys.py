@@ -122,7 +122,7 @@ def test_what_is_no_file_is_not_waited_for(folder: Path) -> None:
 def test_what_is_missing_is_named(folder: Path) -> None:
     (folder / "observe/observer.key").unlink()
     (folder / "observe").rmdir()
-    with pytest.raises(ConfigError, match=f"^{folder}/observe: No such file or directory: it is to hold"):
+    with pytest.raises(ConfigError, match=f"^{folder}/observe: No such file or directory: make it"):
         ring(folder)
     with pytest.raises(ConfigError, match=r"^/nowhere/a.key_secret: No such file"):
         load_pair(Path("/nowhere/a.key_secret"))

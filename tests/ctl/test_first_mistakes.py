@@ -69,7 +69,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl metrics --port http", 2, "--port: 'http': allowed is a finite number", {}),
     ("tormagctl completion fish", 2, "shell: 'fish': allowed are bash, zsh", {}),
     ("tormagctl guide recovery", 2, "no such guide; did you mean `recover`?", {}),
-    ("tormagctl calibrate", 2, "give one of --insert NAME, --motors and --device", {}),
+    ("tormagctl calibrate", 2, "calibrate takes one of three things", {}),
     ("tormagctl calibrate --insert MRE-50-40 --rates 1", 2, "--rates: '1': allowed are 3..60 rates", {}),
     ("tormagctl keys generate", 2, "the following arguments are required: DIR|FILE", {}),
     ("tormagctl keys show /nowhere/a.key", 2, "/nowhere/a.key", {}),

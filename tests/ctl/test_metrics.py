@@ -117,7 +117,7 @@ def test_without_its_extra_it_says_which(ctl: Any, monkeypatch: pytest.MonkeyPat
     monkeypatch.delitem(sys.modules, "tormagd.ctl.metrics")
     error = ctl("--json", "metrics").ended(2).error
     assert (error["message"], error["hint"]) == (
-        "prometheus_client is not installed",
+        "metrics needs prometheus_client, which is not installed",
         "pip install 'tormagd[metrics]'",
     )
 

@@ -84,7 +84,9 @@ def test_slices_that_always_have_something_to_do_take_turns(rig: Rig) -> None:
 def test_an_error_ends_its_phase_alone_and_is_told_once(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     rig.errors["read"] = TypeError("a bug")
     assert rig.beat(0) == rig.beat(1) == ["read", "drive"]
-    assert [record.getMessage() for record in caplog.records] == ["the beat's 'read' failed"]
+    assert [record.getMessage() for record in caplog.records] == [
+        "the beat goes on without 'read', which failed: report the trace"
+    ]
 
 
 @pytest.mark.parametrize(

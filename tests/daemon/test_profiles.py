@@ -174,7 +174,7 @@ def test_a_wrong_file_is_named_and_nothing_is_believed_of_it(
 
 def test_a_folder_that_cannot_be_written_keeps_nothing_and_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ProfileError, match="nothing was kept"):
+    with pytest.raises(ProfileError, match="File exists"):
         keep(tmp_path / "file", 7)
 
 

@@ -128,4 +128,4 @@ def test_a_search_that_is_gone_answers_no_more_and_one_that_cannot_start_is_refu
     for _ in range(3):
         process.ask(Question(7.0, 2.0, 42.0, 1.5, 300.0))
         assert process.answer() is None
-    assert caplog.messages == ["the search beside the plans has ended; restart the daemon"]
+    assert caplog.messages == ["the search beside the plans has ended; next: start the daemon again"]

@@ -191,13 +191,15 @@ def calibrate(
     where stdin is no terminal. Raises as the three calibrations do.
     """
     if [insert is not None, motors, device].count(True) != 1:
-        raise usage_error("give one of --insert NAME, --motors and --device", "tormagctl calibrate --help shows them")
+        raise usage_error("calibrate takes one of three things", "give one of --insert NAME, --motors and --device")
     if insert is None and csv is not None:
-        raise usage_error("--csv is the training data of an insert", "with --motors, --out is the log")
+        raise usage_error(
+            "--csv is for --insert alone: the training data", "leave it out; with --motors, --out is the log"
+        )
     if device is (out is not None):
         raise usage_error(
-            "--out is the file of a model or of a log",
-            "leave it out: the daemon keeps the profile" if device else "give one",
+            "--out is not for --device" if device else "--out is missing: the file of the model or the log",
+            "leave it out: the daemon keeps the profile" if device else "give --out FILE",
         )
     # before anything moves
     for option, path in (("--out", out), ("--csv", csv)):
@@ -222,6 +224,6 @@ def calibrate(
 def _agree() -> None:
     """Wait until a person presses Enter. Raises CommandError (USAGE) where stdin is no terminal."""
     if not is_terminal(sys.stdin):
-        raise usage_error("nobody can agree to the carriages moving", "a script says --yes")
+        raise usage_error("stdin is no terminal: nobody can agree to the carriages moving", "a script says --yes")
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)
     sys.stdin.readline()

@@ -27,7 +27,7 @@ def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int
         asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(config, path, port))
     except OSError as error:
         raise usage_error(
-            f"{LOOPBACK}:{port}: {error.strerror}", "give another --port; 0 takes one that is free"
+            f"nothing is served at {LOOPBACK}:{port}: {error.strerror}", "give another --port; 0 takes one that is free"
         ) from error
     seconds = time.monotonic() - start_s
     return Outcome({"seconds": round(seconds, 1)}, f"shown for {seconds:.0f} s")

@@ -68,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         extra = EXTRAS.get(error.name or "")
         if extra is None:
             raise
-        missing = usage_error(f"{error.name} is not installed", f"pip install 'tormagd[{extra}]'")
+        missing = usage_error(
+            f"{options.command} needs {error.name}, which is not installed", f"pip install 'tormagd[{extra}]'"
+        )
         print_error(options.command, missing, options.json)
         return exit_code(missing)
     except KeyboardInterrupt:

@@ -53,7 +53,7 @@ def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
             server, _ = start_http_server(port, LOOPBACK, registry)
         except OSError as error:
             raise usage_error(
-                f"{LOOPBACK}:{port}: {error.strerror}", "give another --port; 0: one that is free"
+                f"nothing is served at {LOOPBACK}:{port}: {error.strerror}", "give another --port; 0: one that is free"
             ) from error
         address = f"http://{LOOPBACK}:{server.server_port}/metrics"
         write_line(f"tormagctl metrics: {address}  (Ctrl-C ends)", sys.stderr)

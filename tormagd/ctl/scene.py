@@ -273,7 +273,9 @@ def _derived(name: str, config: Path | None) -> dict[str, Any]:
     try:
         derived: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.daemon.main", arguments, LONGEST_S))["derived"]
     except TimeoutError as error:
-        raise CommandError(Exit.REFUSED, "not_checked", str(error), "try it again") from error
+        raise CommandError(
+            Exit.REFUSED, "not_checked", f"scene {name!r} could not be checked: {error}", "try it again"
+        ) from error
     except ChildProcessError as error:
         raise CommandError(
             Exit.REFUSED,

@@ -120,7 +120,10 @@ def _from_answers(name: str) -> Tables:
     Raises CommandError (USAGE) where stdin is no terminal, or ends.
     """
     if not is_terminal(sys.stdin):
-        raise usage_error("there is nobody to ask", "give a recorded force: --force FORCE.csv, columns t_s,force_N")
+        raise usage_error(
+            "stdin is no terminal: there is nobody to ask",
+            "give a recorded force: --force FORCE.csv, columns t_s,force_N",
+        )
     print("A scene states one task; Enter takes what stands in brackets.", file=sys.stderr)
     said = _answer("what is done, in a sentence", f"{name}.")
     least_N = _number("least force, N", 0.0)
@@ -141,7 +144,7 @@ def _answer(question: str, usual: str) -> str:
     print(f"{question} [{usual}]: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:
-        raise usage_error("the answers ended", "answer all questions, or give --force FORCE.csv")
+        raise usage_error("stdin ended before the last answer", "answer all questions, or give --force FORCE.csv")
     return line.strip() or usual
 
 

@@ -160,7 +160,7 @@ class Phases:
             is_done = True
             if str(error) != self._errors.get(name):  # the first is news, the same one again is not
                 self._errors[name] = str(error)
-                log.error("the beat's %r failed", name, exc_info=error)
+                log.error("the beat goes on without %r, which failed: report the trace", name, exc_info=error)
         if is_done:
             self._ran.append((name, start_ns, self._clock_ns()))
         return is_done

@@ -91,7 +91,7 @@ class BlackBox:
                 self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
                 self._beside.send(msgspec.msgpack.encode(Begin(str(folder), header, key)))
         if folder is not None and self._refusal:
-            log.warning("no black box: %s", self._refusal)
+            log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         self.journal = Journal(is_kept=self._beside is not None)
         self._packer = Packer()
         self._ticks = PART_TICKS // 2
@@ -154,7 +154,7 @@ class BlackBox:
             raise RefusedError(
                 "no_black_box",
                 f"there is no black box: {self._refusal}",
-                "[black_box] folder in the daemon's configuration names where they go",
+                "name [black_box] folder in the daemon's configuration, and start it again",
             )
         now_ns = time.time_ns()
         stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000))
@@ -174,7 +174,10 @@ class BlackBox:
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
             if answer.refusal:
-                log.error("no black box %s: %s", answer.name, answer.refusal)
+                log.error(
+                    "the black box %s was not written: %s; next: make room in [black_box] folder, or name another",
+                    *(answer.name, answer.refusal),
+                )
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
@@ -202,7 +205,7 @@ class BlackBox:
             try:
                 beside.process.wait(LEAVING_S)
             except subprocess.TimeoutExpired:
-                log.info("the black box is still being written")
+                log.info("the black box is still being written, and will be there when its process has ended")
 
     def _send_requests(self) -> None:
         """Send the keeper the requests that wait; those that the socket does not take wait on."""
@@ -229,7 +232,7 @@ class BlackBox:
         `reason` goes into the log and into `report`.
         """
         self._refusal = reason
-        log.error("no black box any more: %s", reason)
+        log.error("no black box is kept any more: %s; next: start the daemon again", reason)
         if self._beside is not None:
             self._beside.close()
         self._beside = None

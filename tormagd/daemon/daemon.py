@@ -175,7 +175,7 @@ class Daemon:
         self._box.close()
         if self._inference.beside is not None:
             self._inference.beside.close()
-        log.info("ended")
+        log.info("tormagd has ended")
 
     def _beat(self, heartbeat: Heartbeat) -> None:
         if beats := heartbeat.beats():  # none at a spurious wake-up
@@ -266,11 +266,11 @@ class Daemon:
             else:
                 self._endpoint.admission.let_in(await asyncio.to_thread(self._keys.load_allowed))
         except ConfigError as error:
-            log.error("the lists of keys stay as they were: %s", error)
+            log.error("the lists of keys stay as they were: %s; next: mend that and reload again", error)
         try:
             again = reread(self._config, await asyncio.to_thread(self._read_again))
         except ConfigError as error:
-            log.error("the configuration stays as it was: %s", error)
+            log.error("the configuration stays as it was: %s; next: mend that and reload again", error)
             return
         self._config = again.config
         self._telemetry.config = again.config

@@ -225,7 +225,7 @@ class Endpoint:
                 made.setsockopt(zmq.USE_FD, file.listener.detach())
             made.bind(address)
         except zmq.ZMQError as error:
-            raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}") from error
+            raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}; name another") from error
         except OSError as error:
             raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
         return made

@@ -23,13 +23,17 @@ class Heartbeat:
     def __init__(self, period_ns: int) -> None:
         self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
-            raise OSError(ctypes.get_errno(), "timerfd_create failed")
+            raise OSError(
+                ctypes.get_errno(), "the kernel makes no timer for the beat (timerfd_create); tormagctl doctor"
+            )
         self.period_ns = period_ns
         self.due_ns = time.monotonic_ns()
         "When the newest beat was due."
         setting = _ITIMERSPEC.pack(*divmod(period_ns, _NS), *divmod(self.due_ns + period_ns, _NS))
         if _libc.timerfd_settime(self._fd, _TFD_TIMER_ABSTIME, setting, None) < 0:
-            raise OSError(ctypes.get_errno(), "timerfd_settime failed")
+            raise OSError(
+                ctypes.get_errno(), "the kernel sets no timer for the beat (timerfd_settime); tormagctl doctor"
+            )
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable at each beat."""

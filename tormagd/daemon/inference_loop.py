@@ -116,7 +116,9 @@ class InferenceLoop:
         """
         if str(error) != self._failure:  # the first failure is news, the same one again is not
             self._failure = str(error)
-            log.error("no gap could be planned for %s", self._inbox.newest, exc_info=error)
+            log.error(
+                "the gap opens: none could be planned for %s; report the trace", self._inbox.newest, exc_info=error
+            )
         self._inbox.withdraw(f"no gap could be planned: {error}")
         self._on_failure()
         self._journal.began_afresh(now_s)

@@ -72,7 +72,7 @@ class ProfileFolder:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise ProfileError(f"{path}: {error.strerror}: nothing was kept") from error
+            raise ProfileError(f"{path}: {error.strerror}") from error
 
 
 class Profiles:
@@ -112,7 +112,7 @@ class Profiles:
                 )
         if self._is_used and self._believe.is_contradicted:
             self._is_used, self._refusal = False, "the device's first slide shows another one"
-            log.warning("the profile is dropped: %s", self._refusal)
+            log.warning("the device's profile is dropped: %s; next: tormagctl calibrate --device", self._refusal)
         if self._was_driven and not is_driven:
             self.keep()
         self._was_driven = is_driven
@@ -167,7 +167,7 @@ class Profiles:
             profile = reading.result()
         except ProfileError as error:
             self._refusal = str(error)
-            log.warning("the profile is not used: %s", error)
+            log.warning("the device's profile is not used: %s; next: tormagctl calibrate --device", error)
             return
         # another device is connected by now, or this one has shown itself meanwhile
         if profile is None or profile.serial_number != self._serial_number or self._believe.strength.fit is not UNSEEN:
@@ -186,6 +186,6 @@ class Profiles:
             writing.result()
         except ProfileError as error:
             self._refusal, self._on_disk = str(error), None
-            log.warning("%s", error)
+            log.warning("the device's profile is not kept: %s; next: let the daemon write to [device] profiles", error)
         else:
             self._refusal = ""

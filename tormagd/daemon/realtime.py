@@ -45,7 +45,7 @@ def prepare(settings: RealTime) -> list[str]:
         except OSError as error:
             refused.append(f"realtime.keep_awake: {_LATENCY}: {error.strerror}; see systemd/udev")
     for line in refused:
-        log.warning("not granted: %s", line)
+        log.warning("the kernel does not grant %s; next: tormagctl doctor", line)
     return refused
 
 
@@ -63,7 +63,10 @@ def priority_of_threads() -> int:
         try:
             pool.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(priority)).result()
         except OSError as error:
-            log.warning("not granted: FIFO priority %d for ZeroMQ's threads: %s", priority, error.strerror)
+            log.warning(
+                "the kernel does not grant ZeroMQ's threads FIFO priority %d: %s; next: tormagctl doctor",
+                *(priority, error.strerror),
+            )
             return 0
     return priority
 

@@ -61,9 +61,9 @@ class SceneChange:
         except RefusedError as refused:
             error = Explained(refused.code, refused.message, refused.hint)
         if error is None:
-            log.info("scene: %s", scene)
+            log.info("the scene is now %s", scene)
         else:
-            log.warning("the scene stays as it was: %s", error.cause)
+            log.warning("the scene stays as it was: %s; next: %s", error.cause, error.remedy)
         self.newest = SceneReport(scene=scene, is_over=True, error=error)
 
     def _finish(self, changing: "asyncio.Task[None]") -> None:

@@ -39,7 +39,10 @@ class SearchProcess:
         self._beside.send(pickle.dumps((core.config, core.scene, core.models)))
         if self._beside.receive(STARTS_S) is None:
             self.close()
-            raise ConfigError(f"solver.name = {core.solver.solver!r}: its process did not start within {STARTS_S:g} s")
+            raise ConfigError(
+                f"solver.name = {core.solver.solver!r}: its process did not start within {STARTS_S:g} s; start the "
+                "daemon again, or name another"
+            )
 
     def answer(self) -> Answer | None:
         """Return the answer that has come since the last call; None where none has. Never waits.
@@ -54,7 +57,7 @@ class SearchProcess:
         found: Answer | ValueError = pickle.loads(data)
         if isinstance(found, Answer):
             return found
-        log.error("the search found no field: %s", found)
+        log.error("the search beside the plans found no field: %s; next: name another solver.name", found)
         return None
 
     def ask(self, question: Question | None) -> None:
@@ -64,7 +67,7 @@ class SearchProcess:
         """
         if self._beside.is_gone and not self._is_told:
             self._is_told = True
-            log.error("the search beside the plans has ended; restart the daemon")
+            log.error("the search beside the plans has ended; next: start the daemon again")
         now_ns, period_ns = time.monotonic_ns(), self.timing.period_ns
         if question is None or not self._is_idle or now_ns < self._due_ns + period_ns:
             return

@@ -21,7 +21,9 @@ class SocketFile:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OSError(f"the directory {path.parent} cannot be made: {error.filename}: {error.strerror}") from error
+            raise OSError(
+                f"the directory {path.parent} cannot be made: {error.filename}: {error.strerror}; name another"
+            ) from error
         self._lock = _locked(self._lock_path)
         try:
             self.listener = _listening(path)
@@ -65,7 +67,7 @@ def _locked(path: Path) -> int:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o660)
         except OSError as error:
-            raise OSError(f"{path} cannot be opened: {error.strerror}") from error
+            raise OSError(f"{path} cannot be opened: {error.strerror}; name another path") from error
         try:
             _lock(path, descriptor)
         except OSError:
@@ -106,7 +108,7 @@ def _listening(path: Path) -> socket.socket:
         made.listen(100)
     except OSError as error:
         made.close()
-        raise OSError(f"{path} cannot be bound: {error.strerror or error}") from error
+        raise OSError(f"{path} cannot be bound: {error.strerror or error}; name another path") from error
     return made
 
 

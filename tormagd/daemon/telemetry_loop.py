@@ -388,7 +388,10 @@ class TelemetryLoop:
                 "not_disputed", "the readings agree with the device: there is nothing to confirm", "tormagctl status"
             )
         self._inference.confirm(wrong)
-        log.warning("confirm: %s", "the device has changed" if wrong == "device" else "the force sensor is wrong")
+        log.warning(
+            "an operator has confirmed: %s",
+            "the device has changed" if wrong == "device" else "the force sensor is wrong",
+        )
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
@@ -401,7 +404,7 @@ class TelemetryLoop:
         inbox = self._endpoint.inbox
         before = inbox.hold.source
         inbox.give(source, time.monotonic())
-        log.info("take: %r", source)
+        log.info("the brake is given to the source %r", source)
         return {"source": source, "instead_of": before}
 
     def _build_status(self, newest: Telemetry) -> Status:

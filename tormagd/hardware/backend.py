@@ -118,7 +118,7 @@ def installed() -> dict[str, str]:
         try:
             _load(entry)
         except PLUGIN_ERRORS as error:
-            log.warning("backend %s is skipped, it does not load: %s: %s", entry.name, type(error).__name__, error)
+            log.warning("backend %s does not load, install it again: %s: %s", entry.name, type(error).__name__, error)
             found[entry.name] = f"{type(error).__name__}: {error}"
         else:
             found[entry.name] = ""
@@ -138,7 +138,9 @@ def choose(device: Device, rates: Rates) -> Chosen:
     try:
         driver = _load(found[device.backend])
     except PLUGIN_ERRORS as error:
-        raise ConfigError(f"device.backend = {device.backend!r}: the plugin does not load: {error}") from error
+        raise ConfigError(
+            f"device.backend = {device.backend!r}: the plugin does not load: {error}; install it again"
+        ) from error
     options = checked(device.options, driver.options, "$.device.options")
     driver.check(device, options, rates)
     return Chosen(options, partial(driver.open, device, options))

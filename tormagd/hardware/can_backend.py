@@ -196,7 +196,9 @@ def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
     try:
         bus = getattr(importlib.import_module(module), name)
     except PLUGIN_ERRORS as error:
-        raise ConfigError(f"device.options.interface = {interface!r}: its driver does not load: {error}") from error
+        raise ConfigError(
+            f"device.options.interface = {interface!r}: its driver does not load: {error}; install it"
+        ) from error
     if bus.fileno is can.BusABC.fileno:
         raise ConfigError(
             f"device.options.interface = {interface!r}: this driver has no descriptor to wait for; allowed is the "

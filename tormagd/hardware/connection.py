@@ -28,7 +28,7 @@ COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisation
 
 _REMEDIES = {
     LinkState.BACK_OFF: "check cable, supply, device.port and who holds it (tormagctl ports); it is tried again",
-    LinkState.UNANSWERED: "is this the device, is it on, and is its rate the configured one? It is asked on",
+    LinkState.UNANSWERED: "make sure that it is the device, is on, and has the configured rate; it is asked again",
     LinkState.REFUSED: "install firmware and daemon of the same protocol schema",
     LinkState.LOST: "check cable and supply; it is tried again",
 }
@@ -321,10 +321,10 @@ class Connection:
         elif before is LinkState.RUNNING:
             self.losses += 1
             self._last_loss = self.cause
-            log.warning("link lost: %s", self.cause)
+            log.warning("the link to %s is lost: %s; next: %s", self._device.port, self.cause, self.remedy)
             self._on_loss()
         elif state in (LinkState.REFUSED, LinkState.UNANSWERED):
-            log.warning("%s: %s; %s", self._device.port, self.cause, self.remedy)
+            log.warning("%s: %s; next: %s", self._device.port, self.cause, self.remedy)
 
 
 def _refusals(refused: Mapping[str, str]) -> str:
