@@ -62,8 +62,8 @@ class FromSource:
 def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
     """Return which build of the packages in `root` may run, and the names of the modules that were compiled.
 
-    Interpreted where there is no record of a compilation, or one for another Python, where TORMAG_COMPILED (`switch`,
-    None where not set) is 0, and where a source was edited since. Reads all of the sources.
+    Interpreted where there is no record of a compilation, or one for another Python, and where a source was edited
+    since. Also where TORMAG_COMPILED (`switch`, None where not set) is 0. Reads all of the sources.
     """
     try:
         record = json.loads((root / "firmware_protocol" / "core.json").read_bytes())
@@ -100,8 +100,8 @@ def check_sum(path: Path) -> int:
 def settle() -> Build:
     """Decide which build this process runs, and return it; call this before any module of the core is imported.
 
-    For an interpreted core of which compiled modules exist, puts a finder of their sources into `sys.meta_path`, and
-    warns with RuntimeWarning where a source was edited. Later calls return the first one's answer.
+    For an interpreted core of which compiled modules exist, puts a finder of their sources into `sys.meta_path`. Warns
+    with RuntimeWarning where a source was edited. Later calls return the first one's answer.
     """
     build, modules = judged(_HERE.parent, os.environ.get(SWITCH))
     if not build.is_compiled and modules:

@@ -112,8 +112,8 @@ def encode(message: Message) -> bytes:
 def decode(function: int, payload: bytes | bytearray) -> Message:
     """Return the message in the payload of a function.
 
-    Raises DecodeError for an unknown function, a wrong length, a wrong CRC-8, an undefined enumeration value or flag,
-    or a value outside its range; nothing else, whatever the bytes.
+    Raises DecodeError for an unknown function, a wrong length or CRC-8, an undefined enumeration value or flag, or a
+    value outside its range. Raises nothing else, whatever the bytes.
     """
     data = payload if isinstance(payload, bytes) else bytes(payload)
     message = wire.unpack(function, data)

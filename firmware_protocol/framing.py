@@ -89,8 +89,8 @@ class Succession:
     def lost(self, number: int) -> int:
         """Take the next number that came; return the change in how many are missing.
 
-        That is 0 for the next number, the first and a repetition, -1 for one that was counted as missing, and else how
-        many were skipped.
+        That is 0 for the next number, the first and a repetition, and -1 for one that was counted as missing. Else it
+        is how many were skipped.
         """
         ahead = (number - self.newest) % 256
         if ahead == 1:  # as nearly always

@@ -1,6 +1,6 @@
 """Generate the Python modules, the message tables of `README.md`, the C codec and the golden vectors from `tormag.dbc`.
 
-`python -m firmware_protocol.generate` writes them; with `--check` nothing is written, and the exit code is 1, with the
+`python -m firmware_protocol.generate` writes them. With `--check` nothing is written: the exit code is 1, with the
 difference on stdout, if what is committed is not what the DBC gives.
 """
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 class Signal(NamedTuple):
     """One field of a payload: physical value = step * scale, with `step` the integer on the wire.
 
-    `minimum` and `maximum` are physical and inclusive. A signal that `wraps` is a counter of steps modulo its span:
-    every finite value has a step, and a value that was read is known only modulo `period`.
+    `minimum` and `maximum` are physical and inclusive. A signal that `wraps` is a counter of steps modulo its span.
+    Every finite value has a step then, and a value that was read is known only modulo `period`.
     `type` is the type of the Python field: float, int, or an enumeration.
     """
 

@@ -29,6 +29,7 @@ def _is_new(host: Host, how: str) -> str:
     """Reset a device in RUN, INSIDE_MM in, and hold it against a new one.
 
     Raises Unmet unless it is IDLE, without zero, fault and host, opens slowly, and runs only after Home and Hello.
+    Raises Untested where nobody can reset it.
     """
     if host.reset is None:
         raise Untested(f"nobody can reset the device: --reset COMMAND, which is called with {how}")

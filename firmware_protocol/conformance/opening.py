@@ -37,8 +37,8 @@ NEARLY: Final = f"in RUN, {NEARLY_MM:g} mm from the closed switches, "
 def opens_fully(host: Host, fault: DeviceFault, beat: Beat = Beat.OFF) -> str:
     """Watch a device open that has begun, and judge each carriage's speed on the device's clock.
 
-    Raises Unmet where the mean is under LEAST_SHARE or a window over MOST_SHARE of the device's speed, and where it
-    ends in anything but rest at both open switches with just this fault.
+    Raises Unmet where the mean is under LEAST_SHARE or a window over MOST_SHARE of the device's speed. Raises it, too,
+    unless it ends at rest at both open switches with just this fault.
     """
     host.forget()
     starts_mm = places(host.last(State))

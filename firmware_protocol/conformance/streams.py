@@ -201,7 +201,10 @@ def device_time_is_fine(host: Host) -> str:
     "no leap over 1 mm, a force against the motion",
 )
 def handle_runs_on(host: Host) -> str:
-    """Check that the handle's position has no leaps, as of swapped bytes, and that the force is against its motion."""
+    """Check that the handle's position has no leaps, as of swapped bytes, and that the force is against its motion.
+
+    Raises Untested where it does not turn, Unmet for a leap or a force along the motion.
+    """
     host.pass_time(LISTENED_S, Beat.OFF)
     places = [sense.handle_position_mm for _, sense in host.all_of(Sense)]
     half = HANDLE_SPAN_MM / 2.0

@@ -60,7 +60,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     (
         "tormagctl plot empty.mcap -o a.png",
         2,
-        "next: give a file that tormagctl record has made",
+        "next: give files that tormagctl record has made",
         {"empty.mcap": ""},
     ),
     ("tormagctl replay /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),

@@ -95,6 +95,7 @@ ROOMS = {
     "control",
     "daemon",
     "exact",
+    "following",
     "force_file",
     "hardware",
     "inverse",

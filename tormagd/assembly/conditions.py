@@ -20,9 +20,9 @@ def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool
 def is_busy(measurement: Measurement | None, pending: DeviceRequest, stepper: Stepper, output: Duty | None) -> bool:
     """Tell whether the device homes or opens, or has not acknowledged a request yet: home, retract or clear.
 
-    `pending` is the unacknowledged request. One that is not in `output` yet, the newest step's, None before the first,
-    counts too. A device that has homed is busy until a step has taken its positions, unless it has to home again.
-    Without a `measurement` (None) it is not busy.
+    `pending` is the unacknowledged request. One of the stepper's that `output`, the newest step's, does not carry yet
+    counts too; before the first step (None) it does not. A device that has homed is busy until a step has taken its
+    positions, unless it has to home again. Without a `measurement` (None) it is not busy.
     """
     if measurement is None:
         return False

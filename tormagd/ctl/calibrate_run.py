@@ -139,7 +139,8 @@ class Run:
     def _rows(self, data: bytes) -> list[list[float]]:
         """Decode a batch into rows of floats, NaN for a word or an unknown value, and note that the daemon was heard.
 
-        Raises CommandError where the batch is another version's, or a tick was not ENABLED.
+        Raises CommandError where the batch is another version's. For a tick that was not ENABLED it asks the daemon
+        why: raises CommandError (FAULT or REFUSED), or as `Client.status`.
         """
         try:
             batch = decode_ticks(data)

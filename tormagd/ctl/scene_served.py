@@ -75,6 +75,8 @@ def _max_wanted(ways: list[Served], share: float | None, tolerance_N: float) -> 
 def _write(name: str, way: OperatingPoint, out: Path) -> None:
     """Write the scene with these rates and this search to the new file `out`; relative paths in it are adapted.
 
+    `[bandwidth]` and `[solver]` are replaced whole: a search's own settings are dropped.
+
     Raises CommandError (USAGE) where `out` exists or cannot be made.
     """
     path = scene_path(name)

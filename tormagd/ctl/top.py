@@ -86,7 +86,9 @@ class Watcher:
     def _ask(self, now_s: float, codes: set[str]) -> None:
         """Take the answer to the last request, and ask again after ASK_S, or for a code not explained yet.
 
-        Called only while the daemon is heard: requests to a silent one would pile up.
+        A request not answered by then is given up; for a code, none may be under way. Called only while the daemon is
+        heard: requests to a silent one would pile up. Raises as `Client.answer`, and UnreachableError for a result that
+        is no status.
         """
         result = None if self._asked is None else self._client.answer(self._asked)
         if result is not None:

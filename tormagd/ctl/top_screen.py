@@ -81,7 +81,10 @@ def screen(seen: Seen, width: int, height: int) -> RenderableType:
 
 
 def _head(seen: Seen, width: int) -> Text:
-    """Return the first line: state, torque, how long nothing was heard, scene, uptime and version."""
+    """Return the first line: state, whether homed and busy, the force as torque in mNm, scene, uptime and version.
+
+    Over SILENT_S it says, too, how long nothing was heard.
+    """
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state = printable(newest.operating_state)
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]

@@ -320,7 +320,8 @@ class SetpointInbox:
     def _timed(self, source: _Source, now_s: float) -> TimedSetpoint:
         """Return the source's newest setpoint, stamped on the control clock, for the planner.
 
-        Its limits say whether another source sends too, and what is wrong with how its own setpoints come.
+        Its limits: OTHER_SOURCE while another source, or a second publisher of the same name, sends too; and what its
+        `manner` found.
         """
         setpoint = source.setpoint
         wall = setpoint.contact

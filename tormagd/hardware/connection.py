@@ -292,7 +292,8 @@ class Connection:
         self._wait(now_s, LinkState.LOST, cause, remedy)
 
     def _release(self) -> None:
-        """Close the backend, if one is open, and tell `traffic` that the conversation is over."""
+        """Close the backend, if one is open, and tell `traffic`; forget link and stream, with what the link has
+        pending."""
         if self._backend is not None:
             self._backend.close()
             if self.traffic is not None:

@@ -56,7 +56,7 @@ class ModelFileError(ValueError):
 class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a force model is and where it came from.
 
-    `insert` names the insert that the data were measured on; of several inserts, it is what their names begin with,
+    `insert` names the insert that the data were measured on. Of several inserts, it is what their names begin with,
     and `boxes` holds the ranges of each. `ranges` holds the least and the greatest value seen in training for each
     feature and for `force_N`. `metrics` are the trainer's figures. `created` is given, never read from a clock.
     `memory` is the part of the force that the network leaves out. Raises `DomainError` for anything that could not be
@@ -256,8 +256,8 @@ def save_model(path: Path | str, model: ForceModel) -> None:
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
     """Read a model file for `element` and `insert`; None accepts any insert. Of several inserts, return that one's.
 
-    Raises `ModelFileError` when the file cannot be read, is truncated or altered, holds anything but a finite 4-h-1
-    network in the features and units of this program, or belongs to another element or insert.
+    Raises `ModelFileError` when the file cannot be read, is truncated or altered, or belongs to another element or
+    insert. Raises it, too, for anything but a finite 4-h-1 network in the features and units of this program.
     """
     source = Path(path)
     try:
@@ -282,7 +282,7 @@ def _decode(data: bytes) -> ForceModel:
     """Return the model in a file's bytes.
 
     Raises ModelFileError for another format, checksum or set of tensors, DomainError for values that make no model, and
-    the errors of safetensors and msgspec.
+    the errors of safetensors and msgspec. Raises RecursionError for a header that is nested without end.
     """
     # the library proves that the header is whole and that the tensors lie inside the file
     tensors = {name: _tensor(name, content) for name, content in safetensors.deserialize(data)}  # type: ignore[no-untyped-call]

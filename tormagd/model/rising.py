@@ -11,8 +11,8 @@ def falling_at(
 ) -> float | None:
     """Return the least rate of the handle, mm/s, at which the model's force somewhere does not rise with the field.
 
-    Looked at are `points` rates over those seen in training, and as many fields between the two `fields_mT`, at one
-    displacement and the least share of iron. None where the force rises at all of them.
+    Looks at `points` rates over those seen in training, and as many fields between the two `fields_mT`. Displacement
+    and the share of iron, the least, are fixed. None where the force rises at all of them.
     """
     _, (slowest, fastest), _, (cip_percent, _) = model.feature_ranges
     fields = np.linspace(*fields_mT, points)

@@ -70,6 +70,8 @@ def frames_in(entry: Any) -> list[Frame]:
         return []
     direction, time_s, raw, *_ = entry
     pieces = [(None, each) if isinstance(each, bytes) else each for each in (raw if isinstance(raw, list) else [raw])]
+    if not all(isinstance(data, bytes) for _, data in pieces):
+        raise TypeError("a frame is bytes")
     return [Frame(time_s, direction, data.hex(), identifier) for identifier, data in pieces]
 
 

@@ -133,7 +133,10 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
     if not 0.0 <= from_s <= lasts_s:
         raise ReplayError(f"--from = {from_s:g}: allowed is 0..{lasts_s:.3f} s")
     start = _start(entries, records, first_s + from_s)
-    running = _Running(core, sum(len(frames_in(entry)) for entry in entries[:start]))
+    try:
+        running = _Running(core, sum(len(frames_in(entry)) for entry in entries[:start]))
+    except (ValueError, TypeError) as error:
+        raise ReplayError(f"before the start: no frames: {_short(error)}") from error
     number = bisect_right(places, start)
     from_s, ticks, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
     difference: Difference | None = None

@@ -100,7 +100,11 @@ class CanDevice:
         return delivered
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`: frames end and start on the bus."""
+        """Let time pass until `now_s`: frames end and start on the bus.
+
+        Frames that end, the hosts' too, are kept for `transmit`. What the device sends into a full queue counts in
+        `lost`.
+        """
         while (event_s := self.next_event_s) <= now_s:
             self._pass_time(event_s)
             if self._flight is not None and self._flight.end_s <= event_s:

@@ -24,7 +24,7 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from tormagd.simulation.firmware import SERIAL_NUMBER, Answer, Output, Sensors
+from tormagd.simulation.firmware import OFF, SERIAL_NUMBER, Answer, Output, Sensors
 from tormagd.simulation.hand import ROLLER_RADIUS_MM
 from tormagd.simulation.parameters import PlantParameters
 
@@ -126,6 +126,7 @@ class CompiledFirmware:
         # The C struct lives in an array of doubles, for their alignment.
         self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
         library.tormag_device_init(self._device, ctypes.byref(parameters))
+        self._output: Output = OFF
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         """Act on one message of the host and return what to answer; messages of a device are ignored.
@@ -188,9 +189,12 @@ class CompiledFirmware:
 
     @property
     def output(self) -> Output:
-        """State of both bridges now."""
+        """State of both bridges now: the same object until it changes."""
         view = self._view()
-        return Output(view.left_duty, view.right_duty, view.enabled)
+        output = Output(view.left_duty, view.right_duty, view.enabled)
+        if output != self._output:
+            self._output = output
+        return self._output
 
     def _view(self) -> _View:
         view = _View()

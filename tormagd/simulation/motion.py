@@ -60,7 +60,8 @@ class Ramp:
     def duty(self, position_mm: float, speed_mm_s: float, dt_s: float) -> float:
         """Advance the ramp by `dt_s` at the signed `speed_mm_s` and return the duty for the carriage at `position_mm`.
 
-        The ramp stays within RAMP_LEAD_MM of the carriage, the duty within DUTY_LIMIT.
+        The duty is the share of the no-load speed, plus RAMP_GAIN_PER_MM times the ramp's lead, within DUTY_LIMIT. The
+        ramp stays within RAMP_LEAD_MM of the carriage.
         """
         reference_mm = self._reference_mm + speed_mm_s * dt_s
         self._reference_mm = min(max(reference_mm, position_mm - RAMP_LEAD_MM), position_mm + RAMP_LEAD_MM)

@@ -102,8 +102,9 @@ class Homing:
     def _follow(self, now_s: float, measurement: Measurement) -> None:
         """Watch a homing that goes on, and set the first fault that shows; else leave `faults`.
 
-        In this order: WRONG_DIRECTION for a carriage over BACKS_OFF_MM back, HOMING after LONGEST_S, OVER_FORCE after
-        OVER_S of too much force, STATUS_STALE.
+        In this order: WRONG_DIRECTION, HOMING after LONGEST_S, OVER_FORCE after OVER_S of too much force, STATUS_STALE.
+        The first is of a carriage over BACKS_OFF_MM towards closed from where it was most open. That counts from the
+        beginning, and again from when the device sets its zero.
         """
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)

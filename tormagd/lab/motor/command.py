@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
-    """Write a new configuration file with the identified motor, to four digits; other values are those of `config`.
+    """Write a new file with the table `[motor]`: the identified values, to four digits, the others as in `config`.
 
     The inductance is written only where its interval is under VAGUE_SHARE of it. Raises LabError where the log cannot
     fill it, the file exists, or `tormagd` would refuse a value.

@@ -30,7 +30,11 @@ def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
 
 
 def _table_2_4(table: Json) -> Figure:
-    """Draw the force ranges of all inserts, measured, the thesis's and ours; `table` is of `reproduction.table_2_4`."""
+    """Draw the force range of each insert, F(45 mm) less F(95 mm): measured with deviation, the thesis's, and ours
+    twice.
+
+    Ours are with friction fitted, and with the exponent free, too. `table` is of `reproduction.table_2_4`.
+    """
     figure, axes = subplots((9.5, 4.2))
     rows = table["rows"]
     place = np.arange(len(rows))

@@ -2,13 +2,13 @@
 
 Like figure 2.7 of the thesis: the gap goes down in steps and up again while the handle moves. It moves as hands do:
 both ways, from a creep of 0.5 mm/s to 300 mm/s, with stops and reversals. Each sweep is a record of its own, from a
-long rest at the open gap on, and has a number (`cycle`); record 0 is a hold of the last insert, which shows how
+long rest at the open gap on, and has a number (`cycle`). Record 0 is a hold of the last insert, which shows how
 the elastomer relaxes. Every figure in the file passed the wire as protocol bytes: gap from the encoders, force from the
-force sensor, motion from the handle's encoder. Two kinds of rows are kept: those in which the handle slides steadily,
-whose displacement is that of full mobilisation, and those after a turn in which the force rises towards it. There the
-displacement counts from where the elastomer bears no force, between the two ways: counted from the turn, more field
-would at first mean less force. Synthetic data: the device is the simulator's, on a bench whose stops stand 2.5 mm
-beyond the stroke at either end, so that the model knows what lies behind the ends of the scenes.
+force sensor, motion from the handle's encoder. Two kinds of rows are kept. Where the handle slides steadily, the
+displacement is that of full mobilisation. After a turn, while the force rises towards it, the displacement counts from
+where the elastomer bears no force, between the two ways. Counted from the turn, more field would at first mean less
+force. Synthetic data: the device is the simulator's. The stops of its bench stand 2.5 mm beyond the stroke at either
+end: the model knows what lies behind the ends of the scenes.
 """
 
 import argparse

@@ -37,7 +37,7 @@ from tormagd.physics.inserts import Insert, insert
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Columns of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the
-roller, its rate and the measured force, both positive in the direction of motion."""
+roller. Then its rate and the measured force, both positive in the direction of motion."""
 
 LEAST_MOVING_SHARE = 0.3
 "Least share of every sweep in motion. Turning to and fro with rests keeps over half of it."
