@@ -1093,7 +1093,7 @@ SAID = {
     "no CRC-8": "form 1: 1 State",
     "clock=+2%": "+2.0",
     "never opens": "THE GAP MAY BE SHUT",
-    "Sense first": "1000 times not State, then Sense",
+    "Sense first": "1000 times a Sense before its State",
 }
 """Of some errors: what was seen says enough to find them."""
 
