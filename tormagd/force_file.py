@@ -37,23 +37,34 @@ def read_forces(path: Path) -> dict[str, "array[float]"]:
     return read_table(path, ALLOWED, OPTIONAL_COLUMNS)
 
 
-def read_table(path: Path, allowed: Allowed, optional: tuple[str, ...] = ()) -> dict[str, "array[float]"]:
+def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"]:
+    """Read `t_s` and one other column, whose numbers may be any up to 1e9; pass over the rest. Raises as
+    `read_table`."""
+    table = read_table(path, {"t_s": TIME, column: (-1e9, 1e9, "")}, has_others=True)
+    return table["t_s"], table[column]
+
+
+def read_table(
+    path: Path, allowed: Allowed, optional: tuple[str, ...] = (), *, has_others: bool = False
+) -> dict[str, "array[float]"]:
     """Read a CSV file's columns into arrays of equal length, by name; a million rows fit.
 
     `allowed` names the columns with their least, most and unit. `t_s` is one of them, and rises from row to row. A file
-    may lack the `optional` ones. Raises ForceFileError also for an unreadable file, over MAX_FILE_BYTES, or under
-    MIN_ROWS.
+    may lack the `optional` ones. Where it `has_others`, these are passed over. Raises ForceFileError also for an
+    unreadable file, over MAX_FILE_BYTES, or under MIN_ROWS.
     """
     try:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
         with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True)
-            columns = _check_header(path, [name.strip() for name in next(reader, [])], list(allowed), optional)
-            table = {name: array("d") for name in columns}
+            header = [name.strip() for name in next(reader, [])]
+            others = [name for name in header if name not in allowed] if has_others else []
+            columns = _check_header(path, header, [*allowed, *others], (*optional, *others))
+            table = {name: array("d") for name in columns if name in allowed}
             for cells in reader:
                 if cells:
                     row = _check_row(path, reader.line_num, columns, cells, table["t_s"][-1:], allowed)
-                    for name, value in zip(columns, row, strict=True):
+                    for name, value in zip(table, row, strict=True):
                         table[name].append(value)
     except OSError as error:
         raise ForceFileError(f"{path}: {error.strerror}") from error
@@ -89,7 +100,8 @@ def _check_header(path: Path, columns: list[str], known: list[str], optional: tu
 def _check_row(
     path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]", allowed: Allowed
 ) -> list[float]:
-    """Return the numbers of the row `cells` in the order of `columns`.
+    """Return the numbers of the row `cells` in the order of `columns`; columns that `allowed` does not name are left
+    out.
 
     `line` is the row's number in the file, `allowed` bounds each column. `before_s` holds the time of the row before;
     it is empty in the first row. Raises ForceFileError, naming `path` and `line`, for another number of cells, a cell
@@ -97,11 +109,12 @@ def _check_row(
     """
     if len(cells) != len(columns):
         raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
-    row = [_number(path, line, name, text, *allowed[name]) for name, text in zip(columns, cells, strict=True)]
-    time = columns.index("t_s")
+    known = [(name, text) for name, text in zip(columns, cells, strict=True) if name in allowed]
+    row = [_number(path, line, name, text, *allowed[name]) for name, text in known]
+    time = [name for name, _ in known].index("t_s")
     if before_s and not row[time] > before_s[0]:
         raise ForceFileError(
-            f"{path}: row {line}, t_s = {cells[time]}: allowed is above the row before, {before_s[0]:g}"
+            f"{path}: row {line}, t_s = {known[time][1]}: allowed is above the row before, {before_s[0]:g}"
         )
     return row
 

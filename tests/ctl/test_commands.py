@@ -1,6 +1,7 @@
 import io
 import json
 import math
+import re
 import subprocess
 import sys
 from itertools import chain, repeat
@@ -523,21 +524,58 @@ def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(tmp_path, ct
 
 
 @pytest.mark.parametrize(
-    ("least_N", "most_N", "rate_hz", "code", "words"),
+    ("most_N", "rate_hz", "parts"),
+    [(40.0, 0.1, ["force.most_N = 40"]), (2.0, 5.0, ["tolerance_rms_N = 0.065: allowed for its signal is at least"])],
+)
+def test_a_force_that_no_insert_renders_is_written_and_marked(tmp_path, ctl, most_N, rate_hz, parts):
+    out = tmp_path / "mine.toml"
+    forces = recording(tmp_path / "f.csv", 0.7, most_N, rate_hz)
+    result = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(1).result
+    assert result["insert"] == "MRE-50-40"
+    assert all(any(part in line for line in result["unmet"]) for part in parts)
+    assert out.read_text().startswith(f"# NOT MET: {result['unmet'][0]}\n")
+    told = ctl("scene", "check", str(out), "--json").ended(1).error["message"]
+    assert told == "scene mine: " + "; and ".join(result["unmet"])
+
+
+def test_what_is_not_met_is_met_by_the_tolerance_that_is_named(tmp_path, ctl):
+    forces = recording(tmp_path / "f.csv", 0.7, 2.0, 5.0)
+    unmet = ctl("scene", "new", str(tmp_path / "a.toml"), "--force", str(forces), "--json").ended(1).result["unmet"]
+    [tolerance] = re.findall(r"at least ([0-9.]+):", unmet[0])
+    out = str(tmp_path / "b.toml")
+    ctl("scene", "new", out, "--force", str(forces), "--tolerance", tolerance, "--insert", "MRE-50-40").ended(0)
+    assert load_scene(out).force.tolerance_rms_N == float(tolerance)
+
+
+def test_another_quantity_becomes_a_force_by_scale_and_offset(tmp_path, ctl):
+    (tmp_path / "f.csv").write_text("t_s,note,ABP_mmHg\n" + "".join(f"{n},a,{70 + 50 * (n % 2)}\n" for n in range(30)))
+    given = ("--force", str(tmp_path / "f.csv"), "--column", "ABP_mmHg", "--scale", "0.01", "--offset", "0.5")
+    scene = load_scene(ctl("scene", "new", str(tmp_path / "mine.toml"), *given, "--json").ended(0).result["file"])
+    assert (scene.force.least_N, scene.force.most_N, scene.signal.file) == (1.2, 1.7, "mine.csv")
+    assert (tmp_path / "mine.csv").read_text().splitlines()[:2] == ["t_s,force_N", "0.000000,1.2"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
     [
-        (1.0, 1.0, 1.0, 2, ("has no range",)),
-        (0.5, 40.0, 0.1, 1, ("MRE-50-40", "force.most_N = 40")),
-        (0.7, 2.0, 5.0, 1, ("N/s at", "MRE-50-40")),
+        (("--scale", "0"), "has no range"),
+        (("--column", "torque_mNm"), "row 1 has no column torque_mNm"),
+        (("--offset", "-2"), "force_N = -1: allowed is 0..1000 N"),
+        (("--scale", "nan"), "--scale"),
     ],
 )
-def test_a_force_that_no_insert_renders_is_refused_and_leaves_no_file(
-    tmp_path, ctl, least_N, most_N, rate_hz, code, words
-):
+def test_what_can_be_no_scene_is_told_and_leaves_no_file(tmp_path, ctl, options, words):
+    forces = recording(tmp_path / "f.csv", 1.0, 1.4, 1.0)
     out = tmp_path / "mine.toml"
-    forces = recording(tmp_path / "f.csv", least_N, most_N, rate_hz)
-    error = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(code).error
-    assert all(word in error["message"] for word in words)
-    assert not out.exists()
+    assert words in ctl("scene", "new", str(out), "--force", str(forces), *options, "--json").ended(2).error["message"]
+    assert [file.name for file in tmp_path.iterdir()] == ["f.csv"]
+
+
+def test_an_insert_that_there_is_not_is_refused_and_leaves_no_file(tmp_path, ctl):
+    forces = recording(tmp_path / "f.csv", 1.0, 1.4, 0.1)
+    given = ("--force", str(forces), "--insert", "MRE-70-10")
+    assert "MRE-70-10" in ctl("scene", "new", str(tmp_path / "a.toml"), *given, "--json").ended(1).error["message"]
+    assert not (tmp_path / "a.toml").exists()
 
 
 class Terminal(io.StringIO):

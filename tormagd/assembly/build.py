@@ -58,6 +58,10 @@ BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most e
 "At every tolerance and for every size of network: docs/inverse_trade.md, and docs/scenes.md on the device."
 
 
+ROUNDED_UP = 1.005
+"Three digits of a number times this are not below the number."
+
+
 class Core(NamedTuple):
     """All that control of one scene needs, immutable. `planner` and `stepper` make the parts that keep state."""
 
@@ -117,12 +121,17 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         element, choice = _element(scene, model)
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
-    _refuse_unknown_hand(scene, model)
-    _refuse_out_of_reach(scene, element.portrait)
-    _refuse_too_fine(scene, element.portrait)
-    too_fast = _refuse_too_fast(config, scene, element.portrait, beside) if models is None else None
-    _refuse_too_sudden(config, scene, element.portrait)
-    return Core(config, scene, element, stability, choice, model.fingerprint, beside, too_fast)
+    miss = _missed(config, scene, element.portrait, beside) if models is None else None
+    unmet = [
+        *_unknown_hand(scene, model),
+        *_out_of_reach(scene, element.portrait),
+        *_too_fine(scene, element.portrait),
+        *_too_fast(config, scene, miss),
+        *_too_sudden(config, scene, element.portrait),
+    ]
+    if unmet:
+        raise ConfigError(f"scene {scene.name}: " + "; and ".join(unmet))
+    return Core(config, scene, element, stability, choice, model.fingerprint, beside, miss)
 
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
@@ -251,21 +260,25 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
         )
 
 
-def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
-    """Raise ConfigError where the gaps do not reach the scene's greatest force, or its standby force is not allowed.
+def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
+    """Return what the gaps do not reach of the scene's greatest and standby forces, with what is allowed.
 
     Standby has to be above the open gap's force, by STANDBY_N at most, and not above the scene's greatest force.
     """
     # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
-    between = f"allowed is {reach.min_N:.2f}..{reach.max_N:.2f}, what model {scene.insert.model} gives in these gaps"
+    unmet = []
     if not reach.min_N < scene.force.most_N <= reach.max_N:
-        raise ConfigError(f"scene {scene.name}: force.most_N = {scene.force.most_N:g}: {between}")
+        unmet.append(
+            f"force.most_N = {scene.force.most_N:g}: allowed is {reach.min_N:.2f}..{reach.max_N:.2f}, what model "
+            f"{scene.insert.model} gives in these gaps"
+        )
     standby_N, most_N = scene.force.standby_N, min(reach.min_N + STANDBY_N, scene.force.most_N)
     if standby_N is not UNSET and not reach.min_N < standby_N <= most_N:
-        raise ConfigError(
-            f"scene {scene.name}: force.standby_N = {standby_N:g}: allowed is above {reach.min_N:.3g}, what the open "
-            f"gap gives, to {most_N:.3g}"
+        unmet.append(
+            f"force.standby_N = {standby_N:g}: allowed is above {reach.min_N:.3g}, what the open gap gives, to "
+            f"{most_N:.3g}"
         )
+    return unmet
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:
@@ -311,64 +324,70 @@ def least_resolution_N(reach: Portrait, most_N: float) -> float:
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
-def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
-    """Raise ConfigError where the scene's resolution is finer than the device makes and measures."""
+def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
+    """Return that the scene's resolution is finer than the device makes and measures, and what is allowed; else
+    nothing."""
     least_N = least_resolution_N(reach, scene.force.most_N)
-    if scene.force.resolution_N < least_N:
-        raise ConfigError(
-            f"scene {scene.name}: force.resolution_N = {scene.force.resolution_N:g}: allowed is at least {least_N:.2g}"
-            f": the force sensor has steps of {SENSED_N:g} N, and the gap settles to {1e3 * SETTLES_MM:.0f} um"
-        )
+    if scene.force.resolution_N >= least_N:
+        return []
+    return [
+        f"force.resolution_N = {scene.force.resolution_N:g}: allowed is at least {least_N:.2g}: the force sensor has "
+        f"steps of {SENSED_N:g} N, and the gap settles to {1e3 * SETTLES_MM:.0f} um"
+    ]
 
 
-def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
-    """Raise ConfigError where the model was not trained on the handle's rates, or on the depth and rate of a finger."""
+def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
+    """Return which of the handle's rates, or of a finger's depth and rate, the model was not trained on."""
     depths_mm, rates_mm_s, *_ = model.feature_ranges
     handle, finger = scene.handle, scene.finger
     stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
     if finger is not UNSET:
         stated = [("finger.depth_mm", finger.depth_mm, depths_mm), ("finger.most_mm_s", finger.most_mm_s, rates_mm_s)]
-    for key, value, (least, most) in stated:
-        if not least <= value <= most:
-            raise ConfigError(
-                f"scene {scene.name}: {key} = {value:g}: allowed is {least:.2g}..{most:.3g}, what model "
-                f"{scene.insert.model} was trained on"
-            )
+    return [
+        f"{key} = {value:g}: allowed is {least:.2g}..{most:.3g}, what model {scene.insert.model} was trained on"
+        for key, value, (least, most) in stated
+        if not least <= value <= most
+    ]
 
 
-def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
+def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
     """Return what ideal carriages at the gap's speed miss of the scene's signal; None where the scene states no signal.
 
     The first LOOKED_AT_S of the signal count, within what scene and device give. Its file is read from the folder
-    `beside`. Raises ConfigError for a file that is refused, and where the RMS error is over the scene's
-    `tolerance_rms_N`.
+    `beside`. Raises ConfigError for a file that is refused.
     """
     if scene.signal is None:
         return None
-    force, speed_mm_s = scene.force, config.position.gap_speed_mm_s
-    range_N = max(force.least_N, reach.min_N), force.most_N
+    # a scene whose greatest force is out of reach is asked for what is in reach
+    low_N, most_N = max(scene.force.least_N, reach.min_N), min(scene.force.most_N, reach.max_N)
     bandwidth_hz = 0.0 if scene.signal.bandwidth_hz is UNSET else scene.signal.bandwidth_hz
     rate_hz = max(LOOKED_AT_HZ, math.ceil(LOOKS * bandwidth_hz))
-    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, rate_hz)
-    miss = missed(reach, times_s.tolist(), forces_N.tolist(), speed_mm_s)
-    if miss.rms_N > force.tolerance_rms_N:
-        worst = ", ".join(
-            f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
-            for point in miss.worst
-        )
-        raise ConfigError(
-            f"scene {scene.name}: signal: allowed is what gaps of {speed_mm_s:g} mm/s follow within "
-            f"force.tolerance_rms_N = {force.tolerance_rms_N:g}: they miss it by {miss.rms_N:.3f}, {miss.share:.0%} of "
-            f"the time is faster: {worst}"
-        )
-    return miss
+    times_s, forces_N = asked(scene.signal, beside, (min(low_N, most_N), most_N), LOOKED_AT_S, rate_hz)
+    return missed(reach, times_s.tolist(), forces_N.tolist(), config.position.gap_speed_mm_s)
 
 
-def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
-    """Raise ConfigError where an opening gap could release the force faster than the scene allows.
+def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
+    """Return that ideal carriages miss the scene's signal by more than its tolerance, with the tolerance that they
+    keep; else nothing."""
+    if miss is None or miss.rms_N <= scene.force.tolerance_rms_N:
+        return []
+    worst = ", ".join(
+        f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
+        for point in miss.worst
+    )
+    return [
+        f"force.tolerance_rms_N = {scene.force.tolerance_rms_N:g}: allowed for its signal is at least "
+        f"{ROUNDED_UP * miss.rms_N:.3g}: gaps of {config.position.gap_speed_mm_s:g} mm/s miss it by that, "
+        f"{miss.share:.0%} of the time it is faster: {worst}"
+    ]
+
+
+def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
+    """Return that an opening gap could release the force faster than the scene allows, with what it has to allow.
 
     Three things are taken at their worst: the weakest believable device, the greatest force that the ceiling lets it
-    make, and the speed. The speed is that of the device's own opening or the gap's, whichever is greater.
+    make, and the speed. The speed is that of the device's own opening or the gap's, whichever is greater. Nothing is
+    returned where it could not.
     """
     # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
     # ceiling lets no gap make more than CEILING times the scene's greatest
@@ -379,12 +398,12 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
     weakest = config.trim.least
     model_N = min(CEILING * scene.force.most_N / weakest, reach.max_N)
     lost_N_s = weakest * reach.force_rate_N_s(model_N, opening_mm_s)
-    if lost_N_s > scene.force.most_release_N_s:
-        raise ConfigError(
-            f"scene {scene.name}: force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least "
-            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {weakest * model_N:.2g} N "
-            "loses so much"
-        )
+    if lost_N_s <= scene.force.most_release_N_s:
+        return []
+    return [
+        f"force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least {lost_N_s:.2f}: {key} opens "
+        f"the gap by {opening_mm_s:g} mm/s, which at {weakest * model_N:.2g} N loses so much"
+    ]
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:

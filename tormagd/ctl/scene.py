@@ -24,7 +24,6 @@ POLL_S = 0.05
 def scene(
     action: str,
     name: str | None,
-    force: Path | None,
     share: float | None,
     tolerance_N: float | None,
     out: Path | None,
@@ -32,13 +31,25 @@ def scene(
     config_file: Path | None,
     endpoints: Endpoints,
     wait_s: float,
+    **recorded: Any,
 ) -> Outcome:
     """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new.
 
     `share`, `tolerance_N` or `out` choose how the scene is served, for check only. `new` writes the file `name`, from
-    `force` or answers, and raises CommandError (USAGE) without a name. Raises as the six do.
+    `recorded`, which with `tolerance_N` is a `Recorded`, or from answers. Raises CommandError (USAGE) for `new` without
+    a name, and for what is recorded without it. Raises as the six do.
     """
     named = name or config.scene
+    if action == "new":
+        if name is None:
+            raise usage_error("scene new: the file to write is missing", "tormagctl scene new FILE.toml")
+        from tormagd.ctl.scene_new import Recorded, new_scene
+
+        return new_scene(Path(name), Recorded(**recorded, tolerance_N=tolerance_N), config_file)
+    if unused := [key for key, value in recorded.items() if value is not None]:
+        raise usage_error(
+            f"--{unused[0].removesuffix('_N')}: allowed only for scene new", "tormagctl scene new FILE.toml"
+        )
     if share is not None or tolerance_N is not None or out is not None:
         from tormagd.ctl.scene_served import serve_scene
 
@@ -52,16 +63,10 @@ def scene(
             return check_scene(named, config_file)
         case "explain":
             return explain_scene(named, config_file)
-        case "use":
-            from tormagd_client.blocking import Client
+    from tormagd_client.blocking import Client
 
-            with Client(endpoints, wait_s) as client:
-                return use_scene(client, named)
-    if name is None:
-        raise usage_error("scene new: the file to write is missing", "tormagctl scene new FILE.toml")
-    from tormagd.ctl.scene_new import new_scene
-
-    return new_scene(Path(name), force, config_file)
+    with Client(endpoints, wait_s) as client:
+        return use_scene(client, named)
 
 
 def use_scene(client: "Client", name: str) -> Outcome:

@@ -3,16 +3,17 @@
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene import as_toml, check_scene
-from tormagd.scenes.scene import MIN_CONTROL_HZ, Scene
+from tormagd.force_file import ForceFileError, read_column
+from tormagd.scenes.scene import AUTO, MIN_CONTROL_HZ, Scene
 from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError
 
@@ -24,68 +25,132 @@ RESERVED = 0.8
 """Share of the greatest force that the model gives. A device may be a fifth weaker than its model, by friction,
 modulus, field and relaxation. A soft insert is asked for more only where no stiffer one follows fast enough."""
 
+UNMET = "# NOT MET: "
+"Begins a line of a scene file that says what the device does not give."
+
 Tables = dict[str, Any]
 
 
-def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcome:
-    """Write the new scene file `out` from a recorded force, or for None from a person's answers, with a fitting insert.
+class Recorded(NamedTuple):
+    """A recorded quantity that becomes the scene's force, and what a person states of the scene; None is not stated."""
 
-    `config` is the configuration to check it by; None means the defaults. The text warns of a greatest force over
-    RESERVED of the device's. Raises CommandError (USAGE) for files and answers that cannot be used, or nobody to ask.
-    Raises it (REFUSED) where no shipped insert renders the scene, or the check fails. Then there is no file.
+    force: Path | None = None
+    "A CSV with the column `t_s` and one of the quantity; None: ask a person."
+    column: str | None = None
+    "The quantity's; `force_N` by default."
+    scale: float | None = None
+    "Newtons for each of its units; 1 by default."
+    offset_N: float | None = None
+    "Newtons at its 0; 0 by default."
+    insert: str | None = None
+    "By default the softest that renders the scene."
+    tolerance_N: float | None = None
+
+
+def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
+    """Write the new scene file `out` from a recorded force, or without one from a person's answers.
+
+    `config` is the configuration to check it by; None means the defaults. Where column, scale or offset are stated, the
+    forces are written beside `out`, as CSV. The text warns of a greatest force over RESERVED of the device's. A scene
+    that no insert renders is written all the same. Its first lines say what is not met, and so does `unmet` in the
+    result; the exit code is REFUSED. Raises CommandError (USAGE) for files and answers that cannot be used, or nobody
+    to ask. Raises it for an unknown insert, and where the check does not come to an end. Then there is no file.
     """
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
-    tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
+    force_file = _forces_of(out, recorded)
     try:
-        msgspec.convert(_with(tables, INSERTS[0]), Scene)
+        return _proposed(out, force_file, recorded, config)
+    except CommandError:
+        if force_file is not None and force_file != recorded.force:
+            force_file.unlink()
+        raise
+
+
+def _proposed(out: Path, force_file: Path | None, recorded: Recorded, config: Path | None) -> Outcome:
+    """Write the scene file `out` for the forces in `force_file`. Raises CommandError, as `new_scene`."""
+    tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
+    if recorded.tolerance_N is not None:
+        tables["force"] |= {"tolerance_rms_N": recorded.tolerance_N, "resolution_N": 2.0 * recorded.tolerance_N}
+    inserts = INSERTS if recorded.insert is None else (recorded.insert,)
+    try:
+        msgspec.convert(_with(tables, inserts[0]), Scene)
     except msgspec.ValidationError as error:
         raise usage_error(f"no scene can be made of this: {error}", "docs/scenes.md says what each key asks") from error
-    insert, checked = _softest(out, tables, config)
+    insert, checked, unmet = _softest(out, tables, inserts, config)
+    found = {"file": str(out), "insert": insert, "unmet": unmet}
+    if checked is None:
+        said = f"{out} is written, with insert {insert}, and is NOT MET:\n" + "\n".join(unmet)
+        hint = "state what is allowed, or another --insert, --tolerance, --scale or --offset"
+        return Outcome(found, f"{said}\n{hint}", Exit.REFUSED)
     text = f"{checked.text}\n\n{out} is written, with insert {insert}: its tolerance, handle and rates are proposals"
     if not _has_reserve(tables, checked):
         text += f"\nits greatest force is over {RESERVED:.0%} of the device's: a weak device does not give it"
-    return Outcome(checked.result | {"file": str(out), "insert": insert}, text)
+    return Outcome(checked.result | found, text)
 
 
-def _softest(out: Path, tables: Tables, config: Path | None) -> tuple[str, Outcome]:
-    """Write the file with the softest insert that gives the scene with RESERVED to spare, else the softest at all.
+def _forces_of(out: Path, recorded: Recorded) -> Path | None:
+    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new one beside `out`.
 
-    Raises CommandError, and deletes the file, where no insert gives it or the check fails.
+    None where nothing was recorded. Raises CommandError (USAGE) for a file or options that cannot be used.
+    """
+    conversion = (recorded.column, recorded.scale, recorded.offset_N)
+    if recorded.force is None or conversion == (None, None, None):
+        if recorded.force is None and conversion != (None, None, None):
+            raise usage_error("--column, --scale and --offset convert a recorded force", "add --force FORCE.csv")
+        return recorded.force
+    column = "force_N" if recorded.column is None else recorded.column
+    scale, offset_N = (1.0 if recorded.scale is None else recorded.scale), recorded.offset_N or 0.0
+    with as_usage_error(ForceFileError, OSError, hint="a CSV with the columns t_s and --column, and a new FILE.toml"):
+        times_s, values = read_column(recorded.force, column)
+        rows = (f"{time_s:.6f},{offset_N + scale * value:.6g}\n" for time_s, value in zip(times_s, values, strict=True))
+        converted = out.with_suffix(".csv")
+        with converted.open("x", encoding="utf-8") as file:
+            file.write("t_s,force_N\n")
+            file.writelines(rows)
+    return converted
+
+
+def _softest(
+    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None
+) -> tuple[str, Outcome | None, list[str]]:
+    """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all.
+
+    Return the insert, what the check says, and an empty list. Where no insert gives the scene, the one that lacks the
+    least is written, and what it lacks as comments. Then there is no check, and the list has these lines. Raises
+    CommandError, and deletes the file, for an unknown insert and where a check does not come to an end.
     """
     taken: dict[str, Outcome] = {}
-    refused = {}
-    for insert in INSERTS:
+    lacks: dict[str, list[str]] = {}
+    for insert in inserts:
         _write(out, tables, insert)
         try:
             taken[insert] = check_scene(str(out), config)
         except CommandError as error:
-            if error.code != "refused":  # such as a machine too busy to say
+            # a machine too busy to say, or an insert or model that there is not
+            if error.code not in ("refused", "budget") or ": insert." in error.message:
                 out.unlink()
                 raise
-            refused[insert] = error.message
+            lacks[insert] = error.message.removeprefix(f"scene {tables['name']}: ").split("; and ")
             continue
         if _has_reserve(tables, taken[insert]):
-            return insert, taken[insert]
+            return insert, taken[insert], []
     if taken:
         insert = next(iter(taken))
         _write(out, tables, insert)
-        return insert, taken[insert]
-    out.unlink()
-    raise CommandError(
-        Exit.REFUSED,
-        "refused",
-        "no shipped insert renders this: " + "; ".join(f"{insert}: {reason}" for insert, reason in refused.items()),
-        "record or ask for slower or lower forces, or train a model of another insert (tormagctl calibrate --insert)",
-    )
+        return insert, taken[insert], []
+    insert = min(reversed(inserts), key=lambda name: len(lacks[name]))
+    _write(out, tables, insert, lacks[insert])
+    return insert, None, lacks[insert]
 
 
 def _with(tables: Tables, insert: str) -> Tables:
-    return tables | {"insert": {"name": insert, "model": "torque_" + insert.lower().replace("-", "_")}}
+    return tables | {"insert": {"name": insert, "model": AUTO}}
 
 
-def _write(out: Path, tables: Tables, insert: str) -> None:
-    out.write_text(as_toml(_with(tables, insert)) + "\n", encoding="utf-8")
+def _write(out: Path, tables: Tables, insert: str, unmet: Sequence[str] = ()) -> None:
+    lines = [f"{UNMET}{reason}" for reason in unmet]
+    out.write_text("\n".join([*lines, as_toml(_with(tables, insert))]) + "\n", encoding="utf-8")
 
 
 def _has_reserve(tables: Tables, checked: Outcome) -> bool:
@@ -100,7 +165,8 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
     The resolution is twice the tolerance; the file is named relative to `out`. Raises CommandError (USAGE) for a bad
     file, or a force that does not change.
     """
-    with as_usage_error(ConfigError, hint="a CSV with the columns t_s,force_N"):
+    hint = "a CSV with the columns t_s,force_N, no force below 0; else --column, --scale, --offset"
+    with as_usage_error(ConfigError, hint=hint):
         time_s, force_N = recorded(force_file)
     least_N, most_N = _rounded(float(force_N.min()), math.floor), _rounded(float(force_N.max()), math.ceil)
     if not least_N < most_N:
