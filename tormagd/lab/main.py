@@ -42,6 +42,7 @@ COMMANDS = {
     "optimise-design": ("design.command", "the brake's geometry for a task"),
     "bound": ("ideal_carriage", "what a device's ideal carriages miss of a force"),
     "bench-sweep": ("training.bench_sweep", "training data from the simulated device on a bench"),
+    "import-data": ("training.import_data", "training data from measured CSV files of any columns, units and signs"),
     "train-model": ("training.train_model", "a model file from training data"),
     "tactile-model": ("tactile.shipped", "a model file of a simulated pad"),
     "identify-motor": ("motor.command", "a motor and its screw from a log"),
