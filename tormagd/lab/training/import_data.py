@@ -191,8 +191,8 @@ def _units() -> str:
 def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], dict[str, Array], int]:
     """Return the columns of a file by quantity, their values in our units, and how many rows lacked one.
 
-    Raises LabError for a file that cannot be read, has no header, too few columns, or a cell that is no number, and for
-    values that cannot be so.
+    Raises LabError for a file that cannot be read, has no header or too few columns. Also for a cell that is no number,
+    and for values that cannot be so.
     """
     rows = _rows(path)
     header, columns = _header(path, rows, stated)
@@ -277,8 +277,8 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 def _columns(path: Path, header: list[str], stated: Mapping[str, Stated]) -> dict[str, Column]:
     """Return which column of `header` is which quantity, stated ones first.
 
-    Raises LabError for a unit that is not known, two columns of one quantity, and a stated column that is not there in
-    a row that has known ones.
+    Raises LabError for a unit that is not known, and for two columns of one quantity. In a row with known columns it is
+    raised for a stated one that is not there, too.
     """
     found: dict[str, Column] = {}
     for cell in header:
