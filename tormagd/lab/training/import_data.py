@@ -411,6 +411,7 @@ def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
     """Write a picture of field and rate of all rows, coloured by force, with what is missing as its title."""
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)
-    axes.set(xlabel="field, mT", ylabel="rate, mm/s", yscale="log", title="\n".join(missing) or "fields and rates are covered")
+    title = "\n".join(missing) or "fields and rates are covered"
+    axes.set(xlabel="field, mT", ylabel="rate, mm/s", yscale="log", title=title)
     figure.colorbar(points, label="force, N")
     figure.savefig(path, dpi=90)
