@@ -22,6 +22,8 @@ STRICT: Final = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 # A fused multiplication rounds once where Python rounds twice; without it the doubles are the same to the last bit.
 SAME_DOUBLES: Final = ("-ffp-contract=off",)
 TIME_LIMIT_S: Final = 120
+PACKAGES: Final = "gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm"
+"Debian's packages for the firmware on an emulated processor."
 
 
 class BuildError(RuntimeError):
@@ -31,17 +33,24 @@ class BuildError(RuntimeError):
 class Target(Enum):
     """A program or library to build: its sources beside the firmware's, and its compiler flags."""
 
-    LIBRARY = ("bridge",), ("-O2", "-fPIC", "-shared")
+    LIBRARY = ("host/bridge",), ("-O2", "-fPIC", "-shared")
     SANITIZED_EXCHANGE = (
-        ("bridge", "exchange"),
+        ("host/bridge", "host/exchange"),
         ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"),
     )
+    MPS2 = (
+        ("mps2/board", "mps2/main"),
+        (
+            *("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=soft", "-Os", "-ffunction-sections", "-Wl,--gc-sections"),
+            *("-nostartfiles", "--specs=nano.specs", "-T", str(ROOM / "mps2" / "mps2.ld")),
+        ),
+        "arm-none-eabi-gcc",
+    )
 
-    def __init__(self, host_sources: tuple[str, ...], flags: tuple[str, ...]) -> None:
-        self.sources = tuple(ROOM / f"{name}.c" for name in FIRMWARE) + tuple(
-            ROOM / "host" / f"{name}.c" for name in host_sources
-        )
+    def __init__(self, own_sources: tuple[str, ...], flags: tuple[str, ...], cross_compiler: str = "") -> None:
+        self.sources = tuple(ROOM / f"{name}.c" for name in (*FIRMWARE, *own_sources))
         self.flags = flags
+        self.cross_compiler = cross_compiler
 
 
 def compiler() -> str:
@@ -53,12 +62,21 @@ def compiler() -> str:
     return found
 
 
+def emulation_tool(name: str) -> str:
+    """Return the path of the cross compiler or the emulator called `name`. Raises BuildError without it."""
+    found = shutil.which(name)
+    if found is None:
+        raise BuildError(f"{name} is not on the path; install the Debian packages {PACKAGES}")
+    return found
+
+
 def build(target: Target) -> Path:
     """Build a target, unless the cache has it from the present sources, and return the path of its file.
 
     Raises BuildError where there is no compiler, where it fails or takes too long, and where the cache is not writable.
     """
-    command = [compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
+    cross = target.cross_compiler
+    command = [emulation_tool(cross) if cross else compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
     path = _cache_folder() / f"{target.name.lower()}-{_fingerprint(command)}"
     if path.exists():
         return path
@@ -89,9 +107,10 @@ def _cache_folder() -> Path:
 
 
 def _fingerprint(command: list[str]) -> str:
-    """Return 16 hexadecimal digits that change with the compiler's command and with any C source or header."""
+    """Return 16 hexadecimal digits that change with the compiler's command and with any C source, header or linker
+    script."""
     digest = hashlib.sha256("\0".join(command).encode())
-    for path in sorted([*ROOM.glob("*.[ch]"), *ROOM.glob("host/*.[ch]")]):
+    for path in sorted([*ROOM.glob("**/*.[ch]"), *ROOM.glob("**/*.ld")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
 

@@ -22,6 +22,7 @@ from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevi
 from tormagd.simulation.can_door import FOLDER_PREFIX, CanDoor
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, MessageDevice, VirtualDevice
+from tormagd.simulation.emulated_firmware import EmulatedFirmware, EmulationError
 from tormagd.simulation.faults import FORMS as KNOWN_FAULTS, FaultError, parse_fault
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
@@ -32,16 +33,16 @@ from tormagd.simulation.slcan_door import SlcanDoor
 from tormagd.slices import ask_for_slices
 from tormagd_client.printable import printable
 
-# The C sources are what a microcontroller would run; the Python twin, held equal to them by tests, needs no compiler.
-FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
+# The C sources are what a microcontroller runs, qemu one; the Python twin, held equal by tests, needs no compiler.
+FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware, "qemu": EmulatedFirmware}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come.
 
     `arguments` None: those of the process. Writes `--truth` while it runs, and says on stderr how often it fell behind
-    real time. Returns 0, or 1 where stdout cannot be written. Raises SystemExit(2) for usage, or parts that cannot be
-    used.
+    real time. Returns 0, or 1 where stdout cannot be written or an emulated processor ends. Raises SystemExit(2) for
+    usage, or parts that cannot be used.
     """
     command = parser()
     options = command.parse_args(arguments)
@@ -57,7 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if write_line(door.address, sys.stdout) is not None:
             print(f"{command.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
             return 1
-        punctuality = serve(device, door, is_stopped, truth)
+        try:
+            punctuality = serve(device, door, is_stopped, truth)
+        except EmulationError as error:
+            print(f"{command.prog}: {printable(str(error))}", file=sys.stderr)
+            return 1
     if punctuality.late:
         print(
             f"fell behind real time {punctuality.late} times, by {punctuality.worst_s * 1e3:.1f} ms at worst; "
@@ -137,7 +142,8 @@ def parser() -> argparse.ArgumentParser:
         "--firmware",
         choices=FIRMWARES,
         default="python",
-        help="c compiles and runs the firmware's own C sources; default python, which needs no compiler",
+        help="c compiles and runs the firmware's own C sources, qemu runs them on an emulated Cortex-M4; "
+        "default python, which needs neither",
     )
     made.add_argument("--truth", type=Path, metavar="FILE.csv", help="record what no sensor sees, 1000 rows a second")
     return made

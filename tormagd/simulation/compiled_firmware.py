@@ -7,7 +7,7 @@ and the state is the C struct. Tests hold this firmware and the Python one equal
 import ctypes
 import math
 from functools import cache
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from firmware_protocol.c.build import BuildError, load_library
 from firmware_protocol.codec import (
@@ -33,7 +33,7 @@ M = TypeVar("M", State, Sense, Status, Identity)
 ANSWERS = (Answer.NONE, Answer.IDENTITY, Answer.MEASUREMENT)
 
 
-class _Parameters(ctypes.Structure):
+class CParameters(ctypes.Structure):
     """struct tormag_device_parameters."""
 
     _fields_ = [
@@ -47,7 +47,7 @@ class _Parameters(ctypes.Structure):
     ]
 
 
-class _Sensors(ctypes.Structure):
+class CSensors(ctypes.Structure):
     """struct tormag_sensors, in the order of `Sensors`; like the firmware's, the counters run over at 32 bits."""
 
     _fields_ = [
@@ -63,7 +63,7 @@ class _Sensors(ctypes.Structure):
     ]
 
 
-class _View(ctypes.Structure):
+class View(ctypes.Structure):
     """struct tormag_bridge_view."""
 
     _fields_ = [
@@ -84,19 +84,20 @@ def _library() -> ctypes.CDLL:
     """
     library = load_library()
     pointer, time_s, payload = ctypes.c_void_p, ctypes.c_double, ctypes.c_char_p
+    sensors = ctypes.POINTER(CSensors)
     library.tormag_device_init.argtypes = [pointer, pointer]
     for name, arguments in {
         "sizes": [pointer],
-        "receive": [pointer, time_s, ctypes.c_uint8, payload, ctypes.c_size_t, pointer],
-        "tick": [pointer, time_s, pointer, payload],
-        "measurement": [pointer, time_s, pointer, payload],
-        "status": [pointer, pointer, payload],
+        "receive": [pointer, time_s, ctypes.c_uint8, payload, ctypes.c_size_t, sensors],
+        "tick": [pointer, time_s, sensors, payload],
+        "measurement": [pointer, time_s, sensors, payload],
+        "status": [pointer, sensors, payload],
         "identity": [pointer, payload],
         "view": [pointer, pointer],
     }.items():
         getattr(library, f"tormag_bridge_{name}").argtypes = arguments
     _, *structures = _sizes(library)
-    if structures != [ctypes.sizeof(structure) for structure in (_Parameters, _Sensors, _View)]:
+    if structures != [ctypes.sizeof(structure) for structure in (CParameters, CSensors, View)]:
         raise BuildError("the C structures are not laid out as ctypes does it; use the Python firmware on this machine")
     return library
 
@@ -113,19 +114,10 @@ class CompiledFirmware:
     built."""
 
     def __init__(self, plant: PlantParameters) -> None:
-        parameters = _Parameters(
-            lead_mm=plant.screw.lead_mm,
-            stall_A=plant.assumed.overcurrent_A,
-            mm_per_count=plant.screw.lead_mm / plant.electronics.encoder_counts_per_rev,
-            handle_mm_per_count=math.tau * ROLLER_RADIUS_MM / plant.assumed.handle_counts_per_rev,
-            retract_mm_s=plant.assumed.retract_mm_s,
-            homing_mm_s=plant.assumed.homing_mm_s,
-            serial_number=SERIAL_NUMBER,
-        )
         library = _library()
         # The C struct lives in an array of doubles, for their alignment.
         self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
-        library.tormag_device_init(self._device, ctypes.byref(parameters))
+        library.tormag_device_init(self._device, ctypes.byref(parameters_of(plant)))
         self._output: Output = OFF
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
@@ -135,7 +127,7 @@ class CompiledFirmware:
         """
         payload = encode(message)
         answer: int = _library().tormag_bridge_receive(
-            self._device, time_s, FUNCTION[type(message)], payload, len(payload), _seen(sensors)
+            self._device, time_s, FUNCTION[type(message)], payload, len(payload), seen(sensors)
         )
         if answer < 0:
             raise DecodeError(f"{message}: the C codec refuses {payload.hex()} with result {-answer}")
@@ -145,7 +137,7 @@ class CompiledFirmware:
         """Run one 1 kHz tick, as `Firmware.tick`: a Status every twentieth time, None otherwise. Raises EncodeError as
         `status`."""
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-        length: int = _library().tormag_bridge_tick(self._device, time_s, _seen(sensors), payload)
+        length: int = _library().tormag_bridge_tick(self._device, time_s, seen(sensors), payload)
         _require_sent(length, sensors)
         return _decoded(Status, payload.raw) if length else None
 
@@ -155,14 +147,14 @@ class CompiledFirmware:
         Raises EncodeError for a supply or temperature that has no step on the wire.
         """
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-        _require_sent(_library().tormag_bridge_status(self._device, _seen(sensors), payload), sensors)
+        _require_sent(_library().tormag_bridge_status(self._device, seen(sensors), payload), sensors)
         return _decoded(Status, payload.raw)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
         """Return State and Sense of that moment. Raises EncodeError for a current or force that has no step on the
         wire."""
         payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
-        result: int = _library().tormag_bridge_measurement(self._device, time_s, _seen(sensors), payloads)
+        result: int = _library().tormag_bridge_measurement(self._device, time_s, seen(sensors), payloads)
         _require_sent(result, sensors)
         return _decoded(State, payloads.raw[:MAX_PAYLOAD]), _decoded(Sense, payloads.raw[MAX_PAYLOAD:])
 
@@ -196,26 +188,37 @@ class CompiledFirmware:
             self._output = output
         return self._output
 
-    def _view(self) -> _View:
-        view = _View()
+    def _view(self) -> View:
+        view = View()
         _library().tormag_bridge_view(self._device, ctypes.byref(view))
         return view
 
 
-def _seen(sensors: Sensors) -> Any:
-    """Return a reference to `sensors` as a C structure."""
-    return ctypes.byref(
-        _Sensors(
-            sensors.left_counts,
-            sensors.right_counts,
-            sensors.left_current_A,
-            sensors.right_current_A,
-            sensors.force_N,
-            sensors.handle_counts,
-            sensors.switches,
-            sensors.supply_V,
-            sensors.temperature_C,
-        )
+def parameters_of(plant: PlantParameters) -> CParameters:
+    """Return what the firmware of a plant's device is given at its boot."""
+    return CParameters(
+        lead_mm=plant.screw.lead_mm,
+        stall_A=plant.assumed.overcurrent_A,
+        mm_per_count=plant.screw.lead_mm / plant.electronics.encoder_counts_per_rev,
+        handle_mm_per_count=math.tau * ROLLER_RADIUS_MM / plant.assumed.handle_counts_per_rev,
+        retract_mm_s=plant.assumed.retract_mm_s,
+        homing_mm_s=plant.assumed.homing_mm_s,
+        serial_number=SERIAL_NUMBER,
+    )
+
+
+def seen(sensors: Sensors) -> CSensors:
+    """Return `sensors` as the firmware's structure."""
+    return CSensors(
+        sensors.left_counts,
+        sensors.right_counts,
+        sensors.left_current_A,
+        sensors.right_current_A,
+        sensors.force_N,
+        sensors.handle_counts,
+        sensors.switches,
+        sensors.supply_V,
+        sensors.temperature_C,
     )
 
 

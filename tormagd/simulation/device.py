@@ -28,6 +28,7 @@ from firmware_protocol.codec import (
 from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
 from firmware_protocol.value import Value
 from tormagd.simulation.compiled_firmware import CompiledFirmware
+from tormagd.simulation.emulated_firmware import EmulatedFirmware
 from tormagd.simulation.faults import Fault
 from tormagd.simulation.firmware import IDENTITY, NO_ANSWER, OFF, TICK_S, Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import ROLLER_RADIUS_MM, Hand
@@ -36,8 +37,10 @@ from tormagd.simulation.plant import Plant, Truth
 
 BITS_PER_BYTE: Final = 10  # start, eight data bits, stop
 DEFAULT_BAUD: Final = 1_000_000
-FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware]
-"""Makes what boots: `Firmware`, or the C sources of the same rules, `CompiledFirmware`."""
+FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware | EmulatedFirmware]
+"""Makes what boots: `Firmware`, the C sources of the same rules, or these on their processor."""
+BYTES: Final = 0
+"The function of what arrives as bytes of a serial line, for a firmware that reads frames itself."
 WEAR: Final = 4.0
 JUMP_MM: Final = 4.0
 "By how much an encoder leaps."
@@ -63,6 +66,7 @@ STANDING: Final = frozenset(
 )
 """Faults without a size or state of their own, asked for by name where they show."""
 OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed", "opening"})
+DRIVE: Final = bytes((FUNCTION[Drive],))
 LEFT_OPEN: Final = 1
 RIGHT_OPEN: Final = 2
 LEFT_CLOSED: Final = 4
@@ -101,7 +105,7 @@ class MessageDevice:
         self.parameters = parameters
         self.plant = Plant(parameters, hand, seed)
         self._boot = boot
-        self.firmware: Firmware | CompiledFirmware = boot(parameters)
+        self.firmware: Firmware | CompiledFirmware | EmulatedFirmware = boot(parameters)
         self.outbox: deque[Packet] = deque()
         self.undecodable = 0
         """Payloads that arrived and were no message."""
@@ -249,16 +253,11 @@ class MessageDevice:
         """
         if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
-        try:
-            message = decode(packet.function, packet.payload)
-        except DecodeError:
-            self.undecodable += 1
-            return
-        if self._answering_every > 1 and isinstance(message, Drive):
+        if self._answering_every > 1 and _is_drive(packet):
             self._drives += 1
             if self._drives % self._answering_every:
                 return
-        answer = self.firmware.receive(self._device_time_s(time_s), message, self._sensors())
+        answer = self._hear(self._device_time_s(time_s), packet)
         if answer is not NO_ANSWER:
             answer_s = time_s + self._jitter_s * self._jitter.random()
             if self._answer_s == math.inf:
@@ -267,6 +266,17 @@ class MessageDevice:
                 # none overtakes the one before it
                 answer_s = max(answer_s, self._answers[-1][0])
             self._answers.append((answer_s, answer))
+
+    def _hear(self, device_s: float, packet: Packet) -> Answer:
+        """Give the firmware a packet's bytes or message, and return what it answers."""
+        if packet.function == BYTES and isinstance(self.firmware, EmulatedFirmware):
+            return self.firmware.hear(device_s, packet.payload, self._sensors())
+        try:
+            message = decode(packet.function, packet.payload)
+        except DecodeError:
+            self.undecodable += 1
+            return NO_ANSWER
+        return self.firmware.receive(device_s, message, self._sensors())
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
         """Send what `answer` stands for into `outbox`: Identity, or State and Sense as they are at `time_s`."""
@@ -478,7 +488,7 @@ class VirtualDevice:
     advance(now_s)         only lets time pass
 
     Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError. Damaged
-    frames are dropped, and counted in `statistics`.
+    frames are dropped, and counted in `statistics`; a firmware that reads frames itself gets them all.
     """
 
     def __init__(
@@ -493,6 +503,7 @@ class VirtualDevice:
         self.messages = MessageDevice(parameters, hand, faults, seed, boot)
         self._byte_s = BITS_PER_BYTE / baud
         self._decoder = FrameDecoder()
+        self._reads_frames = isinstance(self.messages.firmware, EmulatedFirmware)
         self._receiver_free_s = 0.0
         self._sequence = 0
         self._line: deque[tuple[float, bytes]] = deque()
@@ -518,6 +529,9 @@ class VirtualDevice:
         taken = 0
         for stretch in _stretches(data):
             taken += len(stretch)
+            if self._reads_frames:
+                self.messages.receive(start_s + taken * self._byte_s, BYTES, stretch)
+                continue
             for frame in self._decoder.feed(stretch):
                 self.messages.receive(start_s + taken * self._byte_s, frame.function, frame.payload)
         self._receiver_free_s = start_s + taken * self._byte_s
@@ -561,6 +575,12 @@ class VirtualDevice:
             start_s, data = self._line[0]
             event_s = min(event_s, start_s + len(data) * self._byte_s)
         return event_s
+
+
+def _is_drive(packet: Packet) -> bool:
+    """Return whether a packet is a Drive, whole or damaged."""
+    # behind the first byte of COBS, a frame's next one is its function
+    return (packet.payload[1:2] if packet.function == BYTES else bytes((packet.function,))) == DRIVE
 
 
 def _stretches(data: bytes) -> list[bytes]:

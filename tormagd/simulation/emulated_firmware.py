@@ -1,0 +1,218 @@
+"""The firmware as a microcontroller's program, run by QEMU, behind the interface of the Python firmware.
+
+What runs is the program for a Cortex-M4 in `firmware_protocol/c/mps2`, from its reset on. The link's bytes go through
+its UART. Its pins lead here: at each wake it stands still until it is told its sensors. So a run repeats to the bit,
+however busy the computer is.
+"""
+
+import contextlib
+import ctypes
+import socket
+import subprocess
+import tempfile
+import weakref
+from collections import deque
+from typing import IO, Final
+
+from firmware_protocol.c.build import Target, build, emulation_tool
+from firmware_protocol.codec import (
+    FUNCTION,
+    DeviceFault,
+    DeviceMode,
+    Identity,
+    Message,
+    Sense,
+    State,
+    Status,
+    decode,
+    encode,
+)
+from firmware_protocol.framing import FrameDecoder, encode_frame
+from tormagd.simulation.compiled_firmware import CSensors, View, parameters_of, seen
+from tormagd.simulation.firmware import OFF, Answer, Output, Sensors
+from tormagd.simulation.parameters import PlantParameters
+
+CYCLES_PER_S: Final = 25e6
+"Of the timers that the firmware has its time from."
+MACHINE: Final = (
+    *("-M", "mps2-an386", "-display", "none", "-nodefaults"),
+    # an instruction takes a nanosecond of the machine's time, a sleep none of the computer's
+    *("-icount", "shift=0,sleep=off", "-semihosting-config", "enable=on,target=native", "-serial", "chardev:link"),
+)
+INSTRUCTIONS_PER_CYCLE: Final = 40
+MAX_BYTES: Final = 64
+"Of the link, at one wake."
+END_S: Final = 5.0
+
+
+class EmulationError(OSError):
+    """The emulation has ended by itself. The text has the emulator's last words."""
+
+
+class _PinsIn(ctypes.Structure):
+    """struct pins_in."""
+
+    _fields_ = [("sensors", CSensors), ("cycles", ctypes.c_uint32), ("bytes", ctypes.c_uint32)]
+
+
+class _PinsOut(ctypes.Structure):
+    """struct pins_out."""
+
+    _fields_ = [("view", View), ("sent", ctypes.c_uint32), ("busy", ctypes.c_uint32)]
+
+
+class EmulatedFirmware:
+    """One device's firmware on its processor from its boot on, as `Firmware`.
+
+    `output` is what its bridges do. Raises BuildError without compiler or emulator. Where the emulator ends by itself,
+    every method that lets the firmware run raises EmulationError.
+    """
+
+    def __init__(self, plant: PlantParameters) -> None:
+        program, emulator = build(Target.MPS2), emulation_tool("qemu-system-arm")
+        self._link, theirs = socket.socketpair()
+        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the emulator
+        with theirs:
+            chardev = f"socket,id=link,fd={theirs.fileno()}"
+            self._process = subprocess.Popen(
+                [emulator, *MACHINE, "-chardev", chardev, "-kernel", str(program)],
+                bufsize=0,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                pass_fds=[theirs.fileno()],
+            )
+        self.close = weakref.finalize(self, _end, self._process, self._link, self._errors)
+        """Ends the emulation; returns how many bytes of the stack were ever used, None where it had ended already."""
+        self._decoder = FrameDecoder()
+        self._sequence = 0
+        self._cycles = 0
+        self._identity: Identity | None = None
+        self._measured: deque[tuple[State, Sense]] = deque()
+        self._status: Status | None = None
+        self.output: Output = OFF
+        self._pins = self._told(bytes(parameters_of(plant)))
+
+    def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+        """Let a message of the host arrive, in a frame of its own, and return what was answered to it."""
+        frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
+        self._sequence = (self._sequence + 1) % 256
+        return self.hear(time_s, frame, sensors)
+
+    def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
+        """Let bytes of the link arrive, one whole frame at most, and return what was answered to them."""
+        answer = Answer.NONE
+        for start in range(0, len(data), MAX_BYTES):
+            messages = self._wake(time_s, sensors, data[start : start + MAX_BYTES])
+            if messages:
+                answer = self._answer(messages)
+        return answer
+
+    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
+        """Let it sleep until its tick, as `Firmware.tick`: a Status every twentieth time, None otherwise."""
+        self._answer(self._wake(time_s, sensors))
+        status, self._status = self._status, None
+        return status
+
+    def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
+        """Return the oldest State and Sense that it has sent and nobody has taken; their moment is that of `hear`."""
+        return self._measured.popleft()
+
+    def identity(self) -> Identity:
+        """Return what it has answered to the last Hello. Raises RuntimeError before any."""
+        if self._identity is None:
+            raise RuntimeError("the firmware has sent no Identity yet: allowed is to ask after a Hello")
+        return self._identity
+
+    @property
+    def mode(self) -> DeviceMode:
+        """Operating mode."""
+        return DeviceMode(self._pins.view.mode)
+
+    @property
+    def faults(self) -> DeviceFault:
+        """Latched faults."""
+        return DeviceFault(self._pins.view.faults)
+
+    @property
+    def homed(self) -> bool:
+        """Whether the zero of the encoders is valid."""
+        return bool(self._pins.view.homed)
+
+    @property
+    def instructions(self) -> int:
+        """How many the last wake took, to INSTRUCTIONS_PER_CYCLE."""
+        return INSTRUCTIONS_PER_CYCLE * int(self._pins.busy)
+
+    def _answer(self, messages: list[Message]) -> Answer:
+        """Keep what the firmware has sent in one wake, and return what answer it is."""
+        answer = Answer.NONE
+        match messages:
+            case [State() as state, Sense() as sense, *rest]:
+                self._measured.append((state, sense))
+                answer = Answer.MEASUREMENT
+            case [Identity() as identity, *rest]:
+                self._identity, answer = identity, Answer.IDENTITY
+            case rest:
+                pass
+        for message in rest:
+            assert isinstance(message, Status), f"{message} is no device's answer"
+            self._status = message
+        return answer
+
+    def _wake(self, time_s: float, sensors: Sensors, data: bytes = b"") -> list[Message]:
+        """Let it sleep until `time_s` on its clock, and act on its sensors and the link's `data` then.
+
+        Returns the messages that it sends. Raises EmulationError.
+        """
+        cycles = round(time_s * CYCLES_PER_S)
+        record = _PinsIn(seen(sensors), cycles - self._cycles, len(data))
+        self._pins = pins = self._told(bytes(record), data)
+        self._cycles = cycles
+        output = Output(pins.view.left_duty, pins.view.right_duty, pins.view.enabled)
+        if output != self.output:
+            self.output = output
+        frames = self._decoder.feed(self._link.recv(pins.sent)) if pins.sent else []
+        assert self._decoder.statistics.corrupt == 0, "the firmware sends frames that are none"
+        return [decode(frame.function, frame.payload) for frame in frames]
+
+    def _told(self, record: bytes, data: bytes = b"") -> _PinsOut:
+        """Tell the firmware a record, put `data` on the link, and return what it says when it waits again.
+
+        Raises EmulationError.
+        """
+        to, of = _pipes(self._process)
+        said = b""
+        with contextlib.suppress(OSError):
+            self._link.sendall(data)
+            to.write(record)
+            said = of.read(ctypes.sizeof(_PinsOut))
+        if len(said) != ctypes.sizeof(_PinsOut):
+            self._process.kill()
+            self._process.wait()
+            self._errors.seek(0)
+            raise EmulationError(f"the emulator has ended; its last words: {self._errors.read()[-200:]!r}")
+        return _PinsOut.from_buffer_copy(said)
+
+
+def _pipes(process: "subprocess.Popen[bytes]") -> tuple[IO[bytes], IO[bytes]]:
+    """Return the pipes to and from the emulator."""
+    assert process.stdin, "it was opened"
+    assert process.stdout, "it was opened"
+    return process.stdin, process.stdout
+
+
+def _end(process: "subprocess.Popen[bytes]", link: socket.socket, errors: IO[bytes]) -> int | None:
+    """End the emulation, as `EmulatedFirmware.close`: without its pins the firmware counts its stack and stops."""
+    to, of = _pipes(process)
+    to.close()
+    used = of.read(4)
+    of.close()
+    link.close()
+    errors.close()
+    try:
+        process.wait(END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    return int.from_bytes(used, "little") or None
