@@ -19,6 +19,9 @@ from tqdm import tqdm
 
 from tormagd.lab.told import table
 from tormagd.safety.operating_state import RefusedError
+from tormagd.simulation.__main__ import FIRMWARES
+from tormagd.simulation.device import FirmwareKind
+from tormagd.simulation.firmware import Firmware
 
 INJECTED_S = 5.0
 "Virtual time of the injection: homed, enabled and settled by then."
@@ -39,6 +42,8 @@ def main() -> int:
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
     parser.add_argument("--bus", choices=(SERIAL, CAN), help="only this one")
     parser.add_argument("--only", default="", metavar="TEXT", help="faults with this in their name")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="only every Nth cell")
+    parser.add_argument("--firmware", choices=FIRMWARES, default="python", help="what the device runs")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     todo = [
@@ -46,9 +51,10 @@ def main() -> int:
         for injection in MATRIX
         for bus in injection.buses
         if options.bus in (None, bus) and options.only in injection.name
-    ]
+    ][:: options.every]
+    boot = FIRMWARES[options.firmware]
     steps = tqdm(todo, desc="faults", unit="fault", disable=not sys.stderr.isatty())
-    cells = [recover(injection, *inject(injection, options.plant, bus)) for injection, bus in steps]
+    cells = [recover(injection, *inject(injection, options.plant, bus, boot=boot)) for injection, bus in steps]
     if options.json:
         print(json.dumps({"plant": options.plant, "cells": [cell._asdict() for cell in cells]}))
     else:
@@ -56,19 +62,21 @@ def main() -> int:
     return 0 if all(cell.named and cell.safe and cell.in_time and cell.recovered for cell in cells) else 1
 
 
-def inject(injection: Injection, plant: str, bus: str = SERIAL, watched_s: float = WATCHED_S) -> tuple[Rig, Cell]:
+def inject(
+    injection: Injection, plant: str, bus: str = SERIAL, watched_s: float = WATCHED_S, boot: FirmwareKind = Firmware
+) -> tuple[Rig, Cell]:
     """Runs one fault; also the rig, where it still lasts."""
     if not injection.is_driven:
-        return _begin_with(injection, plant, bus, watched_s)
-    rig, watch = spoiled(injection, plant, bus)
+        return _begin_with(injection, plant, bus, watched_s, boot)
+    rig, watch = spoiled(injection, plant, bus, boot)
     for sample in rig.run(watched_s):
         watch.see(sample)
     return rig, watch.cell(injection, bus)
 
 
-def spoiled(injection: Injection, plant: str, bus: str) -> tuple[Rig, Watch]:
+def spoiled(injection: Injection, plant: str, bus: str, boot: FirmwareKind = Firmware) -> tuple[Rig, Watch]:
     """A rig that renders the force and is spoiled now, and who watches it."""
-    rig = Rig(injection, plant, bus, INJECTED_S)
+    rig = Rig(injection, plant, bus, INJECTED_S, boot)
     rig.loop.arm()
     usual: dict[str, None] = {}
     for sample in rig.run(INJECTED_S - rig.loop.now_s):
@@ -78,9 +86,9 @@ def spoiled(injection: Injection, plant: str, bus: str) -> tuple[Rig, Watch]:
     return rig, Watch(rig, usual, is_driven=True)
 
 
-def _begin_with(injection: Injection, plant: str, bus: str, watched_s: float) -> tuple[Rig, Cell]:
+def _begin_with(injection: Injection, plant: str, bus: str, watched_s: float, boot: FirmwareKind) -> tuple[Rig, Cell]:
     """Connects, homes and enables as far as the device lets one, and asks for the force then."""
-    rig = Rig(injection, plant, bus, 0.0)
+    rig = Rig(injection, plant, bus, 0.0, boot)
     rig.spoil(injection)
     rig.publisher.is_silent = True
     rig.rest(CONNECTED_S)

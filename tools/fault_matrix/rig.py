@@ -17,8 +17,9 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.safety.operating_state import SafetyState
 from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.device import FirmwareKind, VirtualDevice
 from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
 from tormagd.simulation.plant import Plant
@@ -40,13 +41,15 @@ REALTIME_S = 1_700_000_000
 class Rig:
     """A daemon's core and a device, with a line between them that may go bad, and a publisher that may, too."""
 
-    def __init__(self, injection: Injection, plant: str, bus: str, injected_s: float) -> None:
+    def __init__(
+        self, injection: Injection, plant: str, bus: str, injected_s: float, boot: FirmwareKind = Firmware
+    ) -> None:
         """The device's own fault begins at `injected_s`; `spoil` begins all others."""
         core = _coronary()
         self.config = core.config
         self.most_N = core.scene.force.most_N
         faults = [parse_fault(f"{fault}@{injected_s}") for fault in (injection.device or "").split()]
-        device = VirtualDevice(load_plant(plant), SteadyHand(), faults, seed=1)
+        device = VirtualDevice(load_plant(plant), SteadyHand(), faults, seed=1, boot=boot)
         self.line: BadSerialLine | BadBus
         if bus == SERIAL:
             self.line = serial = BadSerialLine(device)

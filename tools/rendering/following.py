@@ -19,7 +19,8 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.ideal_actuator import ideal_stepper
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.device import FirmwareKind, VirtualDevice
+from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import Hand, parse_hand
 from tormagd.simulation.parameters import PlantParameters
 
@@ -106,11 +107,17 @@ class Followed(NamedTuple):
 
 
 def armed(
-    core: Core, plant: PlantParameters, hand: Hand, shown: Learned = NOTHING_LEARNED, *, is_ideal: bool = False
+    core: Core,
+    plant: PlantParameters,
+    hand: Hand,
+    shown: Learned = NOTHING_LEARNED,
+    *,
+    is_ideal: bool = False,
+    boot: FirmwareKind = Firmware,
 ) -> ClosedLoop:
     """A device that was homed and enabled, and counts as having `shown` so much of itself. `is_ideal`: carriages that
     lose no time move its gap. Raises RuntimeError where the device does not get that far."""
-    device = VirtualDevice(plant, hand, seed=1)
+    device = VirtualDevice(plant, hand, seed=1, boot=boot)
     stepper = ideal_stepper(core, device.messages.plant) if is_ideal else core.stepper()
     loop = ClosedLoop(core.config, stepper, core.planner(), device)
     taught(loop).teach(shown)
@@ -208,14 +215,14 @@ class Case(NamedTuple):
 Rehearsals = dict[Case, Followed]
 
 
-def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Followed:
+def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array, boot: FirmwareKind = Firmware) -> Followed:
     """Homes, enables, plays the profile. Raises RuntimeError where the device does not get that far or faults."""
     if case.gap_speed_mm_s is not None:
         slow = msgspec.structs.replace(config.position, gap_speed_mm_s=case.gap_speed_mm_s)
         config = msgspec.structs.replace(config, position=slow)
     # what is played is not the scene's own signal, which the daemon refuses where the gap is too slow for it
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
-    loop = armed(build_core(config, scene), device_of(case.plant), parse_hand(case.hand))
+    loop = armed(build_core(config, scene), device_of(case.plant), parse_hand(case.hand), boot=boot)
     start_s = loop.now_s + LEAD_IN_S
     publish = publisher(times_s + start_s, forces_N, 0.0)
     found = follow(loop, publish, LEAD_IN_S + float(times_s[-1]), start_s)

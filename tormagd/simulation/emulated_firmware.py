@@ -27,7 +27,7 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from firmware_protocol.framing import FrameDecoder, encode_frame
+from firmware_protocol.framing import FrameDecoder, FramingStatistics, encode_frame
 from tormagd.simulation.compiled_firmware import CSensors, View, parameters_of, seen
 from tormagd.simulation.firmware import OFF, Answer, Output, Sensors
 from tormagd.simulation.parameters import PlantParameters
@@ -81,6 +81,7 @@ class EmulatedFirmware:
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 pass_fds=[theirs.fileno()],
+                process_group=0,  # Ctrl-C is for this process, which ends the emulator
             )
         self.close = weakref.finalize(self, _end, self._process, self._link, self._errors)
         """Ends the emulation; returns how many bytes of the stack were ever used, None where it had ended already."""
@@ -138,6 +139,11 @@ class EmulatedFirmware:
     def homed(self) -> bool:
         """Whether the zero of the encoders is valid."""
         return bool(self._pins.view.homed)
+
+    @property
+    def statistics(self) -> FramingStatistics:
+        """What was seen of the frames that the firmware has sent."""
+        return self._decoder.statistics
 
     @property
     def instructions(self) -> int:

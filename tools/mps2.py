@@ -1,0 +1,147 @@
+"""The firmware on an emulated Cortex-M4, in virtual time: its figures, and the pulse of `make run` beside what the same
+sources do on this computer.
+
+Instructions are those that QEMU has executed, to 40 in a wake, and no cycles: a Cortex-M4 takes one or more for each,
+and waits for its flash. The emulated UART takes any byte at once, so no baud rate is overrun.
+"""
+
+import argparse
+import subprocess
+import sys
+from collections import defaultdict
+from typing import final
+
+import numpy as np
+from rendering.following import RATE_HZ, Case, rehearse
+from rendering.signals import pulse_signal
+
+from firmware_protocol.c.build import BuildError, Target, build, emulation_tool
+from firmware_protocol.conformance.check import run
+from firmware_protocol.conformance.examination import checks_on
+from firmware_protocol.conformance.host import Host
+from firmware_protocol.conformance.line import SerialLine
+from tormagd.config import Config
+from tormagd.lab.told import table
+from tormagd.simulation.compiled_firmware import CompiledFirmware
+from tormagd.simulation.device import FirmwareKind, VirtualDevice
+from tormagd.simulation.emulated_firmware import EmulatedFirmware
+from tormagd.simulation.firmware import Answer, Sensors
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+
+PULSE_S = 20.0
+MOST_N = 1e-3
+"The pulses may differ by so much."
+DRIVE = "Drive taken, State and Sense sent"
+
+
+@final
+class Counted(EmulatedFirmware):
+    """The program, and the instructions of its wakes by what they were for."""
+
+    def __init__(self, plant: PlantParameters) -> None:
+        super().__init__(plant)
+        self.counts: defaultdict[str, list[int]] = defaultdict(list)
+        self.unanswered = 0
+
+    def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
+        """As the program, counted."""
+        answer = super().hear(time_s, data, sensors)
+        if answer is Answer.MEASUREMENT:
+            self.counts[DRIVE].append(self.instructions)
+        self.unanswered += answer is Answer.NONE and data[1:2] == b"\2"
+        return answer
+
+    def tick(self, time_s: float, sensors: Sensors) -> object:  # type: ignore[override]
+        """As the program, counted."""
+        status = super().tick(time_s, sensors)
+        self.counts[f"tick in {self.mode.name}" + (", Status sent" if status else "")].append(self.instructions)
+        return status
+
+
+def main() -> int:
+    """Prints the figures; returns 1 where the kit fails the program, a frame was dropped, or the pulses differ by more
+    than MOST_N."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pulses", type=int, choices=range(1, 181), default=1, metavar="N", help="of 20 s each")
+    parser.add_argument("--kit", action="store_true", help="the conformance kit's checks instead")
+    options = parser.parse_args()
+    try:
+        program, size = build(Target.MPS2), emulation_tool("arm-none-eabi-size")
+    except BuildError as error:
+        parser.error(str(error))
+    booted: list[Counted] = []
+
+    def boot(plant: PlantParameters) -> EmulatedFirmware:
+        booted.append(Counted(plant))
+        return booted[-1]
+
+    is_right = is_passed(boot) if options.kit else is_followed(boot, options.pulses)
+    listing = subprocess.run([size, program], capture_output=True, text=True, check=True).stdout
+    text, data, bss = map(int, listing.splitlines()[1].split()[:3])
+    counts: defaultdict[str, list[int]] = defaultdict(list)
+    for firmware in booted:
+        for name, counted in firmware.counts.items():
+            counts[name] += counted
+    dropped = sum(one.unanswered + one.statistics.lost + one.statistics.corrupt for one in booted)
+    used = max(one.close() or 0 for one in booted)
+    print(f"flash {text + data} bytes, RAM {data + bss} bytes, stack {used} bytes by paint")
+    print(*table(instructions(name, counts[name]) for name in sorted(counts)), sep="\n")
+    print(f"{len(counts[DRIVE])} Drives answered, {dropped} frames dropped, those that the kit damages among them")
+    return int(not is_right or (dropped > 0 and not options.kit))
+
+
+def is_passed(boot: FirmwareKind) -> bool:
+    """Whether every check of the conformance kit passes."""
+    port = VirtualPort(VirtualDevice(load_plant("sample_1"), SteadyHand(), boot=boot))
+    line, messages = SerialLine(port), port.device.messages
+    host = Host(line, reset=lambda how: messages._reset(port.now_s()))
+    results = run(host, checks_on(line), lambda result: print(f"{result.check.name}: {result.seen}", flush=True))
+    failed = [result.check.name for result in results if result.passed is False]
+    print(f"{len(results)} checks, {len(failed)} failed: {', '.join(failed) or 'none'}")
+    return not failed
+
+
+def is_followed(boot: FirmwareKind, pulses: int) -> bool:
+    """Whether the program renders the pulse as the host library does."""
+    forces_N = np.tile(pulse_signal(PULSE_S).force_N, pulses)
+    times_s = np.arange(forces_N.size) / RATE_HZ
+    there_N, here_N = (
+        rehearse(Config(scene="pulse"), Case("sample 1"), times_s, forces_N, made).rendered_N
+        for made in (boot, CompiledFirmware)
+    )
+    worst_N = float(np.abs(there_N - here_N).max())
+    print(f"pulse of {times_s[-1]:.0f} s: {worst_N * 1e3:.2g} mN at most from the host library's")
+    return worst_N <= MOST_N
+
+
+def instructions(name: str, counted: list[int]) -> dict[str, object]:
+    """Of one kind of wake."""
+    return {"wake": name, "times": len(counted), "mean": round(float(np.mean(counted))), "most": max(counted)}
+
+
+class VirtualPort:
+    """The device's serial port in virtual time, as the kit has one."""
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device, self._now_s = device, 0.0
+
+    def now_s(self) -> float:
+        """The device's time."""
+        return self._now_s
+
+    def write(self, data: bytes) -> None:
+        """Hands bytes to the device."""
+        self.device.receive(self._now_s, data)
+
+    def read(self, until_s: float) -> list[tuple[float, bytes]]:
+        """Lets time pass; what came, and when."""
+        self._now_s = max(self._now_s, until_s)
+        return [(self._now_s, self.device.transmit(self._now_s))]
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+if __name__ == "__main__":
+    sys.exit(main())
