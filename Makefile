@@ -10,6 +10,7 @@ GOAL ?= test
 SEARCHES ?= 5
 MUTANTS ?= 60
 SEED ?= 1
+SECONDS ?= 12
 MATRICES ?= 10 30 50
 
 DESTDIR ?=
@@ -35,7 +36,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb wheels run test compiled live yielding interpreted coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb wheels run test compiled live yielding interpreted fuzz coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -50,7 +51,7 @@ live: $(VENV)/.dev
 	$(BIN)/python -P -m pytest -q -m live $$(grep -rlE 'mark\.live' tests --include='test_*.py')
 
 yielding: $(VENV)/.dev
-	nice -n 19 $(MAKE) --no-print-directory --jobs=2 check interpreted WORKERS=0
+	nice -n 19 $(MAKE) --no-print-directory --jobs=2 check fuzz interpreted WORKERS=0
 
 # -P: what its owner keeps in this folder is not imported in place of a module
 compiled: $(VENV)/.dev
@@ -59,6 +60,10 @@ compiled: $(VENV)/.dev
 # the core's tests on the other build
 interpreted: $(VENV)/.dev
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not long' $(CORE_TESTS)
+
+# the firmware's sources under libFuzzer and sanitizers for so many seconds; where clang is not there, that is said
+fuzz: $(VENV)/.dev
+	$(BIN)/python tools/endure.py fuzz --count $(SECONDS) --seed $(SEED)
 
 # which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
 # part are asked again, interpreted. pyproject.toml has the least share

@@ -45,8 +45,8 @@ class Part(NamedTuple):
 PARTS = {
     "fuzz": Part(
         "tools/endure.py fuzz --json",
-        "{frames:,} damaged frames: {false_accepts} false accepts. {second_lost} of {runs_of_damage:,} runs of damage "
-        "not over after two frames. C and Python differ {languages_differ} times",
+        "{executions[codec]:,} payloads, {executions[framing]:,} streams and {executions[device]:,} lives of a device "
+        "under sanitizers: {lines} of the lines that bytes can reach. C and Python differ {languages_differ} times",
     ),
     "replug-serial": Part(
         "tools/endure.py replug-serial --json", "{cycles} cycles. Lost after {lost_after_ms} ms at most"

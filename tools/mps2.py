@@ -15,7 +15,7 @@ import numpy as np
 from rendering.following import RATE_HZ, Case, rehearse
 from rendering.signals import pulse_signal
 
-from firmware_protocol.c.build import BuildError, Target, build, emulation_tool
+from firmware_protocol.c.build import BuildError, Target, build, debian_tool
 from firmware_protocol.conformance.check import run
 from firmware_protocol.conformance.examination import checks_on
 from firmware_protocol.conformance.host import Host
@@ -67,7 +67,7 @@ def main() -> int:
     parser.add_argument("--kit", action="store_true", help="the conformance kit's checks instead")
     options = parser.parse_args()
     try:
-        program, size = build(Target.MPS2), emulation_tool("arm-none-eabi-size")
+        program, size = build(Target.MPS2), debian_tool("arm-none-eabi-size")
     except BuildError as error:
         parser.error(str(error))
     booted: list[Counted] = []

@@ -21,9 +21,16 @@ FIRMWARE: Final = ("codec", "crc", "device", "framing", "messages", "motion", "r
 STRICT: Final = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 # A fused multiplication rounds once where Python rounds twice; without it the doubles are the same to the last bit.
 SAME_DOUBLES: Final = ("-ffp-contract=off",)
+SANITIZED: Final = ("-O1", "-g", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
 TIME_LIMIT_S: Final = 120
-PACKAGES: Final = "gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm"
-"Debian's packages for the firmware on an emulated processor."
+_EMULATION: Final = "gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm"
+DEBIAN: Final = {
+    "arm-none-eabi-gcc": _EMULATION,
+    "qemu-system-arm": _EMULATION,
+    "arm-none-eabi-size": _EMULATION,
+    "clang": "clang and libclang-rt-14-dev",
+}
+"Debian's packages that bring a program."
 
 
 class BuildError(RuntimeError):
@@ -31,12 +38,14 @@ class BuildError(RuntimeError):
 
 
 class Target(Enum):
-    """A program or library to build: its sources beside the firmware's, and its compiler flags."""
+    """A program or library to build: its sources beside the firmware's, its flags, and a compiler that it needs."""
 
     LIBRARY = ("host/bridge",), ("-O2", "-fPIC", "-shared")
-    SANITIZED_EXCHANGE = (
-        ("host/bridge", "host/exchange"),
-        ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"),
+    SANITIZED_EXCHANGE = ("host/bridge", "host/exchange"), (*SANITIZED, "-fsanitize=address,undefined")
+    FUZZ = (
+        ("fuzz/fuzz", "fuzz/codec", "fuzz/framing", "fuzz/device"),
+        (*SANITIZED, "-fsanitize=fuzzer,address,undefined", "-fprofile-instr-generate", "-fcoverage-mapping"),
+        "clang",
     )
     MPS2 = (
         ("mps2/board", "mps2/main"),
@@ -47,10 +56,10 @@ class Target(Enum):
         "arm-none-eabi-gcc",
     )
 
-    def __init__(self, own_sources: tuple[str, ...], flags: tuple[str, ...], cross_compiler: str = "") -> None:
-        self.sources = tuple(ROOM / f"{name}.c" for name in (*FIRMWARE, *own_sources))
+    def __init__(self, sources: tuple[str, ...], flags: tuple[str, ...], needs: str | None = None) -> None:
+        self.sources = tuple(ROOM / f"{name}.c" for name in (*FIRMWARE, *sources))
         self.flags = flags
-        self.cross_compiler = cross_compiler
+        self.needs = needs
 
 
 def compiler() -> str:
@@ -62,11 +71,11 @@ def compiler() -> str:
     return found
 
 
-def emulation_tool(name: str) -> str:
-    """Return the path of the cross compiler or the emulator called `name`. Raises BuildError without it."""
+def debian_tool(name: str) -> str:
+    """Return the path of a program of DEBIAN. Raises BuildError, naming its packages, where it is not on the path."""
     found = shutil.which(name)
     if found is None:
-        raise BuildError(f"{name} is not on the path; install the Debian packages {PACKAGES}")
+        raise BuildError(f"{name} is not on the path; install the Debian packages {DEBIAN[name]}")
     return found
 
 
@@ -75,8 +84,7 @@ def build(target: Target) -> Path:
 
     Raises BuildError where there is no compiler, where it fails or takes too long, and where the cache is not writable.
     """
-    cross = target.cross_compiler
-    command = [emulation_tool(cross) if cross else compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
+    command = [debian_tool(target.needs) if target.needs else compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
     path = _cache_folder() / f"{target.name.lower()}-{_fingerprint(command)}"
     if path.exists():
         return path
@@ -110,7 +118,7 @@ def _fingerprint(command: list[str]) -> str:
     """Return 16 hexadecimal digits that change with the compiler's command and with any C source, header or linker
     script."""
     digest = hashlib.sha256("\0".join(command).encode())
-    for path in sorted([*ROOM.glob("**/*.[ch]"), *ROOM.glob("**/*.ld")]):
+    for path in sorted([*ROOM.rglob("*.[ch]"), *ROOM.rglob("*.ld")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
 

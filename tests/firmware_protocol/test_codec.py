@@ -528,7 +528,7 @@ def test_under_sanitizers_any_payload_is_framed_as_by_python(exchange) -> None:
 
 
 def test_under_sanitizers_golden_streams_are_read_as_written_down(exchange) -> None:
-    """Random payloads and damaged streams: `tools/endure.py fuzz`, which tests/tools runs for a moment."""
+    """Any bytes: `make fuzz`."""
     requests, expected = [], []
     for vector in FRAMES["streams"]:
         requests += ["restart", f"stream {vector['bytes']}"]

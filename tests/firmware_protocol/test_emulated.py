@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 import firmware_protocol
-from firmware_protocol.c.build import PACKAGES
+from firmware_protocol.c.build import DEBIAN
 from firmware_protocol.codec import (
     FUNCTION,
     SCHEMA_HASH,
@@ -35,7 +35,7 @@ from tormagd.simulation.parameters import load_plant
 
 needs_packages = pytest.mark.skipif(
     any(shutil.which(tool) is None for tool in ("arm-none-eabi-gcc", "qemu-system-arm")),
-    reason=f"needs the Debian packages {PACKAGES}",
+    reason=f"needs the Debian packages {DEBIAN['qemu-system-arm']}",
 )
 PLANT = load_plant("sample_1")
 AT_ONCE = msgspec.structs.replace(
@@ -117,4 +117,4 @@ def test_without_its_packages_one_sentence_names_them(capsys, monkeypatch, tmp_p
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(SystemExit, match="2"):
         simulate(["--pty", "--firmware", "qemu"])
-    assert f"arm-none-eabi-gcc is not on the path; install the Debian packages {PACKAGES}" in capsys.readouterr().err
+    assert f"arm-none-eabi-gcc is not on the path; install the Debian packages {DEBIAN['qemu-system-arm']}" in capsys.readouterr().err

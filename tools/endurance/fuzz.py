@@ -1,389 +1,261 @@
-"""Damaged serial frames and CAN payloads through the host's decoder and the firmware's.
+"""Bytes that libFuzzer finds, put to the firmware's codec, framing and device under address and undefined sanitizers.
 
-Every damage starts from valid traffic. After each run of damaged serial frames come two clean ones; the second must
-arrive, or the decoder did not find back in time. A false accept is a message that was not sent, or given twice in a
-row. Where the carrier was right, it is a payload taken for a message that is none. It is allowed as often as chance
-gives it at the odds of the CRC, one judgement in 2^16 or 2^8. It is never allowed where the odds are 0. The bound is a
-count that chance exceeds once in a million runs. `wrong_frames` had a right CRC-16 and were not sent. They are allowed
-likewise.
+The corpus begins with the golden vectors and with lives that lead through every mode. What has to hold beside the
+sanitizers is in `firmware_protocol/c/fuzz`. A payload is taken only with the right CRC-8, a frame only where its own
+bytes come again from encoding it. A false accept is then no more likely than the CRC's odds. What was found for codec
+and framing Python hears afterwards, and must agree with the C in every frame, count and verdict.
 
-Both languages hear all of it, the C99 under sanitizers, and must agree in every frame, count and verdict.
+Lines that no bytes reach are named in BEYOND_REACH; of all others at least REACHED are to be run.
 """
 
-import random
-import struct
+import json
+import os
+import re
 import subprocess
 from collections import Counter
-from collections.abc import Callable, Sequence
-from itertools import pairwise, zip_longest
-from typing import Any
+from collections.abc import Callable, Iterator
+from itertools import zip_longest
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
-from scipy import stats
-from tqdm import tqdm
-
-from firmware_protocol.c.build import BuildError, Target, build
-from firmware_protocol.codec import (
-    FUNCTION,
-    Clear,
-    DecodeError,
-    Drive,
-    Hello,
-    Home,
-    Identity,
-    Message,
-    Retract,
-    Sense,
-    State,
-    Status,
-    crc8,
-    decode,
-)
-from firmware_protocol.framing import MAX_PAYLOAD, Frame, FrameDecoder, FramingStatistics, encode_frame
+import firmware_protocol
+from firmware_protocol.c.build import FIRMWARE, ROOM, BuildError, Target, build
+from firmware_protocol.codec import DecodeError, crc8, decode
+from firmware_protocol.framing import MAX_PAYLOAD, FrameDecoder, FramingStatistics, encode_frame
 from firmware_protocol.layouts import LAYOUTS
-from firmware_protocol.schema import Layout, Signal
-from tormagd.hardware.can_stream import CanStream
 
-CHUNK = 8_192
-"Damaged frames of one kind at once."
-BURSTS = (1, 4, 16)
-"Damaged frames between clean ones."
-PIECES = (3, 16, 300, 4096)
-"Bytes fed at once."
-CAN_SHARE, CAN_FD_PAYLOAD = 0.1, 48
-NODE = 1
-EDGES = 0.3
-"Share of signals at zero or at an end of their range: zeros are what COBS is about."
-CRC16_ODDS, CRC8_ODDS = 2.0**-16, 2.0**-8
-CHANCE = 1e-6
+VECTORS = Path(firmware_protocol.__file__).parent / "vectors"
+REACHED = 0.95
+MAX_INPUT_BYTES = 512
+SLOWEST_INPUT_S = 20
+GRACE_S = 300
+"What building the corpus and writing the last figures may take beside the time that was asked for."
 LINE_BYTES = 4000
 "Bytes in one request to the C filter; its lines end at 8192 characters."
-TIME_LIMIT_S = 600
-HEARD_BY = {"device": (Drive, Retract, Clear, Home, Hello), "host": (State, Sense, Status, Identity)}
-"The first is the one that a CRC-8 protects, the last has a 32-bit number, by which a clean frame is known again."
-RANGED = {"device": Drive, "host": Status}
-UNKNOWN = sorted(set(range(128)) - set(FUNCTION.values()))
-Payload = tuple[int, bytes]
-"Function and payload."
+BEYOND_REACH = {
+    "generated, and nothing calls it": r"_init\(struct|_phys_range\(|_crc_is_in_range\(",
+    "generated: the length was checked before": r"-EINVAL",
+    "the function code was checked before": r"^    default:$",
+    "of a sensor that is not finite, which a port rules out": r"^    if \(!isfinite\(",
+}
+"By what its function's head or the lines about it look like."
+PROTECTED = {layout.function for layout in LAYOUTS if layout.protected}
+HELLO, HOME, CLEAR, RETRACT, RELEASE = (b"\x1e\0", b"\x06\0", b"\x0e\0", b"\x16\0", b"\x26\0")
+WAIT, CLOSE, OPEN, MEND = b"\xf8", b"\xff\x30", b"\xff\xd0", b"\x03"
+"Operations of firmware_protocol/c/fuzz/device.c: 125 ticks, and 32 Drives of RUN."
+ARMED = HELLO + HOME + 11 * WAIT + 4 * CLOSE
+RESTED = MEND + 8 * WAIT + CLEAR
 
 
-class Fuzz:
-    """One run. `program` is the firmware's framing and codec under sanitizers, empty where it cannot be built."""
+class Coverage(NamedTuple):
+    """Lines of the firmware: how many were run, which were not, and how many are beyond reach for what reason."""
 
-    def __init__(self, program: str = "") -> None:
-        self._program = program
-        self.tallies: dict[str, Counter[str]] = {}
-        self.runs = self.lost_second = self.differences = 0
+    run: int
+    missed: list[str]
+    beyond: Counter[str]
 
-    def serial(self, kind: str, receiver: str, rng: random.Random, count: int) -> None:
-        """Frames that the line damages, or whole frames with bad payloads, with clean frames between."""
-        burst, piece = rng.choice(BURSTS), rng.choice(PIECES)
-        sent: set[bytes] = set()
-        clean: list[bytes] = []
-        line = bytearray()
-        frame = encode_frame(*_numbered(0, drawn(rng, receiver)))
-        for number in range(1, count + 1):
-            if kind in WIRE_DAMAGE:
-                before, body = frame, drawn(rng, receiver)
-                frame = encode_frame(*_numbered(number, body))
-                line += damaged(kind, rng, frame, before)
-            else:
-                body = spoilt(kind, rng, receiver, MAX_PAYLOAD)
-                line += encode_frame(*_numbered(number, body))
-            sent.add(_known(number, body))
-            if number % burst == 0 or number == count:
-                for _ in range(2):
-                    body = _anchor(receiver, len(clean))
-                    clean.append(_known(len(clean), body))
-                    line += encode_frame(*_numbered(len(clean) - 1, body))
-        frames, statistics = heard(bytes(line), piece)
-        received = [_known(each.sequence, (each.function, each.payload)) for each in frames]
-        come, expected = set(received), set(clean)
-        self.runs += len(clean) // 2
-        self.lost_second += sum(each not in come for each in clean[1::2])
-        unclean = [each for each in received if each not in expected]
-        surplus = [each for each in unclean if each not in sent]
-        surplus += [each for each, before in pairwise(received) if each == before]
-        payloads = [(each[0], each[2:]) for each in unclean]
-        verdicts = accepted(payloads)
-        self.differences += self._differences(bytes(line), frames, statistics, payloads, verdicts)
-        judged = count
-        if kind in WIRE_DAMAGE:
-            verdicts = accepted([(each[0], each[2:]) for each in surplus])
-            judged = statistics.corrupt + len(surplus)
-        self._count(f"serial: {kind}", count, judged, verdicts, len(surplus))
-
-    def can(self, kind: str, receiver: str, rng: random.Random, count: int) -> None:
-        """Bad payloads in good CAN frames."""
-        payloads = [spoilt(kind, rng, receiver, CAN_FD_PAYLOAD) for _ in range(count)]
-        verdicts = accepted(payloads)
-        self.differences += self._differences(b"", [], FramingStatistics(), payloads, verdicts)
-        if receiver == "host":
-            stream = CanStream(NODE)
-            verdicts = [stream.unpack(function << 4 | NODE, payload) for function, payload in payloads]
-        self._count(f"CAN: {kind}", count, count, verdicts, 0)
-
-    def _count(self, kind: str, frames: int, judged: int, verdicts: Sequence[Message | None], wrong: int) -> None:
-        accepts = sum(message is not None for message in verdicts)
-        tally = self.tallies.setdefault(kind, Counter())
-        tally.update(frames=frames, judged=judged, false_accepts=accepts, wrong_frames=wrong)
-
-    def _differences(
-        self,
-        data: bytes,
-        frames: Sequence[Frame],
-        statistics: FramingStatistics,
-        payloads: Sequence[Payload],
-        messages: Sequence[Message | None],
-    ) -> int:
-        """How many frames and counts of the stream, and verdicts on payloads, the firmware's C has otherwise."""
-        if not self._program:
-            return 0
-        stream = [f"stream {data[at : at + LINE_BYTES].hex()}" for at in range(0, len(data), LINE_BYTES)]
-        asked = [*stream, *(f"decode {function} {payload.hex() or '-'}" for function, payload in payloads)]
-        text = "".join(f"{line}\n" for line in asked)
-        # a sanitizer's complaint ends the program (firmware_protocol/c/host/exchange.c)
-        done = subprocess.run(
-            [self._program], input=text, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=True
-        )
-        answers = done.stdout.splitlines()
-        theirs: list[str] = []
-        counted = [str(getattr(statistics, name)) for name in FramingStatistics.__match_args__]
-        counts = ["0"] * len(counted)
-        for answer in answers[: len(stream)]:
-            words = answer.split(" ")
-            theirs += words[: -len(counts)]
-            counts = words[-len(counts) :]
-        theirs += counts
-        theirs += ["refused" if answer.startswith("refused ") else answer for answer in answers[len(stream) :]]
-        ours = [f"{frame.function}:{frame.sequence}:{frame.payload.hex() or '-'}" for frame in frames] + counted
-        ours += [
-            "refused" if message is None else f"ok {payload.hex() or '-'}"
-            for (_, payload), message in zip(payloads, messages, strict=True)
-        ]
-        return sum(one != other for one, other in zip_longest(ours, theirs))
+    @property
+    def share(self) -> float:
+        """Of the lines that bytes can reach."""
+        return self.run / (self.run + len(self.missed))
 
 
-def run(count: int, seed: int) -> dict[str, Any]:
-    """`count` damaged frames, a tenth of them on CAN; the figures, and `failures`."""
+def run(seconds: int, seed: int) -> dict[str, Any]:
+    """So many seconds in total; the figures, and `failures`. Nothing, with `skipped`, where there is no clang."""
     try:
-        program, decoder = str(build(Target.SANITIZED_EXCHANGE)), "C99 under sanitizers"
+        program = build(Target.FUZZ)
     except BuildError as error:
-        program, decoder = "", str(error)
-    fuzz = Fuzz(program)
-    can = round(CAN_SHARE * count)
-    tasks = [(fuzz.serial, kind, to, count - can) for to in HEARD_BY for kind in (*WIRE_DAMAGE, *PAYLOAD_DAMAGE)]
-    on_can = [(fuzz.can, kind, to, can) for to in HEARD_BY for kind in PAYLOAD_DAMAGE]
-    with tqdm(total=count, desc="fuzz", unit="frame", unit_scale=True, disable=None) as progress:
-        for task, kind, receiver, frames in tasks + on_can:
-            share = max(1, frames // (len(on_can) if task == fuzz.can else len(tasks)))
-            for start in range(0, share, CHUNK):
-                name = f"{seed} {task.__name__} {kind} {receiver} {start}"
-                try:
-                    task(kind, receiver, random.Random(name), min(CHUNK, share - start))
-                except Exception as error:
-                    error.add_note(f"fuzz: {name}")
-                    raise
-            progress.update(share)
+        return {"skipped": str(error), "failures": []}
+    with TemporaryDirectory() as folder:
+        executions, failures = {}, []
+        for name, seeds in SEEDS.items():
+            corpus = Path(folder) / name
+            corpus.mkdir()
+            for number, data in enumerate(seeds()):
+                (corpus / f"{number:04}").write_bytes(data)
+            executions[name], failed = fuzzed(program, corpus, seconds / len(SEEDS), seed)
+            failures += failed
+        found = {name: [path.read_bytes() for path in sorted((Path(folder) / name).iterdir())] for name in SEEDS}
+        coverage = covered(program, Path(folder))
+    differ = differences(found["codec"], found["framing"])
+    if coverage is not None and coverage.share < REACHED:
+        failures.append(f"{coverage.share:.1%} of the lines that bytes can reach: asked are {REACHED:.0%}")
+    if differ:
+        failures.append(f"Python and C differ {differ} times")
     return {
-        "frames": sum(tally["frames"] for tally in fuzz.tallies.values()),
-        "device_decoder": decoder,
-        "false_accepts": sum(tally["false_accepts"] for tally in fuzz.tallies.values()),
-        "runs_of_damage": fuzz.runs,
-        "second_lost": fuzz.lost_second,
-        "languages_differ": fuzz.differences,
-        "kinds": fuzz.tallies,
-        "failures": failures(fuzz),
+        "executions": executions,
+        "inputs": {name: len(inputs) for name, inputs in found.items()},
+        "lines": "no llvm-cov here" if coverage is None else f"{coverage.share:.1%}",
+        "lines_missed": [] if coverage is None else coverage.missed,
+        "lines_beyond_reach": {} if coverage is None else coverage.beyond,
+        "languages_differ": differ,
+        "failures": failures,
     }
 
 
-def failures(fuzz: Fuzz) -> list[str]:
-    """What did not hold, in words."""
-    found = []
-    for kind, tally in fuzz.tallies.items():
-        damage = kind.partition(": ")[2]
-        odds = {
-            "false_accepts": PAYLOAD_DAMAGE[damage][0] if damage in PAYLOAD_DAMAGE else CRC16_ODDS,
-            "wrong_frames": CRC16_ODDS if damage in WIRE_DAMAGE else 0.0,
-        }
-        for what, chance in odds.items():
-            allowed = int(stats.binom.isf(CHANCE, tally["judged"], chance)) if chance else 0
-            if tally[what] > allowed:
-                found.append(f"{kind}: {tally[what]} {what}, allowed {allowed}")
-    if fuzz.lost_second:
-        found.append(f"not resynchronised within two frames: {fuzz.lost_second} times")
-    if fuzz.differences:
-        found.append(f"Python and C differ {fuzz.differences} times")
-    return found
+def fuzzed(program: Path, corpus: Path, seconds: float, seed: int) -> tuple[int, list[str]]:
+    """How many inputs were run, and what did not hold, each with the bytes that showed it."""
+    name, crashes = corpus.name, corpus.with_name(f"{corpus.name}-crash-")
+    command = [
+        *(str(program), str(corpus), f"-max_total_time={max(1, round(seconds))}", f"-seed={seed}"),
+        *(f"-max_len={MAX_INPUT_BYTES}", f"-timeout={SLOWEST_INPUT_S}", "-print_final_stats=1"),
+        f"-artifact_prefix={crashes}",
+    ]
+    environment = os.environ | {"TORMAG_FUZZ": name, "LLVM_PROFILE_FILE": str(corpus.with_suffix(".profraw"))}
+    done = subprocess.run(
+        command,
+        env=environment,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=seconds + GRACE_S,
+        check=False,
+    )
+    executed = re.search(r"number_of_executed_units: (\d+)", done.stderr)
+    if done.returncode == 0:
+        return int(executed[1]) if executed else 0, []
+    why = re.search(r"does not hold: .*|runtime error: .*|ERROR: .*", done.stderr)
+    inputs = [path.read_bytes().hex() for path in corpus.parent.glob(f"{crashes.name}*")]
+    reason = why[0] if why else done.stderr[-500:] or f"exit status {done.returncode}"
+    return int(executed[1]) if executed else 0, [f"{name}: {reason}: {', '.join(inputs)}"]
 
 
-# -- traffic and damage --------------------------------------------------------------------------------------------
+# -- what it begins with -------------------------------------------------------------------------------------------
 
 
-def drawn(rng: random.Random, receiver: str, kind: type[Message] | None = None) -> Payload:
-    """A valid message for that receiver with random steps, of any kind where none is said."""
-    layout = _layout(kind or rng.choice(HEARD_BY[receiver]))
-    return layout.function, _packed(layout, [_step(rng, signal) for signal in layout.signals])
+def payloads() -> Iterator[bytes]:
+    """Function and payload of every message's vector."""
+    vectors = json.loads((VECTORS / "messages.json").read_text(encoding="utf-8"))
+    for vector in (*vectors["valid"], *vectors["invalid"]):
+        yield bytes((vector["function"],)) + bytes.fromhex(vector["payload"])
 
 
-def _layout(kind: type[Message]) -> Layout:
-    return next(layout for layout in LAYOUTS if layout.message is kind)
+def streams() -> Iterator[bytes]:
+    """The frames' vectors, each whole stream in pieces of up to 127 bytes."""
+    vectors = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
+    for text in [
+        *(vector["frame"] for vector in vectors["valid"]),
+        *(vector["bytes"] for vector in vectors["streams"]),
+    ]:
+        yield in_pieces(bytes.fromhex(text), 127, lambda size: size)
 
 
-def _step(rng: random.Random, signal: Signal) -> int:
-    if rng.random() < EDGES:
-        return rng.choice((signal.lowest, max(signal.lowest, 0), signal.highest))
-    return rng.randint(signal.lowest, signal.highest)
+def lives() -> Iterator[bytes]:
+    """Frames on a device's line. Then lives that home and run; there comes each message, or each sensor goes wrong, or
+    leaps to and fro, or the host falls silent."""
+    vectors = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
+    for vector in vectors["valid"]:
+        yield in_pieces(bytes.fromhex(vector["frame"]), 31, lambda size: size << 3 | 4)
+    for vector in vectors["valid"][::3]:
+        yield ARMED + b"\x05" + bytes((vector["function"],)) + bytes.fromhex(vector["payload"]) + 2 * OPEN + 4 * WAIT
+    for what in range(32):
+        spoil = bytes((what << 3 | 2,))
+        for value, other in ((b"\x00\x14", b"\x00\x0c"), (b"\xff\x7f", b"\x00\x80")):
+            yield ARMED + spoil + value + 4 * OPEN + 8 * WAIT + RESTED
+            yield ARMED + spoil + value + 2 * WAIT + spoil + other + 2 * WAIT + RESTED
+    for end in (RELEASE, RETRACT, 4 * WAIT, b"\x01\x20", 9 * OPEN, HELLO, HOME, CLEAR):
+        yield ARMED + end + 4 * WAIT + RESTED + HELLO
 
 
-def _packed(layout: Layout, steps: list[int]) -> bytes:
-    """The payload, with the right CRC-8 where there is one."""
-    if not layout.protected:
-        return struct.pack(layout.format, *steps)
-    data = struct.pack(layout.format, *steps, 0)[:-1]
-    return data + bytes((crc8(bytes((layout.function,)) + data),))
+def in_pieces(data: bytes, most: int, head: Callable[[int], int]) -> bytes:
+    """A stream as a harness reads it: before each piece, a byte that `head` makes of its size."""
+    pieces = [data[at : at + most] for at in range(0, len(data), most)]
+    return b"".join(bytes((head(len(piece)),)) + piece for piece in pieces)
 
 
-def _anchor(receiver: str, number: int) -> Payload:
-    layout = _layout(HEARD_BY[receiver][-1])
-    return layout.function, struct.pack("<I", number).ljust(struct.calcsize(layout.format), b"\0")
+SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {"codec": payloads, "framing": streams, "device": lives}
+"By target: the inputs that its corpus begins with."
 
 
-def _numbered(number: int, body: Payload) -> tuple[int, int, bytes]:
-    return body[0], number % 256, body[1]
+# -- which lines were run ------------------------------------------------------------------------------------------
 
 
-def _known(number: int, body: Payload) -> bytes:
-    return bytes((body[0], number % 256)) + body[1]
+def covered(program: Path, folder: Path) -> Coverage | None:
+    """The lines of the firmware that the targets ran, of the profiles in `folder`; None without LLVM's two tools."""
+    merged = folder / "all.profdata"
+    merge = ["llvm-profdata", "merge", "-o", str(merged), *map(str, folder.glob("*.profraw"))]
+    sources = [str(ROOM / f"{name}.c") for name in FIRMWARE]
+    export = ["llvm-cov", "export", "-format=lcov", str(program), f"-instr-profile={merged}", *sources]
+    try:
+        subprocess.run(merge, capture_output=True, check=True)
+        table = subprocess.run(export, capture_output=True, text=True, check=True).stdout
+    except FileNotFoundError:
+        return None
+    run, missed, beyond = 0, list[str](), Counter[str]()
+    for record in table.split("end_of_record\n")[:-1]:
+        path = Path(re.findall(r"^SF:(.*)$", record, re.MULTILINE)[0])
+        lines = path.read_text(encoding="utf-8").splitlines()
+        for number, count in re.findall(r"^DA:(\d+),(\d+)$", record, re.MULTILINE):
+            reason = "" if int(count) else out_of_reach(lines, int(number))
+            run += int(count) > 0
+            if reason:
+                beyond[f"{path.name}: {reason}"] += 1
+            elif not int(count):
+                missed.append(f"{path.name}:{number}")
+    return Coverage(run, missed, beyond)
 
 
-WIRE_DAMAGE: dict[str, Callable[[random.Random, bytes, bytes, int, int], bytes]] = {
-    "1 to 3 bits flipped": lambda rng, frame, *_: _flipped(frame, rng.sample(range(8 * len(frame)), rng.randint(1, 3))),
-    "burst of up to 16 bits": lambda rng, frame, *_: _flipped(frame, _burst(rng, len(frame), 16)),
-    "bytes overwritten": lambda rng, frame, _, start, end: (
-        frame[:start] + rng.randbytes(end + 1 - start) + frame[end + 1 :]
-    ),
-    "bytes cut out": lambda _rng, frame, _, start, end: frame[:start] + frame[end + 1 :],
-    "bytes inserted": lambda rng, frame, _, start, _end: (
-        frame[:start] + rng.randbytes(rng.randint(1, 4)) + frame[start:]
-    ),
-    # COBS's 1 before the delimiter taken away where it stands, and put where it does not
-    "a zero more or less at the end": lambda _, frame, *__: (
-        frame[:-2] + b"\0" if frame[-2] == 1 else frame[:-1] + b"\1\0"
-    ),
-    "delimiters inserted": lambda rng, frame, _, start, _end: frame[:start] + bytes(rng.randint(1, 3)) + frame[start:],
-    "delimiter lost": lambda _, frame, *__: frame[:-1],
-    "two frames spliced": lambda rng, frame, other, *_: (
-        frame[: rng.randrange(1, len(frame))] + other[rng.randrange(1, len(other)) :]
-    ),
-    "frame repeated": lambda rng, frame, *_: frame * rng.randint(2, 3),
-    "noise": lambda rng, *_: rng.randbytes(rng.randint(1, 40)),
-}
-"""What a line does to sealed frames, of a frame, what went before it, and two of its places. None of these should give
-a frame that was not sent."""
+def out_of_reach(lines: list[str], number: int) -> str:
+    """Why no bytes reach the line, by its function's head, itself and the two lines before it; empty where they can."""
+    heads = [line for line in lines[:number] if line and line[0].isalpha()]
+    looks_like = "\n".join([*heads[-1:], *lines[number - 3 : number]])
+    return next((why for why, looks in BEYOND_REACH.items() if re.search(looks, looks_like, re.MULTILINE)), "")
 
 
-def damaged(kind: str, rng: random.Random, frame: bytes, other: bytes) -> bytes:
-    """A sealed frame that a line has damaged; `other` went before it. Raises KeyError for an unknown kind."""
-    start, end = sorted((rng.randrange(len(frame)), rng.randrange(len(frame))))
-    return WIRE_DAMAGE[kind](rng, frame, other, start, end)
+# -- both languages ------------------------------------------------------------------------------------------------
 
 
-Spoils = Callable[[random.Random, str, int, int, bytes], Payload]
-"Makes a wrong payload for a receiver, of at most so many bytes, of a valid function and payload."
-PAYLOAD_DAMAGE: dict[str, tuple[float, Spoils]] = {
-    "CRC-8: 1 or 2 bits flipped": (
-        0.0,
-        lambda rng, _receiver, _longest, function, payload: (
-            function,
-            _flipped(payload, rng.sample(range(8 * len(payload)), rng.randint(1, 2))),
-        ),
-    ),
-    "CRC-8: burst of up to 8 bits": (
-        0.0,
-        lambda rng, _receiver, _longest, function, payload: (function, _flipped(payload, _burst(rng, len(payload), 8))),
-    ),
-    # all in range, and another counter than that of the message whose CRC-8 it is
-    "CRC-8: of another message": (
-        CRC8_ODDS,
-        lambda rng, receiver, _longest, function, payload: (
-            function,
-            drawn(rng, receiver, HEARD_BY[receiver][0])[1][:-2]
-            + bytes(((payload[-2] + rng.randint(1, 255)) % 256, payload[-1])),
-        ),
-    ),
-    "CRC-8: random payload": (
-        CRC8_ODDS,
-        lambda rng, _receiver, _longest, function, payload: (function, rng.randbytes(len(payload))),
-    ),
-    "wrong length": (
-        0.0,
-        lambda rng, _receiver, longest, function, payload: (
-            function,
-            (payload + rng.randbytes(longest))[
-                : rng.choice([*range(len(payload)), *range(len(payload) + 1, longest + 1)])
-            ],
-        ),
-    ),
-    "out of range or enumeration": (
-        0.0,
-        lambda rng, receiver, _longest, _function, _payload: _out_of_range(rng, _layout(RANGED[receiver])),
-    ),
-    "unknown function": (0.0, lambda rng, _receiver, _longest, _function, payload: (rng.choice(UNKNOWN), payload)),
-}
-"What is wrong in a payload that the carrier brought whole, and the odds that the codec takes it for a message."
+def differences(of_codec: list[bytes], of_framing: list[bytes]) -> int:
+    """How many frames, counts and verdicts Python has otherwise than the C under sanitizers, of these inputs."""
+    heard = [one for data in of_codec if data for one in (data, sealed(data))]
+    requests, ours = [], []
+    for data in heard:
+        requests.append(f"decode {data[0]} {data[1:].hex() or '-'}")
+        ours.append(verdict(data[0], data[1:]))
+    for data in of_framing:
+        line, decoder = line_of(data), FrameDecoder()
+        requests.append("restart")
+        ours.append("-")
+        for at in range(0, len(line), LINE_BYTES):
+            piece = line[at : at + LINE_BYTES]
+            requests.append(f"stream {piece.hex()}")
+            frames = [f"{one.function}:{one.sequence}:{one.payload.hex() or '-'}" for one in decoder.feed(piece)]
+            counts = [str(getattr(decoder.statistics, name)) for name in FramingStatistics.__match_args__]
+            ours.append(" ".join(frames + counts))
+    text = "".join(f"{request}\n" for request in requests)
+    # a sanitizer's complaint ends the program (firmware_protocol/c/host/exchange.c)
+    program = build(Target.SANITIZED_EXCHANGE)
+    done = subprocess.run([program], input=text, capture_output=True, text=True, timeout=GRACE_S, check=True)
+    theirs = [re.sub(r"^refused .*", "refused", answer) for answer in done.stdout.splitlines()]
+    return sum(one != other for one, other in zip_longest(ours, theirs))
 
 
-def spoilt(kind: str, rng: random.Random, receiver: str, longest: int) -> Payload:
-    """A payload of at most `longest` bytes that the codec has to refuse. Raises KeyError for an unknown kind."""
-    valid = drawn(rng, receiver, HEARD_BY[receiver][0] if kind.startswith("CRC-8") else None)
-    return PAYLOAD_DAMAGE[kind][1](rng, receiver, longest, *valid)
+def verdict(function: int, payload: bytes) -> str:
+    """What Python's codec says of a payload, as the C filter writes it."""
+    try:
+        decode(function, payload)
+    except DecodeError:
+        return "refused"
+    return f"ok {payload.hex() or '-'}"
 
 
-def _out_of_range(rng: random.Random, layout: Layout) -> Payload:
-    """One signal, of those whose type holds more than their range does, at a step outside of it."""
-    steps = [_step(rng, signal) for signal in layout.signals]
-    spans = [256 ** struct.calcsize(f"<{code}") for code in layout.format[1:]]
-    roomy = [at for at, one in enumerate(layout.signals) if one.highest - one.lowest + 1 < spans[at]]
-    at = rng.choice(roomy)
-    signal, span = layout.signals[at], spans[at]
-    step = rng.randrange(span - (signal.highest - signal.lowest + 1))
-    step -= span // 2 if layout.format[1 + at].islower() else 0
-    steps[at] = step + (signal.highest - signal.lowest + 1 if step >= signal.lowest else 0)
-    return layout.function, _packed(layout, steps)
+def sealed(data: bytes) -> bytes:
+    """An input of the codec with the right CRC-8 at its end, where its function has one."""
+    return data[:-1] + bytes((crc8(data[:-1]),)) if data[0] in PROTECTED and len(data) > 1 else data
 
 
-def _flipped(data: bytes, bits: list[int]) -> bytes:
-    """With these bits turned, counted from the first byte's highest."""
-    number = int.from_bytes(data, "big")
-    for bit in bits:
-        number ^= 1 << (8 * len(data) - 1 - bit)
-    return number.to_bytes(len(data), "big")
-
-
-def _burst(rng: random.Random, length: int, span: int) -> list[int]:
-    """A first bit, and any of the next `span` - 1 that there are."""
-    first = rng.randrange(8 * length)
-    return [first, *(bit for bit in range(first + 1, min(first + span, 8 * length)) if rng.random() < 0.5)]
-
-
-# -- who hears it --------------------------------------------------------------------------------------------------
-
-
-def heard(data: bytes, piece: int) -> tuple[list[Frame], FramingStatistics]:
-    """What the host's frame decoder makes of a stream that comes in pieces of `piece` bytes."""
-    decoder = FrameDecoder()
-    frames: list[Frame] = []
-    for start in range(0, len(data), piece):
-        frames += decoder.feed(data[start : start + piece])
-    return frames, decoder.statistics
-
-
-def accepted(payloads: Sequence[Payload]) -> list[Message | None]:
-    """What the host's codec makes of each payload; None where it refuses."""
-    messages: list[Message | None] = []
-    for function, payload in payloads:
-        try:
-            messages.append(decode(function, payload))
-        except DecodeError:
-            messages.append(None)
-    return messages
+def line_of(data: bytes) -> bytes:
+    """The stream that an input of the framing stands for; as firmware_protocol/c/fuzz/framing.c reads it."""
+    line, at = bytearray(), 0
+    while at < len(data):
+        piece, at = data[at], at + 1
+        if piece < 128 or len(data) - at < 2:
+            line += data[at : at + piece]
+            at += piece
+            continue
+        payload = data[at + 2 : at + 2 + (piece & 15)]
+        if len(payload) <= MAX_PAYLOAD:
+            line += encode_frame(data[at], data[at + 1], payload)
+        at += 2 + (piece & 15)
+    return bytes(line)

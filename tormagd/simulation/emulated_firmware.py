@@ -14,7 +14,7 @@ import weakref
 from collections import deque
 from typing import IO, Final
 
-from firmware_protocol.c.build import Target, build, emulation_tool
+from firmware_protocol.c.build import Target, build, debian_tool
 from firmware_protocol.codec import (
     FUNCTION,
     DeviceFault,
@@ -69,7 +69,7 @@ class EmulatedFirmware:
     """
 
     def __init__(self, plant: PlantParameters) -> None:
-        program, emulator = build(Target.MPS2), emulation_tool("qemu-system-arm")
+        program, emulator = build(Target.MPS2), debian_tool("qemu-system-arm")
         self._link, theirs = socket.socketpair()
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the emulator
         with theirs:
