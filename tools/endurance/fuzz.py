@@ -155,7 +155,7 @@ def lives() -> Iterator[bytes]:
             yield ARMED + spoil + value + 4 * OPEN + 8 * WAIT + RESTED
             yield ARMED + spoil + value + 2 * WAIT + spoil + other + 2 * WAIT + RESTED
     for end in (RELEASE, RETRACT, 4 * WAIT, b"\x01\x20", 9 * OPEN, HELLO, HOME, CLEAR):
-        yield ARMED + end + 4 * WAIT + RESTED + HELLO
+        yield ARMED + end + 6 * WAIT + HOME + RESTED + HELLO
 
 
 def in_pieces(data: bytes, most: int, head: Callable[[int], int]) -> bytes:
