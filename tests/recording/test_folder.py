@@ -120,17 +120,18 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
 
 
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
-    """Through the recorder, as it goes on for so long: a batch a minute, now and then a mark; the marks."""
+    """Through the recorder, as it goes on for so long: a large tick every three minutes, now and then a mark; the
+    marks."""
     told, newest = [], None
     with RecordingWriter(RecordingFolder(path, budget_of(SETTINGS), clock)) as recorder:
-        for minute in range(hours * 60):
-            clock.now_s += 60.0
+        for number in range(hours * 20):
+            clock.now_s += 180.0
             ms = (clock.now_s - START_NS * 1e-9) * 1e3
-            recorder.ticks(batch(*((ms + i, rng.random(), rng.random(), rng.random(), 36.0, 0.25) for i in range(20))))
-            if rng.random() < 0.0005:
-                newest = Mark(t_ns=round(clock.now_s * 1e9), text=f"event {minute}")
+            recorder.ticks(batch((ms, 36.0, rng.randbytes(8_000).hex()), columns=("t_ns", "right_mm", "words")))
+            if rng.random() < 0.0015:
+                newest = Mark(t_ns=round(clock.now_s * 1e9), text=f"event {number}")
                 told.append(newest.text)
-            recorder.telemetry(telemetry(ms + 20, minute, mark=newest))
+            recorder.telemetry(telemetry(ms + 20, number, mark=newest))
     return told
 
 
@@ -179,7 +180,7 @@ room, name = {
     "finish": (seal.SealingFile, "finish"),
 }[what]
 setattr(room, name, deadly(getattr(room, name), random.Random(after).random() < 0.5))
-record(Path(sys.argv[2]), Clock(), 24, random.Random(3))
+record(Path(sys.argv[2]), Clock(), 24, random.Random(6))
 """
 
 

@@ -63,11 +63,11 @@ def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path:
 
 
 def rewritten(path: Path, target: Path, overview: Overview) -> Path:
-    """The same messages by the usual writer, without seals, and with another overview."""
+    """The same messages of the fault by the usual writer, without seals, and with another overview."""
     with path.open("rb") as source, target.open("wb") as made:
         writer, channels = Writer(made), {}
         writer.start()
-        for schema, channel, message in make_reader(source).iter_messages():
+        for schema, channel, message in make_reader(source).iter_messages(starting_at=START_NS + 24_000_000_000):
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
