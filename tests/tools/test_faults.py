@@ -61,6 +61,13 @@ JUDGED_S = 1.5
 """How long where the judge is judged: one gap is open by then, the other has not moved."""
 
 
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A force is followed by then, on either device."""
+    monkeypatch.setattr(faults, "INJECTED_S", 4.2)
+    monkeypatch.setattr(faults, "USUAL_S", 0.6)
+
+
 def is_let_go_by_the_daemon(item: Injection) -> bool:
     """At the scene's own rate, in a core that runs."""
     return item.host in ("stale", "other") or item.publisher == "nan"

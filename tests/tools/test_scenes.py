@@ -47,7 +47,8 @@ def test_a_case_gives_what_was_stored() -> None:
 
 
 @pytest.mark.parametrize("situation", scene_runs.SITUATIONS)
-def test_a_device_is_measured_in_every_situation(situation: str) -> None:
+def test_a_device_is_measured_in_every_situation(situation: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_runs, "HOLD_S", 1.0)
     error_N = run(Case("coronary", situation=situation, control_hz=500, inference_hz=83, seconds=1.0))
     assert 0.0 < error_N < load_scene("coronary").force.most_N
 
