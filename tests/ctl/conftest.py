@@ -1,12 +1,15 @@
 """A daemon made of sockets only: it answers what a test tells it to and publishes steadily."""
 
+import contextlib
+import importlib
+import io
 import json
 import math
 import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -287,6 +290,22 @@ def ctl(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
         return Ran(code, *capsys.readouterr())
 
     return run
+
+
+@pytest.fixture
+def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The daemon's own check of a scene, in this process: another takes longer to load than to check. That one does it
+    is asked where a scene is checked as the daemon does."""
+
+    def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
+        said, told = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(told):
+            code = importlib.import_module(module).main([*arguments])
+        if code:
+            raise ChildProcessError(told.getvalue().strip().splitlines()[-1])
+        return said.getvalue()
+
+    monkeypatch.setattr("tormagd.ctl.scene.answer_of", answer_of)
 
 
 @pytest.fixture

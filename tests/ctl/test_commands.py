@@ -187,12 +187,12 @@ def test_a_scene_is_checked_as_the_daemon_does(ctl):
     assert list(comes_s) == sorted(comes_s, reverse=True)
 
 
-def test_every_measured_way_is_shown_with_what_it_costs(ctl):
+def test_every_measured_way_is_shown_with_what_it_costs(ctl, checked_here):
     text = ctl("scene", "explain", "brain").ended(0).out
     assert all(said in text for said in ("1000 / 500 Hz, newton", "chosen, runs here", "contact", "signal, frozen"))
 
 
-def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_written(tmp_path, ctl):
+def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_written(tmp_path, ctl, checked_here):
     every = ctl("--json", "scene", "explain", "pulse").ended(0).result
     errors_N = {json.dumps(tried["way"]): max(tried["rms_N"]) for tried in every["tried"]}
     shares = {json.dumps(share["way"]): share["daemon"] for share in every["shares"]}
@@ -499,7 +499,7 @@ def recording(path: Path, least_N: float, most_N: float, rate_hz: float) -> Path
     return path
 
 
-def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_it(tmp_path, ctl):
+def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_it(tmp_path, ctl, checked_here):
     forces = recording(tmp_path / "forces.csv", 0.31, 0.62, 0.3)
     out = tmp_path / "scenes" / "mine.toml"
     out.parent.mkdir()
@@ -516,7 +516,9 @@ def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_i
 
 
 @pytest.mark.parametrize(("rate_hz", "insert", "is_told"), [(0.1, "MRE-50-40", False), (4.5, "MRE-10-20", True)])
-def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(tmp_path, ctl, rate_hz, insert, is_told):
+def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(
+    tmp_path, ctl, checked_here, rate_hz, insert, is_told
+):
     """A weak device does not give 1.7 N with MRE-10-20, whose model gives 1.9."""
     forces, out = recording(tmp_path / "forces.csv", 1.4, 1.7, rate_hz), tmp_path / "mine.toml"
     assert ("a weak device" in ctl("scene", "new", str(out), "--force", str(forces)).ended(0).out) == is_told
@@ -527,7 +529,7 @@ def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(tmp_path, ct
     ("most_N", "rate_hz", "parts"),
     [(40.0, 0.1, ["force.most_N = 40"]), (2.0, 5.0, ["tolerance_rms_N = 0.065: allowed for its signal is at least"])],
 )
-def test_a_force_that_no_insert_renders_is_written_and_marked(tmp_path, ctl, most_N, rate_hz, parts):
+def test_a_force_that_no_insert_renders_is_written_and_marked(tmp_path, ctl, checked_here, most_N, rate_hz, parts):
     out = tmp_path / "mine.toml"
     forces = recording(tmp_path / "f.csv", 0.7, most_N, rate_hz)
     result = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(1).result
@@ -538,7 +540,7 @@ def test_a_force_that_no_insert_renders_is_written_and_marked(tmp_path, ctl, mos
     assert told == "scene mine: " + "; and ".join(result["unmet"])
 
 
-def test_what_is_not_met_is_met_by_the_tolerance_that_is_named(tmp_path, ctl):
+def test_what_is_not_met_is_met_by_the_tolerance_that_is_named(tmp_path, ctl, checked_here):
     forces = recording(tmp_path / "f.csv", 0.7, 2.0, 5.0)
     unmet = ctl("scene", "new", str(tmp_path / "a.toml"), "--force", str(forces), "--json").ended(1).result["unmet"]
     [tolerance] = re.findall(r"at least ([0-9.]+):", unmet[0])
@@ -547,7 +549,7 @@ def test_what_is_not_met_is_met_by_the_tolerance_that_is_named(tmp_path, ctl):
     assert load_scene(out).force.tolerance_rms_N == float(tolerance)
 
 
-def test_another_quantity_becomes_a_force_by_scale_and_offset(tmp_path, ctl):
+def test_another_quantity_becomes_a_force_by_scale_and_offset(tmp_path, ctl, checked_here):
     (tmp_path / "f.csv").write_text("t_s,note,ABP_mmHg\n" + "".join(f"{n},a,{70 + 50 * (n % 2)}\n" for n in range(30)))
     given = ("--force", str(tmp_path / "f.csv"), "--column", "ABP_mmHg", "--scale", "0.01", "--offset", "0.5")
     scene = load_scene(ctl("scene", "new", str(tmp_path / "mine.toml"), *given, "--json").ended(0).result["file"])
@@ -571,7 +573,7 @@ def test_what_can_be_no_scene_is_told_and_leaves_no_file(tmp_path, ctl, options,
     assert [file.name for file in tmp_path.iterdir()] == ["f.csv"]
 
 
-def test_an_insert_that_there_is_not_is_refused_and_leaves_no_file(tmp_path, ctl):
+def test_an_insert_that_there_is_not_is_refused_and_leaves_no_file(tmp_path, ctl, checked_here):
     forces = recording(tmp_path / "f.csv", 1.0, 1.4, 0.1)
     given = ("--force", str(forces), "--insert", "MRE-70-10")
     assert "MRE-70-10" in ctl("scene", "new", str(tmp_path / "a.toml"), *given, "--json").ended(1).error["message"]
@@ -583,7 +585,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, ctl, monkeypatch):
+def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, ctl, monkeypatch, checked_here):
     monkeypatch.setattr(sys, "stdin", Terminal("A vein is held open.\n\n1.5\nmuch\n0.06\n" + "\n" * 6))
     scene = load_scene(ctl("scene", "new", str(tmp_path / "vein.toml"), "--json").ended(0).result["file"])
     assert (scene.description, scene.force.most_N, scene.force.tolerance_rms_N) == ("A vein is held open.", 1.5, 0.06)

@@ -158,7 +158,7 @@ def ended(command: str, files: dict[str, str]) -> int:
 
 
 @pytest.mark.parametrize(("command", "code", "says", "files"), MISTAKES, ids=[row[0][:60] for row in MISTAKES])
-def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_path, monkeypatch, capsys):
+def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_path, monkeypatch, capsys, checked_here):
     monkeypatch.chdir(tmp_path)
     assert ended(command, files) == code
     said = "".join(capsys.readouterr()).strip()
@@ -174,7 +174,7 @@ def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_pat
 JSON = [row for row in MISTAKES if row[0].startswith("tormagctl") and "--measure" not in row[0]]
 
 
-def test_with_json_each_of_them_is_one_object(tmp_path, monkeypatch, capsys):
+def test_with_json_each_of_them_is_one_object(tmp_path, monkeypatch, capsys, checked_here):
     """Of those that are wrong in the command line itself, too."""
     monkeypatch.chdir(tmp_path)
     for command, code, says, files in JSON:

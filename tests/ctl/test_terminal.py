@@ -73,7 +73,7 @@ def test_a_terminal_that_has_ascii_only_gets_all_of_it(fake_daemon, status_with,
         assert json.loads(said)["result"]["limits"] == ["\u0394"]
 
 
-def test_a_narrow_terminal_gets_lines_that_go_on_under_their_own_words(fake_daemon, ctl, monkeypatch):
+def test_a_narrow_terminal_gets_lines_that_go_on_under_their_own_words(fake_daemon, ctl, monkeypatch, checked_here):
     monkeypatch.setattr("tormagd.ctl.outcome.is_terminal", lambda stream: True)
     monkeypatch.setenv("COLUMNS", "40")
     monkeypatch.setenv("NO_COLOR", "1")
