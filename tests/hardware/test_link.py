@@ -340,6 +340,16 @@ def test_busy_and_latched(mode: DeviceMode, faults: DeviceFault, busy: bool, lat
     assert (link.measurement.is_busy, link.measurement.is_latched) == (busy, latched)
 
 
+@pytest.mark.parametrize("switches", [Switches(bits) for bits in range(1 << 5)])
+def test_each_switch_is_read_by_itself(switches: Switches) -> None:
+    measurement = running().measurement.replaced(switches=switches)
+    assert (measurement.is_left_open, measurement.is_right_open, measurement.is_homed) == (
+        Switches.LEFT_OPEN in switches,
+        Switches.RIGHT_OPEN in switches,
+        Switches.HOMED in switches,
+    )
+
+
 def through_the_wire(message: Message) -> Message:
     """What arrives of a message: quantised and wrapped."""
     return decode(FUNCTION[type(message)], encode(message))

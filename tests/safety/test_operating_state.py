@@ -86,6 +86,29 @@ def test_what_a_command_wants_and_has_not_is_said(name: str, changes: dict[str, 
     assert code != "device_latched" or refused.hint in ("tormagctl clear-fault", "tormagctl arm")
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"apart_mm": 1.04, "most_apart_mm": 1.0}, "the carriages are 1.04 mm apart: allowed is at most 1 mm"),
+        (
+            {"round_trip_s": 0.0124, "most_round_trip_s": 0.011},
+            "the round trip to the device is 12.4 ms: allowed is at most 11.0 ms, or the carriages swing",
+        ),
+        ({"clock_drift": -0.123, "most_clock_drift": 0.1}, "the device's clock is off by -12.3%: allowed is 10%"),
+        ({"fresh": False, "cause": "no Sense yet"}, "no fresh measurement from the device: no Sense yet"),
+    ],
+)
+def test_a_refusal_to_enable_has_the_figures(changes: dict[str, bool | float | str], message: str) -> None:
+    assert str(refusal(SafetyState(), "enable", READY.replaced(**changes))) == message
+
+
+def test_only_a_missing_device_has_a_remedy_of_its_own() -> None:
+    missing = READY.replaced(connected=False, cause="no port", remedy="plug it in")
+    refused = refusal(SafetyState(), "enable", missing)
+    assert (refused.message, refused.hint) == ("the device is not connected: no port", "plug it in")
+    assert refusal(SafetyState(), "enable", missing.replaced(connected=True, homed=False)).hint == "tormagctl arm"
+
+
 OPENED = (DISABLED, DeviceRequest.RETRACT)
 STOPPED = (FAULT, DeviceRequest.RETRACT)
 CLEAR = "tormagctl clear-fault"
@@ -114,10 +137,13 @@ def test_each_command_in_each_state(name: str, present: OperatingState) -> None:
         assert (refused.code, refused.hint) == (row.code, wanted)
         if present is FAULT:
             assert (refused.code, Fault.DEVICE_OVERCURRENT in refused.message) == ("fault", True)
+        else:
+            assert refused.message == (f"already {present}" if name == "enable" else f"cannot {name} while {present}")
         return
     after = command(state, name, 0.0, READY)
     has_asked = after.request_number > state.request_number
     assert ((after.operating_state, after.request) if has_asked else after.operating_state) == wanted
+    assert after.is_driven is (after.operating_state in (ENABLED, PAUSED))
 
 
 def test_stop_is_taken_without_a_device() -> None:
@@ -344,6 +370,14 @@ def test_several_bits_are_several_faults() -> None:
     assert device_faults(DeviceFault(0)) == ()
     assert len(set(device_faults(DeviceFault(sum(DeviceFault))))) == len(DeviceFault)
     assert device_faults(DeviceFault.SUPPLY | DeviceFault.SKEW) == (Fault.DEVICE_SUPPLY, Fault.DEVICE_SKEW)
+
+
+def test_only_the_command_timeout_is_put_down_to_a_host_that_stalled() -> None:
+    every = DeviceFault(sum(DeviceFault))
+    pairs = zip(device_faults(every), device_faults(every, is_host_stall=True), strict=True)
+    assert [(fault, told) for fault, told in pairs if fault is not told] == [
+        (Fault.DEVICE_COMMAND_TIMEOUT, Fault.HOST_STALL)
+    ]
 
 
 def test_codes_are_their_names_and_told_in_the_order_of_their_tables() -> None:
