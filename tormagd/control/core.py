@@ -85,8 +85,8 @@ class Planner:
     def _held_N(self, measured: Measured | None, device: DeviceFit) -> float:
         """Return the force of `device`, N, at the gap where it is: `measured`, or open where that is None or not homed.
 
-        The portrait's gap for a force is corrected by as much as the newest plan's gap is beside it, unless the ceiling
-        held that plan.
+        By as much as the newest plan's gap differs from the portrait's for its force, the measured gap is corrected
+        first. A plan that the ceiling held corrects nothing.
         """
         portrait, planned = self._portrait, self.planned
         if measured is None or not measured.is_homed:
@@ -123,9 +123,10 @@ class Planner:
         self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
-        """Begin anew at `now_s` after a plan that failed, with nothing known of the device.
+        """Begin anew at `now_s` after a plan that failed, with nothing known of the device or of setpoints.
 
-        The newest plan is then one that opens the gap. Plan numbers go on, and the element's memory stays.
+        The newest plan is then one that opens the gap. Plan numbers go on. The element's memory and the handle's travel
+        stay.
         """
         self.believe.forget()
         self.governor.begin(now_s)
@@ -168,11 +169,11 @@ class Stepper:
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
         """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties.
 
-        A device that is not driven gets duties of 0 in mode OFF. While the loop is blind, or after a leap of the
-        encoders, a driven one gets 0 in mode RUN: friction holds the gap. `measurement` is None when the link is lost:
-        mode OFF, and a driven device gives the fault LINK_LOST. A measurement with a number that is not finite gives
-        the fault NOT_FINITE, and measuring and driving begin anew. Raises DomainError where `now_s` is not finite;
-        nothing has changed then.
+        A device that is not driven gets duties of 0 in mode OFF. A paused one is driven to hold its gap. While the loop
+        is blind, or after a leap of the encoders, a driven one gets 0 in mode RUN: friction holds the gap.
+        `measurement` is None when the link is lost: mode OFF, and a driven device gives the fault LINK_LOST. A
+        measurement with a number that is not finite gives the fault NOT_FINITE, and measuring and driving begin anew.
+        Raises DomainError where `now_s` is not finite; nothing has changed then.
         """
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:

@@ -112,8 +112,9 @@ class Measure:
     def _measured(self, last: Measured | None, measurement: Measurement) -> Measured:
         """Return the record of `measurement`, or `last` again where the device has said nothing new.
 
-        `last` is None before the first: the record is one at rest. Speeds are filtered derivatives over the *device's*
-        clock, so that late delivery is not mistaken for slow motion.
+        Nothing new is the same number, or a device time less than MIN_DT_S after that of `last`. `last` is None before
+        the first: the record is one at rest. The force is positive against the handle's way. Speeds are filtered
+        derivatives over the *device's* clock, so that late delivery is not mistaken for slow motion.
         """
         if last is None:
             return self._first(measurement)

@@ -39,9 +39,10 @@ class Leap(Value):
         self.right_from_mm: Final = right_from_mm
 
     def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
-        """Tell whether both carriages read places that they can have reached from before the step.
+        """Tell whether both carriages read places that they can have reached by `now_s` from before the step.
 
-        The leap was noise on a line then. `full_speed_mm_s` is one carriage's.
+        The leap was noise on a line then. They can have gone LEAP_MM, and at LEAP_SPEEDS times `full_speed_mm_s`, one
+        carriage's.
         """
         max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
@@ -59,7 +60,7 @@ def leap_between(
     """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None.
 
     `last` was found at `seen_s`, `measured` at `now_s`. The step took the longer of two times, by the device's clock
-    and by the host's. `full_speed_mm_s` is one carriage's.
+    and by the host's. In it a carriage goes LEAP_MM, and at LEAP_SPEEDS times `full_speed_mm_s`, one carriage's.
     """
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
@@ -72,8 +73,8 @@ def leap_between(
 def is_outside(measured: Measured, closed_mm: float, open_mm: float, is_left_open: bool, is_right_open: bool) -> bool:
     """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`.
 
-    A place outside the stroke is impossible. So is one far from the open end while the carriage's open switch is closed
-    (`is_left_open`, `is_right_open`).
+    A place more than OVERRUN_MM outside the stroke is impossible, and NaN. So is one as far from the open end while the
+    carriage's open switch is closed (`is_left_open`, `is_right_open`). A `closed_mm` over CLOSED_END_MM counts as that.
     """
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     home_mm = open_mm / 2.0 - OVERRUN_MM

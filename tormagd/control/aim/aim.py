@@ -96,7 +96,7 @@ class Aim:
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open, no setpoint, the limit NO_SETPOINT and this `number`.
 
-        The element's field lags `lag_mT` behind the gap's. The field of the open gap becomes the newest `answer`.
+        The element's field there lags `lag_mT` behind the gap's: it becomes `element_mT`, and the newest `answer`.
         """
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
@@ -115,6 +115,7 @@ class Aim:
     ) -> Plan:
         """Return the next plan, for the force in `ask` and the device in `belief`.
 
+        The plan's gap is never less than `least_mm`; where that holds it open, the plan has the limit CEILING.
         `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent.
         `memory` gives the lag of the element's field. Updates `number` and `element_mT`, and `question` where a search
         runs beside the plans. Raises DomainError where no gap gives the field, a number is not finite, or the newest

@@ -135,8 +135,7 @@ class Forecast:
     def trust(self) -> float:
         """Return how far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast.
 
-        The trust is the skill score of LONG_S, times 1 less what the score of SHORT_S is below 0, each held within
-        0..1.
+        The trust is the skill score of LONG_S times (1 + the score of SHORT_S), both factors held within 0..1.
         """
         if not self.changes_N:
             return 0.0
@@ -235,7 +234,10 @@ class Forecast:
         self.beat_missed += _LONG_SHARE * (beat_error_N * beat_error_N - self.beat_missed)
 
     def _guess(self, rise: list[float], beat: list[float], changes: list[float], slope_N_s: float) -> Guess:
-        """Return what each embedding, their mixture and the slope say of the point JUDGED steps ahead."""
+        """Return the force at the point JUDGED after the grid's newest, by each embedding, their mixture and the slope.
+
+        `rise`, `beat` and `changes` are changes of force from that newest point, N.
+        """
         since_s = self.stamp_s - self.time_s
         return Guess(
             _ahead_N(self.force_N, rise, since_s),
@@ -253,9 +255,9 @@ def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
 def _search(history: Array) -> list[tuple[list[float], float]]:
     """Forecast with each embedding, and return for each the changes of force and a distance.
 
-    The changes go from the newest point of the grid to itself and the next HORIZON points; there are none without a
-    like stretch. The distance is that of the stretch most like the newest: the mean square of a point, N², at least
-    SAME_N's.
+    The changes go from the newest point of the grid to itself and the next HORIZON points. There are none where no
+    stretch is like the newest, or where its leverage is over MAX_LEVERAGE. The distance is that of the stretch most
+    like the newest: the mean square of a point, N², at least SAME_N's.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.

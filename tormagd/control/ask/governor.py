@@ -118,7 +118,8 @@ class Governor:
 
         `setpoint` is None without a publisher. `device` is what is known of the device's strength, `travel` the
         handle's motion. What is known ahead is looked at `lag_s` later, the carriages' lag. `held_N` is the force of a
-        gap that follows no plan; None where it follows plans.
+        gap that follows no plan; None where it follows plans. A valid setpoint leaves the force at `held_N`, and is
+        reached along a ramp once that is None.
 
         A setpoint that jumps is followed at once, within the scene's and the device's bounds. Three things go at the
         scene's release rate. Without a valid setpoint, the force decays to the device's least. A new publisher's
@@ -148,23 +149,23 @@ class Governor:
         force_N, limits = self._within_reach(asked_N, blended_N, lowest_N, highest_N)
         limits = (*limits, *setpoint.limits)
         heard_N = within(setpoint.force_N, self._allowed)
-        self._hear(setpoint, heard_N, force_N, device)
+        self._note_setpoint(setpoint, heard_N, force_N, device)
         given = lowest_N, highest_N
         bounds = within(self._allowed[0], given), within(self._allowed[1], given)
         foresight = 1.0
         wall = setpoint.wall
         if not travel.is_pushing and (wall is not None or setpoint.withdraw_N is not None):
-            self._foreseen(setpoint.stamp_s, heard_N, soon_s)
+            self._feed_forecast(setpoint.stamp_s, heard_N, soon_s)
             self.sent_N, self.expected_N = None, None
             path_N = [force_N] * len(PATH_S)
         elif wall is not None:
-            self._foreseen(setpoint.stamp_s, heard_N, soon_s)
-            path_N = self._against(wall, travel, dt_s, force_N, bounds, device, lag_s)
+            self._feed_forecast(setpoint.stamp_s, heard_N, soon_s)
+            path_N = self._path_against(wall, travel, dt_s, force_N, bounds, device, lag_s)
         elif setpoint.preview_N:
-            path_N = self._previewed(setpoint, soon_s, dt_s, force_N, bounds, device, lag_s)
+            path_N = self._path_of_preview(setpoint, soon_s, dt_s, force_N, bounds, device, lag_s)
         else:
-            foresight = self._foreseen(setpoint.stamp_s, heard_N, soon_s)
-            path_N = self._continued(soon_s, dt_s, force_N, foresight, bounds, device, lag_s)
+            foresight = self._feed_forecast(setpoint.stamp_s, heard_N, soon_s)
+            path_N = self._path_continued(soon_s, dt_s, force_N, foresight, bounds, device, lag_s)
         if self.blend_N != 0.0 and wall is None:
             path_N = [within(each_N + self.blend_N, bounds) for each_N in path_N]
         governed_N = force_N if self.expected_N is None else within(self.expected_N, bounds)
@@ -183,11 +184,12 @@ class Governor:
         """Make a forecast for the next plans, if one is due, and return whether it was. Call between plans."""
         return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
-    def _hear(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
+    def _note_setpoint(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
         """Update the setpoints' slope, newest force, stamp and holder.
 
-        A new holder begins a ramp, without slope or forecast. There is no slope after a pause above MAX_STEP_S, against
-        a wall, or without the term forecast. It is held to what the gap's speed gives at `force_N`.
+        A new holder begins a ramp, without slope or forecast. The slope becomes 0 after a pause above MAX_STEP_S,
+        against a wall, or without the term forecast. A stamp that is not newer leaves it. It is held to what the gap's
+        speed gives at `force_N`.
         """
         spacing_s = setpoint.stamp_s - self.stamp_s
         if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
@@ -223,7 +225,7 @@ class Governor:
         self.law_mm, self.was_pushing = place_mm, travel.is_pushing
         return blended_N
 
-    def _against(
+    def _path_against(
         self,
         wall: Wall,
         travel: Travel,
@@ -245,12 +247,13 @@ class Governor:
         ]
         over_N = within(within(wall.friction_N, self._allowed) + added_N, bounds) - wall.friction_N + EARLY_N
         most_N = [wall.force_N(place_mm + rate_mm_s * after_s) + over_N for after_s in PATH_S]
-        return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
+        return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
-    def _foreseen(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
+    def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
         """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1.
 
-        0 without the term forecast, and for a setpoint that was meant to be followed `soon_s` > MAX_STEP_S ago.
+        Without the term forecast nothing is given, and 0 returned. 0 is also returned for a setpoint that was meant to
+        be followed `soon_s` > MAX_STEP_S ago.
         """
         if not self._has_forecast:
             return 0.0
@@ -258,7 +261,7 @@ class Governor:
         # a publisher that has fallen silent is not believed to go on as it did
         return self.forecast.trust if soon_s <= MAX_STEP_S else 0.0
 
-    def _previewed(
+    def _path_of_preview(
         self,
         setpoint: TimedSetpoint,
         soon_s: float,
@@ -282,9 +285,9 @@ class Governor:
         else:
             self.forecast.forget()
         wanted_N = _wanted_N(setpoint, soon_s + lag_s, bounds, self.forecast)
-        return self._pursued(wanted_N, dt_s, force_N, bounds, device, lag_s)
+        return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s)
 
-    def _pursued(
+    def _best_path(
         self,
         wanted_N: list[float],
         dt_s: float,
@@ -308,7 +311,7 @@ class Governor:
         self.expected_N = expected_N
         return [within(each_N, bounds) for each_N in path_N]
 
-    def _continued(
+    def _path_continued(
         self,
         soon_s: float,
         dt_s: float,
@@ -370,7 +373,7 @@ class Governor:
         """Return a force that falls to `lowest_N` at the release rate, for no valid setpoint, and forget the last one.
 
         The force above `lowest_N` never grows, even where a device is found to be weaker. The next setpoint is reached
-        along a ramp.
+        along a ramp. `age_s`, None without a setpoint, and `limits` only go into the result.
         """
         # where a device turns out weaker, the force above its least does not grow
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)

@@ -45,9 +45,9 @@ class Way:
         """Return the handle's travel, and keep it in `travel`.
 
         `measured` is None while the device is silent: the handle counts as resting where it was. A force over PULLS_N
-        against the encoder's motion says that this is the way; one below -UNSEEN_N says that the other is. Between
-        them, the way changes after SLID_MM on the encoder: since it turned, and from where the way last changed. With
-        `is_sensor_believed` False only such travel counts.
+        against the encoder's motion shows that the handle goes that way; one below -UNSEEN_N, that it goes the other.
+        Between them, the way changes after SLID_MM on the encoder: since it turned, and from where the way last
+        changed. With `is_sensor_believed` False only such travel counts.
         """
         before = self.travel
         if measured is None:

@@ -97,7 +97,11 @@ class Freshness:
         self.changed_N = scale * abs(model_N - self.stood_N)
 
     def _take_run(self, change_N: float, run_s: float) -> None:
-        """Learn noise and resolution from a run that lasted `run_s` and ended with a change of `change_N`."""
+        """Learn noise and resolution from a run that lasted `run_s` and ended with a change of `change_N`.
+
+        Updates the number of runs, their mean and least length, the least change, and how many changes go back. The
+        newest run counts for one in HEARD at least.
+        """
         self.runs = min(self.runs + 1, HEARD)
         share = 1.0 / self.runs
         self.run_s += share * (run_s - self.run_s)

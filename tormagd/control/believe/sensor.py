@@ -133,7 +133,7 @@ class SensorTrust:
             zero_sd_N = 0.0  # a reversal has to tell the zero first
         self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
         self._hear(model_N, reading_N, dt_s)
-        self._allow(fit, model_N, rate_mm_s, direction, zero_sd_N, dt_s)
+        self._update_slack(fit, model_N, rate_mm_s, direction, zero_sd_N, dt_s)
         self._judge(self.measured_N - fit.force_N(model_N), self._is_strange(model_N, zero_sd_N), dt_s)
 
     def fit_moved(self, learned_N: float, model_N: float, dt_s: float) -> None:
@@ -148,7 +148,7 @@ class SensorTrust:
         if abs(self.moved_N) > MOVED_N + self.slack_N:
             self._begin(self.moved_N)
         else:
-            self._forget(model_N, dt_s)
+            self._fade_moved(model_N, dt_s)
 
     def compare(self, fit: DeviceFit, model_N: float) -> None:
         """Begin a dispute where the mean of the last readings has left `fit`, unless the device has slid for under
@@ -172,7 +172,7 @@ class SensorTrust:
         return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute.
+        """Take the operator's word in a dispute. Call it in a dispute only.
 
         `device`: the dispute ends, and none begins before LEARNS_S of sliding. `sensor`: the sensor counts as wrong
         until its readings agree for TRUSTED_AGAIN_S.
@@ -189,7 +189,7 @@ class SensorTrust:
         self.known_s = min(self.known_s + dt_s, LEARNS_S)
         self.measured_N = low_pass(self.measured_N, reading_N, dt_s, FILTER_S)
 
-    def _allow(
+    def _update_slack(
         self, fit: DeviceFit, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float, dt_s: float
     ) -> None:
         """Update `slack_N`: what the device may show that its fit did not, as conditions have changed of late.
@@ -248,8 +248,11 @@ class SensorTrust:
         self.lead_N, self.began_way = max(over_N, 0.0), self.direction
         self.back_N, self.moved_N = -self.moved_N, 0.0
 
-    def _forget(self, model_N: float, dt_s: float) -> None:
-        """Reduce `moved_N` by what a device changes by itself in `dt_s`, and count what relaxing uses up of RELAXED."""
+    def _fade_moved(self, model_N: float, dt_s: float) -> None:
+        """Bring `moved_N` towards 0 by what a device changes by itself in `dt_s`; `model_N` is the model's force.
+
+        A loss of force may be relaxing: it adds to `relaxed_N`, until RELAXED is used up. A gain does not.
+        """
         self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
         by_itself_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
         relaxes_N = min(RELAXES_1_S * model_N * dt_s, max(RELAXED * model_N - self.relaxed_N, 0.0))
@@ -261,7 +264,11 @@ class SensorTrust:
             self.moved_N = max(self.moved_N - by_itself_N - RELAXES_1_S * model_N * dt_s, 0.0)
 
     def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
-        """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices."""
+        """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices.
+
+        Compared is their mean over FILTER_S. Relaxing, noise and `zero_sd_N`, how well the zero is known, widen the
+        bounds. `model_N` is the model's force.
+        """
         if self.freshness.is_frozen:
             return True
         unknown_N = NOISE_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)

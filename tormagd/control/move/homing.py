@@ -92,7 +92,10 @@ class Homing:
             self._follow(now_s, measurement)
 
     def _begin(self, now_s: float, measurement: Measurement) -> None:
-        """Begin with a device that was found homing: its places, its switches, and the force it may show."""
+        """Begin with a device that was found homing: note its places, its switches, and the force it may show.
+
+        That force is the ceiling, or RISES times what the sensor shows now where this is more.
+        """
         self.is_running, self.began_s, self.time_s, self.over_s = True, now_s, now_s, 0.0
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -122,10 +125,10 @@ class Homing:
             self.faults = (Fault.STATUS_STALE,)
 
     def _end(self, now_s: float, measurement: Measurement) -> None:
-        """Judge a homing that has ended: done, given up by the device, or ended by a request to open.
+        """Judge a homing that has ended, and set `faults`; it is done, given up, or ended by a request to open.
 
         A homed device that has not shown both open switches has the fault HOMING. One that latched after a carriage
-        went towards closed has WRONG_DIRECTION.
+        went over WENT_BACK_MM towards closed has WRONG_DIRECTION. Others have none.
         """
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN

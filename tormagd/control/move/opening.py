@@ -37,7 +37,7 @@ _FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED
 def is_open(measurement: Measurement, is_placed: bool) -> bool:
     """Tell whether the gap is open.
 
-    Where `is_placed`, the carriages' places say so, else both open switches.
+    Where `is_placed`, it is with both carriages within OPEN_MM of their open switches; else with both switches closed.
     """
     if is_placed:
         return min(measurement.left_mm, measurement.right_mm) >= -OPEN_MM
@@ -116,9 +116,9 @@ class Opening:
             self._begin(measurement)
         if not is_placed or is_blind:
             is_asked = safety.request is _RETRACT and number > self.unheard_request
-            self._listen(measurement, is_asked, is_placed)
+            self._judge_by_word(measurement, is_asked, is_placed)
         else:
-            self._follow(measurement)
+            self._judge_by_places(measurement)
 
     def _begin(self, measurement: Measurement) -> None:
         self.is_watching = True
@@ -130,11 +130,11 @@ class Opening:
         self.device_s = measurement.device_time_s
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
 
-    def _follow(self, measurement: Measurement) -> None:
-        """Judge the carriages by their places: NOT_OPENING where one is later than LATE_S.
+    def _judge_by_places(self, measurement: Measurement) -> None:
+        """Judge the carriages by their places, and set `faults` to NOT_OPENING where one is later than LATE_S.
 
-        The device's own opening speed, lower at a low supply voltage, says how far they should have come since the last
-        State.
+        Updates how late both are, and where. The device's own opening speed, lower at a low supply voltage, says how
+        far they should have come since the last State.
         """
         dt_s = max(measurement.device_time_s - self.device_s, 0.0)
         share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
@@ -146,7 +146,7 @@ class Opening:
         if max(self.left_late_s, self.right_late_s) > LATE_S:
             self.faults = (Fault.NOT_OPENING,)
 
-    def _listen(self, measurement: Measurement, is_asked: bool, is_placed: bool) -> None:
+    def _judge_by_word(self, measurement: Measurement, is_asked: bool, is_placed: bool) -> None:
         """Judge the device by its word, while its places are unknown or the loop is blind; may set `faults` to
         NOT_OPENING.
 

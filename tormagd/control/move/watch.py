@@ -136,10 +136,10 @@ class Watch:
     ) -> tuple[Fault, ...]:
         """Return all faults that show now, and change nothing: `operating_state.latch` sorts them.
 
-        Those of the device and OUT_OF_STROKE always may. `leap` is an encoder step that no carriage makes, None without
-        one: ENCODER shows once a later Status has come. `sensor_doubted_s` is how long the force sensor has not been
-        believed. Faults of link and motion show only while `safety.is_driven`, those of motion not during a leap.
-        DEVICE_NOT_RUNNING shows alone, once STARTING_S have passed since enabling.
+        Those of the device always may, and OUT_OF_STROKE of a homed one. `leap` is an encoder step that no carriage
+        makes, None without one: ENCODER shows once a later Status has come. `sensor_doubted_s` is how long the force
+        sensor has not been believed. Faults of link and motion show only while `safety.is_driven`, those of motion not
+        during a leap. DEVICE_NOT_RUNNING shows alone, once STARTING_S have passed since enabling.
         """
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
