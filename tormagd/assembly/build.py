@@ -263,7 +263,8 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
 def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
     """Return what the gaps do not reach of the scene's greatest and standby forces, with what is allowed.
 
-    Standby has to be above the open gap's force, by STANDBY_N at most, and not above the scene's greatest force.
+    Standby has to be above the open gap's force, by STANDBY_N at most, and not above the scene's greatest force. The
+    scene's least force may be any.
     """
     # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
     unmet = []
@@ -308,8 +309,9 @@ def _slowed(config: Config, scene: Scene) -> Config:
 def approaches_s(core: Core) -> list[tuple[float, float]]:
     """Return forces at which a brake may wait, N, each with the time of its gap to the middle of the scene's forces, s.
 
-    The first is the force at which the scene lets the brake wait. A third, two thirds and all of STANDBY_N above the
-    least follow. Empty for a pad.
+    The first is the force at which the scene lets the brake wait. The others are a third, two thirds and all of
+    STANDBY_N above the open gap's force. The middle is that of the first and the scene's greatest; from above it the
+    time is negative. Empty for a pad.
     """
     if core.scene.element == "tactile":
         return []

@@ -49,7 +49,7 @@ def conditions(
     these.
     """
     measurement = connection.measurement
-    old = "" if measurement is None else _old(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
+    old = "" if measurement is None else _late_stream(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
     return Conditions(
         connected=measurement is not None,
         fresh=measurement is not None and not old,
@@ -64,7 +64,7 @@ def conditions(
     )
 
 
-def _old(now_s: float, measurement: Measurement, timeout_s: float) -> str:
+def _late_stream(now_s: float, measurement: Measurement, timeout_s: float) -> str:
     """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has.
 
     A State is late after `timeout_s`, a Sense and a Status after the times of their faults.

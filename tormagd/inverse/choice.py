@@ -46,10 +46,10 @@ def named(
 def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel, *, rises: bool) -> FieldSolver:
     """Build the chosen search over a range of fields. `rises`: every curve of the model rises over the whole range.
 
-    "newton" is a RisingSearch, "nearest" and "torch" are a NearestFieldSearch, "thesis" is RowByRow. The last two
-    import torch, and hold it to one thread. Raises `DomainError` where the settings do not fit the range, and where
-    torch is needed and not installed. It is raised, too, for "newton" without `rises`, and for "thesis" where the model
-    states no mean error.
+    "newton" is a RisingSearch, "nearest" and "torch" are a NearestFieldSearch, "thesis" is RowByRow. "torch" and
+    "thesis" import torch, and hold it to one thread. Raises `DomainError` where the settings do not fit the range, and
+    where torch is needed and not installed. It is raised, too, for "newton" without `rises`, and for "thesis" where the
+    model states no mean error.
     """
     if choice.solver == "newton":
         require_that(rises, "solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")

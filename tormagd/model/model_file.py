@@ -254,7 +254,9 @@ def save_model(path: Path | str, model: ForceModel) -> None:
 
 
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
-    """Read a model file for `element` and `insert`; None accepts any insert. Of several inserts, return that one's.
+    """Read a model file for `element` and `insert`; None accepts any insert.
+
+    Of a model of several inserts, return that of `insert`; with None the whole.
 
     Raises `ModelFileError` when the file cannot be read, is truncated or altered, or belongs to another element or
     insert. Raises it, too, for anything but a finite 4-h-1 network in the features and units of this program.

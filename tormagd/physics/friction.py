@@ -45,10 +45,10 @@ class Friction(Value):
     def advance(self, deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> tuple[float, float]:
         """Return force, N, and deflection, mm, at the end of a step of `dt_s` at constant speed and kinetic level.
 
-        Exact in z for any `dt_s`. A deflection above what the level now carries (the field fell) slips back to that
-        level first, so the dry force never exceeds g(v). Passive: z moves with v, so the returned force times the
-        step's displacement is at least the exact work. The hand gets back sigma0 z^2 / 2 at most. At a level of 0 the
-        deflection is 0, and the force viscous alone.
+        Exact in the deflection for any `dt_s`. A deflection above what the level now carries (the field fell) slips
+        back to that level first, so the dry force never exceeds `level_N`. Passive: the deflection moves with the
+        speed, so the returned force times the step's displacement is at least the exact work. The hand gets back sigma0
+        / 2 times the deflection squared at most. At a level of 0 the deflection is 0, and the force viscous alone.
         """
         viscous_N = self.viscous_N_s_mm * speed_mm_s
         reach_mm = self.level_N(speed_mm_s, kinetic_N) / self.presliding_stiffness_N_mm

@@ -32,12 +32,10 @@ def asked(
 ) -> tuple[Array, Array]:
     """Return times, s from 0 on, and forces, N (n each), that `signal` asks for.
 
-    There are `rate_hz` of them a second, and at least two.
-
-    A recording, `signal.file` in the folder `beside`, is interpolated by a smooth curve to its end, and held within
-    `range_N`, least and greatest. Without a file the force goes through the range up and down once, in steps of
-    `step_N`. Each step is half a cosine, and is held for `hold_s`. Both end after `longest_s` at the latest. Raises
-    ConfigError for a file that is not as allowed.
+    There are `rate_hz` of them a second, and at least two. A recording, `signal.file` in the folder `beside`, is
+    interpolated by a smooth curve to its end, and held within `range_N`, least and greatest. Without a file the force
+    goes through the range up and down once, in steps of `step_N`. Each step is half a cosine, and is held for `hold_s`.
+    Both end after `longest_s` at the latest. Raises ConfigError for a file that is not as allowed.
     """
     low_N, high_N = range_N
     if signal.file:
