@@ -215,7 +215,8 @@ class Connection:
     def report(self) -> LinkReport:
         """Return the link's report for `status`; None in it for what is not known yet or needs an open port.
 
-        Counters are those since the port was last opened.
+        Counters are those since the port was last opened, but for `losses` and `last_loss`. `repeated` has the States
+        that the link dropped, too. Half of the shortest round trip, a State's way, is taken off the clock's offset.
         """
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
@@ -249,7 +250,8 @@ class Connection:
     def _open(self, now_s: float) -> None:
         """Open the port, begin a conversation, in which an unfinished RETRACT is sent again, and tell `traffic` so.
 
-        Where the port does not open, log why and wait in BACK_OFF.
+        Where the port does not open, log why and wait in BACK_OFF; the same reason as before is logged for debugging
+        only.
         """
         try:
             self._backend = self._open_backend()

@@ -115,7 +115,8 @@ class DeviceLink:
     def _begin(self, now_s: float, cause: str) -> None:
         """Begin to identify the device, for `cause`, and forget all that was known of it.
 
-        Also after a reset or a replacement. A pending RETRACT stays; any other request is dropped.
+        Also after a reset or a replacement. A pending RETRACT stays; any other request is dropped. A Hello is due at
+        once. The Drives' counter and `repeated` go on.
         """
         self.state = _IDENTIFYING
         self.cause = cause
@@ -261,7 +262,10 @@ class DeviceLink:
         self.cause = cause
 
     def _change_state(self, now_s: float) -> None:
-        """Identify a device anew that was reset or replaced; else enter LOST on silence, UNANSWERED for no Identity."""
+        """Identify a device anew that was reset or replaced; else enter LOST or UNANSWERED, and say why in `cause`.
+
+        LOST is for a running device that is silent, UNANSWERED for no Identity within UNANSWERED_S of asking.
+        """
         # the break was heard a tick ago: so the core has seen the measurement that shows it, and names it better
         if self._broken:
             self._begin(now_s, self._broken)
@@ -360,7 +364,10 @@ class DeviceLink:
         self.clock.add(now_s, self._device_time_s)
 
     def _begin_measuring(self, now_s: float, state: State) -> None:
-        """Begin measurements with this State, unless a Status or a Sense is still missing."""
+        """Begin measurements with this State, as number 0 and with its places and time as they are.
+
+        Nothing happens while a Status or a Sense is still missing.
+        """
         if self._status is None or self._sense is None:
             return
         self._is_measured = True

@@ -72,7 +72,8 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
     """Repeat one plan and one step a beat until all are done, and return the processor time of each, us.
 
-    There are as many plans as steps. The caller has asked for the thread's scheduling. Raises what a call raises.
+    There are as many plans as steps. The caller has asked for the thread's scheduling. No call may raise: the event
+    loop would only log the error, and the same beat be repeated for ever.
     """
     found = CoreCost([], [])
     ended = asyncio.Event()
