@@ -154,7 +154,8 @@ class Brake(NamedTuple):
         return branch_Tm + (lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm)
 
     def lags_Tm(self, moments_Tm: Array) -> Array:
-        """Return the lag at each moment of a series; before the first moment the gap was open."""
+        """Return the lag at each moment of a series; before the first the gap had been opened, and lagged
+        `branch_Tm`."""
         lag_Tm, before_Tm = self.branch_Tm, float(self.moment_Tm[-1])
         found = []
         for moment_Tm in moments_Tm.tolist():

@@ -76,7 +76,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """Run the command `name` of COMMANDS, print what it found and return its exit code.
 
     Refused input, an OSError and a missing package become one sentence on stderr and exit code 2; so does usage, by
-    SystemExit.
+    SystemExit. An answer that stdout does not take makes the code NOT_TOLD, where it would be 0. A ValueError that is
+    none of REFUSALS, and a missing module of tormagd itself, are raised.
     """
     try:
         module = import_module(f"tormagd.lab.{COMMANDS[name][0]}")

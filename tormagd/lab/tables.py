@@ -29,9 +29,10 @@ def read_columns(
     """Return the columns `names` of a CSV file and its `optional` ones, in this order.
 
     `allowed` gives least and most of some columns; None: any number. The header is the first row with all `names`, in
-    any order. Rows before it (many testing machines write a preamble), other columns and empty rows are skipped; with
-    `is_exact` they are refused. Raises `LabError` for an unreadable file, a missing header, no rows, over MAX_ROWS, and
-    a cell that is no finite number within its bounds. The message names the file, and the row where one is wrong.
+    any order. Rows before it (many testing machines write a preamble), other columns and rows without a value are
+    skipped. With `is_exact` rows before it, other columns and rows of another length are refused. Raises `LabError` for
+    an unreadable file, a missing header, no rows, over MAX_ROWS, and a cell that is no finite number within its bounds.
+    The message names the file, and the row where one is wrong.
     """
     try:
         require_regular(path, MAX_TABLE_BYTES)
@@ -58,7 +59,7 @@ def _columns(
 ) -> dict[str, Array]:
     """Find the header in `rows`, pairs of line number and cells, and return the columns below it by name.
 
-    `rows` is used up. Raises `LabError` as `read_columns`.
+    `rows` is used up. With `is_exact` only the first row can be the header. Raises `LabError` as `read_columns`.
     """
     header: list[str] = []
     for _, header in rows:

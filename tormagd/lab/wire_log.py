@@ -145,7 +145,10 @@ def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stop
 
 
 def viewer_formats() -> list[str]:
-    """Return `ID:FORMAT:DIVISOR...` of each message, as `python -m can.viewer -d FILE` reads them."""
+    """Return `ID:FORMAT:DIVISOR...` of each message, as `python -m can.viewer -d FILE` reads them.
+
+    The identifiers are hexadecimal, those of node NODE.
+    """
     lines = []
     for layout in LAYOUTS:
         divisors = [repr(1.0 / signal.scale) if signal.type is float else "1" for signal in layout.signals]
@@ -170,8 +173,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Log until the session or a signal ends it, or with the way `viewer` return the formats for python-can's viewer.
 
-    Returns the file, and how many frames were logged and damaged. Raises LabError for a file type that is not known,
-    OSError for a file or port that cannot be used.
+    With the way `tap` prints where the daemon finds the line. Returns the file, and how many frames were logged and
+    damaged. Raises LabError for a file type that is not known, OSError for a file or port that cannot be used, and
+    RuntimeError as `virtual_session`.
     """
     if options.way == "viewer":
         formats = viewer_formats()

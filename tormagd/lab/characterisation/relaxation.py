@@ -53,8 +53,9 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
     together. Time constants are sought from a third of the shortest time step to three times the record. A slower one
     cannot be told from the equilibrium. Branches that the record does not show are dropped.
 
-    Raises `LabError` for a record of too few rows, not in order, or without a change of force. A record that leaves no
-    force at equilibrium is too short and raises `LabError`, too. Raises `DomainError` for values out of range.
+    Raises `LabError` for other `branches`, and for a record of too few rows, not in order, or without a change of
+    force. A record that leaves no force at equilibrium is too short and raises `LabError`, too. Raises `DomainError`
+    for values out of range.
     """
     _check(record, branches)
     span = float(record.time_s[-1] - record.time_s[0])
@@ -88,7 +89,7 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
 
 
 def _columns(record: RelaxationRecord, times_s: Array) -> Array:
-    """Return F0 and each branch's response to it, one column each, by the exact update for a linear force."""
+    """Return F0 and each branch's response to it (n x 1 + branches), by the exact update for a linear force."""
     ratios = np.diff(record.time_s)[:, None] / times_s
     changes = np.diff(record.driving)[:, None] * -np.expm1(-ratios) / ratios
     decays = np.exp(-ratios)
@@ -112,7 +113,11 @@ def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
 
 
 def _check(record: RelaxationRecord, branches: int) -> None:
-    """Raise LabError or DomainError unless the record has rows enough, in range and order, and shows a change."""
+    """Raise LabError or DomainError unless the record has rows enough, in range and order, and shows a change.
+
+    Enough are 4 rows for each of 1 to MAX_BRANCHES branches, and 2 more. Times have to rise strictly, and both forces
+    to change.
+    """
     if not 1 <= branches <= MAX_BRANCHES:
         raise LabError(f"branches = {branches}: allowed is 1..{MAX_BRANCHES}")
     rows = len(record.time_s)

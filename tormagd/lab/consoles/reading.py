@@ -11,7 +11,7 @@ SUFFIX = ".mcap"
 
 
 def files(url: str) -> dict[str, str]:
-    """Return the full address of every recording in a folder or under a URL, by its name there; or of one file.
+    """Return the full address of every `.mcap` in a folder or under a URL, by its path there; or of that one file.
 
     Raises FileNotFoundError where there is nothing, and OSError where the place cannot be read. Raises ValueError for
     an unknown kind of URL, and ImportError for one whose package is missing.

@@ -59,8 +59,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 def summarise(file: BinaryIO, name: str) -> Summary:
     """Return the summary of the recording in `file`, which errors call `name`.
 
-    Figures of the device and lateness are of ticks while ENABLED; what the recording does not say is None. Raises
-    RecordingError and OSError where it cannot be read, and ValueError for one without messages.
+    Figures of the device and lateness are of ticks while ENABLED, or of no stated operating state. Limits and faults
+    are of the whole recording. What the recording does not say is None. Raises RecordingError and OSError where it
+    cannot be read, and ValueError for one without messages.
     """
     builder, enabled = OverviewBuilder(), {name: array("d") for name in FIGURES}
 

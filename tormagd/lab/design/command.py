@@ -51,8 +51,8 @@ def run(options: argparse.Namespace) -> Found:
     """Find the best design from each start that `options` ask for, and return all, best first.
 
     The best has the greatest coverage, with the measure `corners` the least corner cost; then the least volume. Each
-    row also tells the coverage with dimensions off by `options.off` percent. Raises DomainError where a solver finds no
-    design; of the executor OSError and LabError.
+    row also tells the coverage with dimensions off by `options.off` percent. Raises DomainError for a region that is no
+    task, and where a solver finds no design. Raises what `executors.chosen` raises, too.
     """
     with executors.chosen(options) as executor:
         outcomes = sweep(_runs(options), executor)
@@ -66,7 +66,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _runs(options: argparse.Namespace) -> list[Run]:
-    """Return one run from each random start, drawn by the seed."""
+    """Return one run from each random start, drawn by the seed between the problem's bounds.
+
+    Raises DomainError for a region that is no task.
+    """
     problem = Problem(Region(*options.region), options.measure, options.gap_speed)
     low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
     drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))

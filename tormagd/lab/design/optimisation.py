@@ -135,8 +135,8 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
     """Return the least coverage of the design, 0..1, where each dimension may be off by `share`, down, not at all, or
     up.
 
-    All combinations are tried. The result is 0 where the elastomer of one of them does not bear the field. Raises
-    `DomainError` for one that no brake can have.
+    All 27 combinations are tried. The result is 0 where the elastomer of one of them does not bear the field. Raises
+    `DomainError` for a combination that no brake can have, such as an open gap under the closed one.
     """
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
     made = [

@@ -101,7 +101,10 @@ class PhasePortrait:
         )
 
     def true_coverage(self, region: Region) -> float:
-        """Return the share of the region's area inside the true boundary, 0..1, by an integral over the gap."""
+        """Return the share of the region's area inside the true boundary, 0..1, by an integral over the gap.
+
+        0 where the brake gives none of the region's forces.
+        """
         brake = self.brake
         least, most = brake.least_N, brake.most_N
         low, high = max(region.least_N, least), min(region.most_N, most)
@@ -120,7 +123,10 @@ class PhasePortrait:
         return min(area / region.half_area, 1.0)
 
     def trapezoid_coverage(self, region: Region) -> float:
-        """Return the share of the region's area inside the thesis's trapezoid, 0..1; exact."""
+        """Return the share of the region's area inside the thesis's trapezoid, 0..1; exact.
+
+        0 where the brake gives none of the region's forces.
+        """
         offered = self.trapezoid()
         low, high = max(region.least_N, offered.least_N), min(region.most_N, offered.most_N)
         if low >= high:

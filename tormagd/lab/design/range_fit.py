@@ -40,7 +40,8 @@ class RangeFit(NamedTuple):
 def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0) -> float:
     """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N.
 
-    The field grows with the permeability to the power `exponent`; it is 1 in the thesis.
+    The field grows with the permeability to the power `exponent`; it is 1 in the thesis. The permeability is always
+    that of Eq. 5, the friction of the insert does not count. Raises `DomainError` outside Eq. 5's range.
     """
     mu_r = relative_permeability(insert.cip_fraction)
     elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
@@ -53,7 +54,8 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
 def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
     """Fit the friction of each matrix for the least mean relative error of range; the fit has it by Shore 00 hardness.
 
-    The field grows with the permeability to the power `exponent`, which is not fitted.
+    The field grows with the permeability to the power `exponent`, which is not fitted. Raises `DomainError` for an
+    insert whose range has not been measured, and as `frictionless_range_N`.
     """
     ratios: dict[int, list[float]] = {}
     for item in inserts:
@@ -65,7 +67,8 @@ def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1
 def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
     """Fit the friction of each matrix and the permeability exponent, the latter to 1e-4.
 
-    The mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point.
+    The mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point. Raises
+    `DomainError` as `fit_friction`.
     """
     low, high = MIN_EXPONENT, MAX_EXPONENT
     while True:

@@ -77,7 +77,7 @@ def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float
 def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:
     """Return the gap, mm, at which the brake's force is as low as the task tolerates, at least the open gap.
 
-    NaN where this gap is beyond the field law's range.
+    The task tolerates its least force and its resolution more. NaN where this gap is beyond the field law's range.
     """
     tolerated_N = task.least_N + task.resolution_N
     if tolerated_N >= brake.least_N:

@@ -178,8 +178,10 @@ class Volts(NamedTuple):
     relative_residual: float
 
     def voltage(self, log: Log) -> tuple[Array, Array]:
-        """Return the applied voltage and the one that the model predicts for the log's motion, for rows in motion
-        only."""
+        """Return the applied and the predicted voltage, V (n each), for the thinned rows of `log` in motion.
+
+        Raises LabError as `motion`.
+        """
         _, measured, predicted = self.over_time(log)
         known = np.isfinite(measured)
         return measured[known], predicted[known]
@@ -203,7 +205,7 @@ def _volts_rows(seen: Motion) -> Array:
 
 
 def _voltage(log: Log, seen: Motion, delay_s: float) -> tuple[Array, Array]:
-    """Return the delayed voltage and its slope, thinned."""
+    """Return the voltage of `delay_s` earlier, V, and its slope over time, V/s: low-passed and thinned."""
     volts = _low_pass(log)(np.interp(log.t_s - delay_s, log.t_s, log.input_V))
     return seen.thin(volts), seen.thin(np.gradient(volts, log.period_s))
 

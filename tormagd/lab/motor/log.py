@@ -39,9 +39,10 @@ class Log(NamedTuple):
 
 
 def read_log(path: Path) -> Log:
-    """Read the log in a CSV or EMPS .mat file.
+    """Read the log in an EMPS .mat file, or for any other ending in a CSV file.
 
-    Raises LabError for an unreadable file, too few rows, values that are not finite, uneven times, or under 400 Hz.
+    Raises LabError for an unreadable file, under MIN_ROWS rows, values that are not finite, or under MIN_RATE_HZ. Steps
+    of time that are off the median by over half of it raise LabError, too.
     """
     log = _read_mat(path) if path.suffix == ".mat" else _read_csv(path)
     if len(log.t_s) < MIN_ROWS:

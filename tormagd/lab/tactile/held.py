@@ -133,7 +133,7 @@ def _whole(case: Case) -> Iterator[Moment]:
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
-    """Yield the moments of a hold by the plans alone, each COARSE_S, with the gap where the last plan leads.
+    """Yield the moments of a hold by the plans alone: one plan each COARSE_S, and the gap is where the last one leads.
 
     They come once a second from the end of learning on. The only fault they can have is SENSOR.
     """

@@ -30,7 +30,8 @@ UNSEEN_FIELDS_MT = (130.0, 230.0)
 def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceModel:
     """Train the model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen.
 
-    Raises PlantError for a plant that cannot be loaded or has no pad.
+    Its metadata have the figures of that, the pad's memory, the insert INSERT and the date `created`. Raises PlantError
+    for a plant that cannot be loaded or has no pad.
     """
     plant = load_plant(plant_name)
     if plant.pad is None:

@@ -62,7 +62,7 @@ Row = tuple[str, str, str, str]
 
 
 def _chapter_2() -> list[Row]:
-    """Return the errata of chapter 2 but for Eq. 25, with figures computed from what is printed."""
+    """Return the errata of chapter 2 but for Eq. 25, as rows of KEYS, with figures computed from what is printed."""
     eq7, power = ThesisFieldLaw(), PowerFieldLaw()
     closed_Tm, open_Tm = eq7.radial_moment_Tm(CLOSED_MM), eq7.radial_moment_Tm(OPEN_MM)
     stretched = (1.206 * (200.0 - CLOSED_MM) ** 1.867 + 1256.0) * 1e-6
@@ -183,7 +183,7 @@ def _eq_25() -> Row:
 
 
 def _chapter_3() -> list[Row]:
-    """Return the errata of chapter 3."""
+    """Return the errata of chapter 3, as rows of KEYS."""
     low, high = APPENDIX_B_BOUNDS
     lines = [line for case in USE_CASES.values() for line in case.starts]
     outside = [f"R_o {line.start.outer_radius_mm:g}" for line in lines if not _inside(line.start, low, high)]
@@ -213,7 +213,7 @@ def _chapter_3() -> list[Row]:
 
 
 def _appendices() -> list[Row]:
-    """Return the errata of the appendices."""
+    """Return the errata of the appendices, as rows of KEYS."""
     exponent_T = 0.44 * CLOSED_MM ** (-1.3 / 6.0 * APPENDIX_MU_R) / 0.004
     sixth_T = 0.44 * CLOSED_MM**-1.3 / 6.0 * APPENDIX_MU_R / 0.004
     used_T = 0.44 * CLOSED_MM**-1.3 / 4.0 * APPENDIX_MU_R / 0.004
@@ -257,7 +257,7 @@ def _appendices() -> list[Row]:
 
 
 def _chapter_4() -> list[Row]:
-    """Return the errata of chapter 4."""
+    """Return the errata of chapter 4, as rows of KEYS."""
     return [
         (
             "Abstract and section 4.3",

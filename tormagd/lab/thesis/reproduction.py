@@ -60,9 +60,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Return all tables and figures of the reproduction, for a person as the page.
 
-    `options.out`, if given, gets the page and its pictures. With `options.table_2_5` only that table is made. Raises
-    ModuleNotFoundError where a package is missing, OSError where `out` cannot be written, RuntimeError where a
-    simulated device faults.
+    `options.out`, if given, gets the page and its pictures. With `options.table_2_5` only that table is made, and
+    nothing is written. Raises ModuleNotFoundError where a package is missing, OSError where `out` cannot be written,
+    RuntimeError where a simulated device faults.
     """
     if options.table_2_5:
         found = table_2_5()
@@ -340,7 +340,7 @@ RunKey = tuple[int, int, str, str]
 
 
 def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
-    """Return the runs of table 3.2 by use case, start, objective and solver.
+    """Return the runs of table 3.2 by use case, start from 1, objective and solver, which is `global` and `local`.
 
     `starts` is the number of starts of each use case; None: all. `gap_speed_mm_s` is the controller's.
     """

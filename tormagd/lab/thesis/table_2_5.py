@@ -96,7 +96,10 @@ def readings(table: Json) -> list[tuple[str, ...]]:
 
 
 def _missed(row: Json, task: Json) -> str:
-    """Return the forces and the width that the insert misses, in words; `nothing` where it misses none."""
+    """Return in words the forces under its least that the insert misses, and by what its measured range is too narrow.
+
+    `nothing` where it misses neither.
+    """
     (least_N, most_N), given_N = task["range_N"], row["force_N"][0]
     missed = [f"{least_N:g}..{given_N:.2f} N"] if given_N > least_N else []
     if row["matched_share"] < 1.0:

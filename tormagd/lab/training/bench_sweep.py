@@ -134,7 +134,7 @@ def sweep_course(scene: Scene, name: str, seed: int) -> Course:
 def swept(plant: str, scene_name: str, course: Course) -> Array:
     """Record one course in virtual time and return its rows (n x 6): time_s, the features, force_N along the motion.
 
-    Raises RuntimeError where the device faults.
+    Raises RuntimeError where the device faults or does not arm; PlantError, ConfigError and DomainError as `record`.
     """
     scene = bench_scene(load_scene(scene_name), course.insert)
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)

@@ -228,7 +228,8 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
 def require_rising(model: ForceModel, points: int = 64) -> None:
     """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1% of its span.
 
-    Where the force falls, more than one field gives it. `points` is the number of fields that are tried.
+    Tried are `points` fields over those seen in training, at the greatest displacement, the middle rate and the least
+    iron. Where the force falls, more than one field gives it.
     """
     ranges = dict(zip(FEATURES, model.feature_ranges, strict=True))
     rate_mm_s = sum(ranges["rate_mm_s"]) / 2.0
@@ -254,8 +255,9 @@ def calibrate(
 ) -> dict[str, Any]:
     """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file).
 
-    Returns what was saved. Raises CalibrationError, LabError, DomainError and OSError; neither file is there then, so
-    that the same command can be given again.
+    Returns as plain data the files' names, the insert, the date, and the data's rows, ranges and metrics. Raises
+    CalibrationError, LabError, DomainError and OSError; neither file is there then, so that the same command can be
+    given again.
     """
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     require_usable(data)

@@ -11,7 +11,7 @@ from tormagd.model.model_file import ForceModel
 
 
 def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
-    """Return a mask (rows) of the rows held out: `share` of them, scattered; as the thesis's, 70 : 30.
+    """Return a mask (rows), True for the rows held out: `share` of them, drawn by `seed`. The thesis's is 70 : 30.
 
     Rows of a time series are nearly copies of their neighbours: this split flatters, and is for comparison only.
     """
@@ -30,7 +30,7 @@ def leave_one_out(dataset: Dataset, feature: str) -> Iterator[tuple[float, Mask]
 def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[int, Mask]]:
     """Yield the number of each of `folds` folds, and the mask (n) of its rows.
 
-    A fold has whole cycles, and every cycle is in one fold. The data must have cycles.
+    A fold has whole cycles, drawn by `seed`, and every cycle is in one fold. The data must have cycles.
     """
     assert dataset.cycle is not None
     parts = np.array_split(np.random.default_rng(seed).permutation(np.unique(dataset.cycle)), folds)

@@ -110,8 +110,8 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
     """Return by how much the element's field lags behind `field_mT` (n) at each row, mT (n).
 
     The element's field is `field_mT` less the lag. While the field rises, the lag goes to `memory.lag_mT`, while it
-    falls, to the negative of that. Most of the way takes a change by `memory.turn_mT`; time has no effect. Each record
-    of `rows` begins without a lag.
+    falls, to the negative of that. A change by `memory.turn_mT` takes it most of the way; time has no effect. Each
+    record of `rows` begins without a lag.
     """
     lag_mT = np.zeros_like(field_mT)
     for record in records(rows):
