@@ -187,7 +187,7 @@ class MessageDevice:
             else:
                 self._tick(event_s)
             if self.firmware.output is not self._output:
-                self._switch()
+                self._drive_bridges()
         self._pass_time(now_s)
 
     @property
@@ -205,7 +205,7 @@ class MessageDevice:
             self.plant.advance(time_s - self._time_s)
             self._time_s = time_s
 
-    def _switch(self) -> None:
+    def _drive_bridges(self) -> None:
         """Put the firmware's present output at the motors, in steps of the PWM, as supply and faults let it.
 
         Both bridges are open where the output is not enabled, or without supply.
@@ -336,8 +336,8 @@ class MessageDevice:
     def _reset(self, time_s: float) -> None:
         """Boot the firmware again: mode, zero, clock and pending answers are lost.
 
-        The carriages' encoders count from here, the handle's goes on.
-        Faults of the device, and messages on their way to it, stay.
+        The carriages' encoders count from here, the handle's goes on. Faults of the device, and messages on their way
+        to it, stay.
         """
         self.firmware = self._boot(self.parameters)
         self._answers.clear()
@@ -392,7 +392,7 @@ class MessageDevice:
         if self._stuck_left is not None or self._left_count_sign < 0:
             self._count_on(None, 1)
         self._run_clock_at(time_s, 1.0 + parameters.firmware.clock_ppm * 1e-6)
-        self._switch()
+        self._drive_bridges()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
         """Begin `fault` at `time_s`: what it does is in `faults.KNOWN`, its size in percent, if it has one, in `fault`.
@@ -452,7 +452,7 @@ class MessageDevice:
             case _ if fault.name not in STANDING:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
         if fault.name in OF_BRIDGES:
-            self._switch()
+            self._drive_bridges()
 
     def _run_clock_at(self, time_s: float, rate: float) -> None:
         """Let the firmware's clock run at `rate` device seconds a second, from its present time on."""

@@ -154,9 +154,10 @@ class Firmware:
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         """Act on one message of the host at `time_s` and return what to answer; a message of a device is ignored.
 
-        A Hello's nonce counts as the one accepted last. A Hello with another schema or protocol version latches
+        A Hello is answered by IDENTITY, a Drive with a new counter by MEASUREMENT; all else gives NONE, no answer. A
+        Hello's nonce counts as the one accepted last. A Hello with another schema or protocol version latches
         SCHEMA_MISMATCH, which opens the gap unless the drives are off. A command with the nonce accepted last is
-        ignored. NONE is no answer.
+        ignored.
         """
         if isinstance(message, Drive):
             return self._drive(time_s, message, sensors)
@@ -176,8 +177,8 @@ class Firmware:
     def _drive(self, time_s: float, drive: Drive, sensors: Sensors) -> Answer:
         """Act on a Drive; one with a new counter is answered in every mode, so that a host can always measure.
 
-        RUN is entered only from IDLE: homed, of a matching schema, without a fault. Where anything but OFF ended the
-        last run, an OFF must come first.
+        In RUN its duties become the output. RUN is entered only from IDLE: homed, of a matching schema, without a
+        fault. Where anything but OFF ended the last run, an OFF must come first.
         """
         if drive.counter == self._drive_counter:
             return NO_ANSWER
@@ -305,7 +306,10 @@ class Firmware:
         self._rest(time_s, LATCHED if self.faults else IDLE)
 
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
-        """Watch the resting device: motion by itself opens the gap, and other causes not yet latched are latched."""
+        """Watch the resting device, and latch what shows: UNCOMMANDED_MOTION, or SUPPLY and TEMPERATURE where new.
+
+        Motion by itself also opens the gap.
+        """
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)
             return
@@ -336,7 +340,10 @@ class Firmware:
             self._retract(time_s, sensors)
 
     def _retract(self, time_s: float, sensors: Sensors) -> None:
-        """Begin to open the gap. After RUN the host must send OFF before it can enter RUN again."""
+        """Begin to open the gap. After RUN the host must send OFF before it can enter RUN again.
+
+        A homed device opens at its opening speed, slower towards the end; another at its homing speed.
+        """
         if self.mode is RUN:
             self._may_run = False
         self.mode = RETRACTING

@@ -259,7 +259,10 @@ class SimulatedSensor:
 
     def advance(self, time_s: float, force_N: float) -> None:
         """Bring the sensor to `time_s`, at which the rendered force is `force_N`: sample when due, show what has
-        arrived."""
+        arrived.
+
+        A call makes one sample at most.
+        """
         # half an element step of tolerance: a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
             self._samples += 1

@@ -37,8 +37,7 @@ class SlcanAdapter:
         """Take the host's characters; return the characters to answer, and the frames that the host sends.
 
         An incomplete command waits for the next call; one that is too long is refused at its end. A frame (`t`, 11-bit
-        only) is answered as sent where the channel is open, and
-        refused where it is not, as is any unknown command.
+        only) is answered as sent where the channel is open, and refused where it is not, as is any unknown command.
         """
         *commands, rest = (self._pending + data).split(END)
         # too long a command is refused when its end comes: no more of it is kept than shows its length

@@ -18,7 +18,10 @@ class Warmth:
         self.temperature_C = self._ambient_C
 
     def advance(self, time_s: float) -> float:
-        """Set `temperature_C` to that of `time_s`, s since power-on; return the factor on a cool elastomer's force."""
+        """Set `temperature_C` to that of `time_s`, s since power-on; return the factor on a cool elastomer's force.
+
+        It is 1 at the ambient temperature. Only the time counts, not how the device works.
+        """
         if self._warming_K > 0.0:
             self.temperature_C = self._ambient_C - self._warming_K * math.expm1(
                 -self._drift_K_s * time_s / self._warming_K
