@@ -93,7 +93,7 @@ class VirtualPort:
     def advance(self, now_s: float) -> None:
         """Let the device run until `now_s`.
 
-        Its bytes wait for their reader, MAX_UNREAD_BYTES and the newest at most.
+        Its bytes wait for their reader: all new ones, and of those from before the last MAX_UNREAD_BYTES.
         """
         self.now_s = now_s
         self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
@@ -298,16 +298,16 @@ class ClosedLoop:
             return
         is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
         if is_new or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
-            self._search(planner, now_s)
+            self._answer_question(planner, now_s)
             planner.plan(now_s, setpoint, self.stepper.measured, self.stepper.is_followed)
             planner.foresee()
             self._asked = self._asked or planner.question
 
-    def _search(self, planner: Planner, now_s: float) -> None:
+    def _answer_question(self, planner: Planner, now_s: float) -> None:
         """Answer the pending question once SEARCH_S is over, as a search in a process of its own would; else do
         nothing.
 
-        The answer goes to the planner, and no question is pending then.
+        The answer goes to the planner, and no question is pending then. Raises DomainError as `Aim.answer_to`.
         """
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:

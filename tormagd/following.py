@@ -59,8 +59,10 @@ class Following:
     ) -> None:
         """Look once, and add the error for each delay where it counts.
 
-        It counts ENABLED (or where no state is known), with a sliding handle, a measured force, and no limit of
-        NOT_FOLLOWED, after MOST_DELAY_S of setpoints. Out of ENABLED or without a setpoint, the way begins anew.
+        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED, after MOST_DELAY_S of
+        setpoints. A state of None counts as ENABLED, a handle without place or rate (None) as sliding. Out of ENABLED
+        or without a setpoint (`asked_N` None), the way begins anew. With a finite `forgets_s` earlier errors fade at
+        each look.
         """
         if self._kept < 1.0:
             self._weight *= self._kept
@@ -89,7 +91,7 @@ class Following:
     def _slides(self, rate_mm_s: float | None, place_mm: float | None) -> bool:
         """Tell whether the handle has slid SLID_MM since it last turned or was slower than about SLIDES_MM_S.
 
-        True for a handle that is not measured. Remembers where it turned.
+        True for a handle whose rate or place is None. Keeps the rate, and where the handle turned, for the next look.
         """
         if rate_mm_s is None or place_mm is None:
             return True

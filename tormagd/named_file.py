@@ -14,7 +14,7 @@ def shipped(folder: Traversable, ending: str) -> tuple[str, ...]:
 
 
 def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = Path()) -> Path:
-    """Return the path of a shipped file by its name, or of a file that exists at `name`, relative to `beside`.
+    """Return the path of a shipped file by its name, or else of what exists at the path `name`, relative to `beside`.
 
     Raises ConfigError naming `key`, its value and the shipped names where there is neither.
     """

@@ -216,7 +216,10 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
 
 
 def _require_numbers(value: Any, key: str) -> None:
-    """Raise TomlError for a number in `value`, however deep, that is not finite or not of 64 bits."""
+    """Raise TomlError for a number in `value`, however deep, that is not finite or not of 64 bits, with its key.
+
+    `key` is the path of `value` in the whole.
+    """
     if isinstance(value, float) and not math.isfinite(value):
         raise TomlError(f"{key} = {value}: allowed is a finite number")
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
