@@ -67,7 +67,8 @@ def conditions(
 def _late_stream(now_s: float, measurement: Measurement, timeout_s: float) -> str:
     """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has.
 
-    A State is late after `timeout_s`, a Sense and a Status after the times of their faults.
+    Of several it is the first of State, Sense and Status. A State is late after `timeout_s`, a Sense and a Status after
+    the times of their faults.
     """
     for name, came_s, longest_s in (
         ("State", measurement.received_s, timeout_s),

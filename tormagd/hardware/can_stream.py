@@ -79,9 +79,10 @@ class CanStream:
     def unpack(self, identifier: int, data: bytes) -> Message | None:
         """Return the message in a frame; None for a frame of another node, of a host, or one that does not decode.
 
-        Frames of this node are added to `received` and counted, one that does not decode as corrupt. The device's first
-        message after a corrupt frame counts as a resynchronisation, a gap in the States' counter as lost States. Raises
-        SecondHostError for a Drive to this node that is not the echo of one of the last ECHOES sent.
+        Frames with this node's number are added to `received`. Of these the device's messages count in `statistics`,
+        and a frame that does not decode counts as corrupt. The device's first message after a corrupt frame counts as a
+        resynchronisation, a gap in the States' counter as lost States. Raises SecondHostError for a Drive to this node
+        that is not the echo of one of the last ECHOES sent.
         """
         if identifier & 0xF != self.node:
             return None

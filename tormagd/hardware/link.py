@@ -296,9 +296,10 @@ class DeviceLink:
             )
 
     def _take_status(self, now_s: float, status: Status) -> None:
-        """Keep a Status: end an acknowledged request, note a reset, and date the Drive that the device obeys.
+        """Keep a Status: end an acknowledged request, and note a reset or how late the device obeys.
 
-        The first one says from where nonces count on. A RETRACT also ends when the device has latched.
+        That is the age of the first Drive that the device does not obey yet, 0 unless it is in RUN. The first one says
+        from where nonces count on. A RETRACT also ends when the device has latched.
         """
         if self._status is None:
             # an earlier host has counted this far; its last number again would be taken for a repetition

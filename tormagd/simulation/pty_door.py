@@ -44,7 +44,8 @@ class Pty:
     def write(self, data: bytes) -> None:
         """Hand bytes to the host. When nobody reads, bytes are thrown away, as in any receiver that overruns.
 
-        The unread ones go where they and `data` would be MAX_UNREAD_BYTES. Where the line takes nothing, both go.
+        Unread ones are dropped where they and `data` would fill MAX_UNREAD_BYTES; `data` is dropped, too, where the
+        line takes nothing.
         """
         (unread,) = struct.unpack("i", fcntl.ioctl(self._theirs, termios.FIONREAD, bytes(4)))
         if unread + len(data) > MAX_UNREAD_BYTES - 1:

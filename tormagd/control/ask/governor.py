@@ -392,8 +392,8 @@ class Governor:
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
     """Raise DomainError where a number of `setpoint` or its age is not finite or beyond LARGEST.
 
-    Also raise it for a preview whose `preview_dt_s` is not above 0. Forces of a preview are looked at only where their
-    sum is beyond LARGEST.
+    Also raise it for a preview whose `preview_dt_s` is not above 0. Each force of a preview is looked at only where
+    their sum is not finite or beyond LARGEST.
     """
     if not (
         -_LARGEST <= age_s <= _LARGEST
