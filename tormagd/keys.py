@@ -55,8 +55,8 @@ class KeyRing:
 def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
     """Yield name and public key of every `NAME.key` in `folder`, sorted by name.
 
-    Raises ConfigError for an unreadable folder, more than MAX_KEYS keys, and a damaged key. So does a folder or key
-    that others can write: they could let themselves in.
+    Raises ConfigError for an unreadable folder, more than MAX_KEYS keys, and a damaged key. It is raised, too, for a
+    folder or key that others can write: they could let themselves in.
     """
     try:
         information = folder.stat()

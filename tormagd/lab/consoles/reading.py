@@ -13,8 +13,8 @@ SUFFIX = ".mcap"
 def files(url: str) -> dict[str, str]:
     """Return the full address of every `.mcap` in a folder or under a URL, by its path there; or of that one file.
 
-    Raises FileNotFoundError where there is nothing, and OSError where the place cannot be read. Raises ValueError for
-    an unknown kind of URL, and ImportError for one whose package is missing.
+    Empty for a folder without one. Raises FileNotFoundError where there is no such folder or file, and OSError where it
+    cannot be read. Raises ValueError for an unknown kind of URL, and ImportError for one whose package is missing.
     """
     system, root = fsspec.core.url_to_fs(url)
     if not system.exists(root):

@@ -64,7 +64,7 @@ class Problem(msgspec.Struct, frozen=True):
     friction_coefficient: float = 0.2
 
     def geometry(self, design: Design) -> Geometry:
-        """Return the geometry of a design."""
+        """Return the geometry of a design. Raises `DomainError` for lengths that no brake can have."""
         return Geometry(
             inner_radius_m=1e-3 * self.inner_radius_mm,
             outer_radius_m=1e-3 * design.outer_radius_mm,

@@ -55,7 +55,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the experiment's figures, for a person as the page; with `options.out` also write the page there.
+    """Return the experiment's figures, for a person as the page; with `options.out` also write it there with its
+    pictures.
 
     With `options.branches` return instead what the number of neighbours decides on shipped models. Raises LabError
     where `out` is no directory, ModuleNotFoundError where heartpy is not installed.

@@ -60,9 +60,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Return all tables and figures of the reproduction, for a person as the page.
 
-    `options.out`, if given, gets the page and its pictures. With `options.table_2_5` only that table is made, and
-    nothing is written. Raises ModuleNotFoundError where a package is missing, OSError where `out` cannot be written,
-    RuntimeError where a simulated device faults.
+    The folder `options.out`, if given, gets the page and its pictures, and is made where missing. With
+    `options.table_2_5` only that table is made, and nothing is written. Raises ModuleNotFoundError where a package is
+    missing, OSError where `out` cannot be written, RuntimeError where a simulated device faults.
     """
     if options.table_2_5:
         found = table_2_5()
