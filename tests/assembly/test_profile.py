@@ -70,6 +70,7 @@ def test_of_a_profile_from_before_lateness_was_kept_none_is_known() -> None:
 @example(data=b" " * (MAX_BYTES + 1))
 @example(data=b'{"scale": ' + b"9" * 4_000 + b"}")
 @example(data=b"NaN")
+@example(data=b'{"insert": "\xff"}')  # no UTF-8, for which msgspec has no error of its own
 def test_rubbish_is_refused_large_and_deep_too(data: bytes) -> None:
     with pytest.raises(ProfileError):
         read_profile(data, bounds=BOUNDS, **OF)  # type: ignore[arg-type]

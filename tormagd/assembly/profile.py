@@ -96,7 +96,7 @@ def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bo
         raise ProfileError(f"{len(data)} bytes: allowed is {MAX_BYTES}")
     try:
         profile = msgspec.json.decode(data, type=Profile)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ProfileError(f"not a profile: {error}") from error
     for name, kept, present in (
         ("serial_number", profile.serial_number, serial_number),
