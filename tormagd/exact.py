@@ -144,7 +144,8 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
     """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with the value of each there.
 
     None where they are the same to the bit. Where the right one has no such place, its value is None. Where one only
-    ends earlier, the place is "length", with both counts of values.
+    ends earlier, the place is "length", with both counts of values. So it is, with equal counts, where only names of
+    types or empty parts differ.
     """
     if packed(left) == packed(right):
         return None

@@ -409,7 +409,9 @@ def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    """Return the search that `scene` names, with its settings. Raises DomainError for settings that it does not have.
+    """Return the search that `scene` names, with its settings.
+
+    Raises DomainError for an unknown name, and for settings that the search does not have.
 
     Where the scene leaves the choice, it is the portrait if the handle's rate is no term. With the rate it is Newton's
     method where the force `rises` with the field, else the k-nearest search.

@@ -36,8 +36,9 @@ class SlcanAdapter:
     def feed(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
         """Take the host's characters; return the characters to answer, and the frames that the host sends.
 
-        An incomplete command waits for the next call; one that is too long is refused at its end. A frame (`t`, 11-bit
-        only) is answered as sent where the channel is open, and refused where it is not, as is any unknown command.
+        An incomplete command waits for the next call, LONGEST_COMMAND and one more characters of it at most. A frame
+        (`t`, 11-bit only) is answered as sent where the channel is open. It is refused where it is not, or where it is
+        too long, as is any unknown command.
         """
         *commands, rest = (self._pending + data).split(END)
         # too long a command is refused when its end comes: no more of it is kept than shows its length
@@ -59,9 +60,9 @@ class SlcanAdapter:
     def _answer(self, command: bytes) -> bytes:
         """Carry out a command that is no frame, and return its answer.
 
-        `O` opens the channel, `C` closes it. An empty command is accepted, and so are bit rates while it is closed,
-        without effect. `V`, `N` and `F` are answered by TOLD. Any other is refused, as `O` and bit rates are while it
-        is open.
+        Only the first letter counts, but for bit rates. `O` opens the channel, `C` closes it. An empty command is
+        accepted, and so are bit rates while it is closed, without effect. `V`, `N` and `F` are answered by TOLD. Any
+        other is refused, as `O` and bit rates are while it is open.
         """
         match command[:1]:
             case b"":  # hosts send empty lines to end whatever was there before

@@ -256,8 +256,8 @@ def calibrate(
     """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file).
 
     Returns as plain data the files' names, the insert, the date, and the data's rows, ranges and metrics. Raises
-    CalibrationError, LabError, DomainError and OSError; neither file is there then, so that the same command can be
-    given again.
+    CalibrationError, LabError, DomainError and OSError; no new file is there then, so that the same command can be
+    given again. Only a `training_csv` that cannot be replaced leaves the new model.
     """
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     require_usable(data)
