@@ -112,7 +112,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
         if offered < needed:
             raise ConfigError(f"rates.{name} = {offered}: allowed is at least {needed}, which scene {scene.name} needs")
-    stability = _refuse_unstable(config)
+    stability = _stable_margins(config)
     _refuse_too_weak(config, scene)
     try:
         model = load_model(
@@ -236,7 +236,7 @@ def _known_fields_mT(
     return (low_mT, high_mT), all(falling_at(model, (low_mT, high_mT), depth) is None for depth in depths_mm)
 
 
-def _refuse_unstable(config: Config) -> Margins:
+def _stable_margins(config: Config) -> Margins:
     """Return the position loop's stability margins. Raises ConfigError where the phase or gain margin is too small."""
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
     if stability.phase_margin_deg < MIN_PHASE_MARGIN_DEG or stability.gain_margin_dB < MIN_GAIN_MARGIN_DB:
