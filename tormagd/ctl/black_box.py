@@ -1,13 +1,12 @@
 """`tormagctl blackbox`: have the daemon write its last half minute, and fetch the file."""
 
 import shutil
-import time
 from pathlib import Path
 
+from tormagd.ctl.operate import statuses
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd_client.blocking import Client
 
-POLL_S = 0.1
 LONGEST_S = 30.0
 "Longest wait for the file; writing takes a second or two, at low priority."
 
@@ -23,16 +22,15 @@ def black_box(client: Client, copy: Path | None) -> Outcome:
     if copy is not None and copy.exists():
         raise usage_error(f"{copy} exists", "give another name; nothing is overwritten")
     written = Path(client.request("blackbox")["file"])
-    until_s = time.monotonic() + LONGEST_S
-    while (box := client.status().black_box).newest != written.name:
-        if box.refusal or time.monotonic() > until_s:
-            raise CommandError(
-                Exit.REFUSED,
-                "not_written",
-                box.refusal or f"{written} was not written within {LONGEST_S:g} s",
-                "make room in [black_box] folder, or name another; the daemon's log says more",
-            )
-        time.sleep(POLL_S)
+    boxes = (state.black_box for _, state in statuses(client, LONGEST_S))
+    box = next((each for each in boxes if each.newest == written.name or each.refusal), None)
+    if box is None or box.newest != written.name:
+        raise CommandError(
+            Exit.REFUSED,
+            "not_written",
+            f"{written} was not written within {LONGEST_S:g} s" if box is None else box.refusal,
+            "make room in [black_box] folder, or name another; the daemon's log says more",
+        )
     if copy is None:
         return Outcome({"file": str(written)}, f"{written}\ntormagctl replay runs it again, tormagctl plot draws it")
     hint = f"it is {written} on the daemon's machine: fetch it from there"

@@ -74,10 +74,8 @@ def operate(client: Client, command: str) -> Outcome:
     if is_needless:
         return Outcome(result, f"no fault is latched; it is {state}")
     if command == "clear-fault":
-        until_s = time.monotonic() + COMES_BACK_S
-        while time.monotonic() < until_s:
-            require_no_fault(client.status(), "the fault came back")
-            time.sleep(POLL_S)
+        for _, after in statuses(client, COMES_BACK_S):
+            require_no_fault(after, "the fault came back")
     return Outcome(result, text)
 
 
@@ -91,7 +89,7 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
     if begun.exit_code is not Exit.DONE or not is_waiting:
         return begun
     gap_mm = None
-    for elapsed_s, state in _statuses(client, "opening", timeout_s):
+    for elapsed_s, state in statuses(client, timeout_s, "opening"):
         gap_mm = state.gap_mm
         if state.is_open and not state.is_busy:
             return Outcome({**begun.result, "seconds": round(elapsed_s, 2)}, IS_OPEN[command])
@@ -147,7 +145,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     if not is_waiting:
         return Outcome(result, "homing; tormagctl status shows when it is done")
     has_begun = False
-    for elapsed_s, state in _statuses(client, "homing", timeout_s):
+    for elapsed_s, state in statuses(client, timeout_s, "homing"):
         require_no_fault(state, "fault while homing")
         # a homing that was over between two looks still shows, as a device that is homed and was not
         has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
@@ -169,11 +167,13 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     )
 
 
-def _statuses(client: Client, doing: str, timeout_s: float) -> Iterator[tuple[float, Status]]:
-    """Yield seconds since the start and status, every POLL_S for `timeout_s`; on a terminal draws a line of
-    progress."""
+def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tuple[float, Status]]:
+    """Yield seconds since the start and status, every POLL_S for `timeout_s`.
+
+    On a terminal draws a line of progress that says what the device is `doing`; none where that is empty.
+    """
     started_s = time.monotonic()
-    shows_progress = is_terminal(sys.stderr)
+    shows_progress = bool(doing) and is_terminal(sys.stderr)
     try:
         while (elapsed_s := time.monotonic() - started_s) < timeout_s:
             state = client.status()

@@ -1,6 +1,5 @@
 """`tormagctl scene`: which scenes there are, what one asks for, whether this configuration can give it, and how."""
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:  # whoever lists scenes needs no sockets
 
 LONGEST_S = 30.0
 "Longest wait for the daemon's own check, which takes half a second, or for its change of scene."
-POLL_S = 0.05
 
 
 def scene(
@@ -76,15 +74,14 @@ def use_scene(client: "Client", name: str) -> Outcome:
     Raises as `Client.request`. Raises CommandError (REFUSED) where the daemon refuses the scene or is not ready within
     LONGEST_S.
     """
+    from tormagd.ctl.operate import statuses
+
     scene = str(Path(name).absolute()) if name not in shipped_scenes() and Path(name).exists() else name
     client.request("use-scene", scene=scene)
-    until_s = time.monotonic() + LONGEST_S
-    while (change := (state := client.status()).scene_change) is None or not change.is_over:
-        if time.monotonic() > until_s:
-            raise CommandError(
-                Exit.REFUSED, "timeout", f"{scene} is not ready after {LONGEST_S:g} s", "tormagctl status"
-            )
-        time.sleep(POLL_S)
+    changes = ((state, state.scene_change) for _, state in statuses(client, LONGEST_S))
+    state, change = next(((state, each) for state, each in changes if each and each.is_over), (None, None))
+    if state is None or change is None:
+        raise CommandError(Exit.REFUSED, "timeout", f"{scene} is not ready after {LONGEST_S:g} s", "tormagctl status")
     if change.error is not None:
         raise CommandError(Exit.REFUSED, change.error.code, change.error.cause, change.error.remedy)
     result = {"scene": state.scene, "fingerprint": state.scene_fingerprint, "is_homed": state.is_homed}
@@ -104,7 +101,7 @@ def list_scenes() -> Outcome:
 def show_scene(name: str) -> Outcome:
     """Return everything a scene states, defaults included, as TOML. Raises CommandError (USAGE) for an unknown or
     faulty one."""
-    stated = msgspec.to_builtins(_loaded(name))
+    stated = msgspec.to_builtins(loaded(name))
     tables = {key: value for key, value in stated.items() if value is not None}
     return Outcome(tables, as_toml(tables))
 
@@ -141,7 +138,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     serving was measured. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more than its
     budget; USAGE for a faulty scene.
     """
-    scene = _loaded(name)
+    scene = loaded(name)
     derived = _derived(name, config)
     file = measured()
     share = file.share(way_of(derived)) if not derived["terms_out"] else None
@@ -211,7 +208,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     REFUSED where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
     """
     file = measured()
-    found = measured_as(_loaded(name), file)
+    found = measured_as(loaded(name), file)
     derived = _derived(name, config)
     tolerance_N = found.tolerance_N
     runs = way_of(derived)
@@ -262,7 +259,7 @@ def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
     return found
 
 
-def _loaded(name: str) -> Scene:
+def loaded(name: str) -> Scene:
     """Load a scene. Raises CommandError (USAGE) for an unknown or faulty one."""
     with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
         return load_scene(name)

@@ -2,15 +2,21 @@
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
-from tormagd.ctl.scene import as_toml, measured_as
-from tormagd.scenes.measured import OperatingPoint, Share, Tried, measured
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.scene import as_toml, loaded, measured_as
+from tormagd.scenes.measured import OperatingPoint, measured
 from tormagd.scenes.scene import load_scene, scene_path
-from tormagd_client.endpoints import ConfigError
+
+
+class Served(NamedTuple):
+    """A measured way to serve a scene, and its figures: the share of a processor, and the worst RMS error, N."""
+
+    way: OperatingPoint
+    figures: tuple[float, float]
 
 
 def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
@@ -25,51 +31,41 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
             "--share, --tolerance and --out choose how a scene is served",
             "tormagctl scene check NAME with one of --share S and --tolerance N, and --out FILE.toml to write it",
         )
-    with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
-        scene = load_scene(name)
-    file = measured()
+    scene, file = loaded(name), measured()
     ways = [
-        (tried, share_of) for tried in measured_as(scene, file).tried if (share_of := file.share(tried.way)) is not None
+        Served(tried.way, (taken.daemon, tried.worst_N))
+        for tried in measured_as(scene, file).tried
+        if (taken := file.share(tried.way)) is not None
     ]
-    tried, taken = _max_wanted(ways, share, tolerance_N or 0.0)
+    way, (daemon_share, rms_N) = _best(ways, share, tolerance_N or 0.0)
     text = (
-        f"{scene.name}: {tried.way}: {1e3 * tried.worst_N:.1f} mN RMS at worst on samples 1 to 3, "
-        f"the daemon takes {taken.daemon:.1%} of a processor"
+        f"{scene.name}: {way}: {1e3 * rms_N:.1f} mN RMS at worst on samples 1 to 3, "
+        f"the daemon takes {daemon_share:.1%} of a processor"
     )
     if out is not None:
-        _write(name, tried.way, out)
+        _write(name, way, out)
         text += f"\n{out} is written: tormagd --scene {out}"
-    result = {"scene": scene.name, "way": msgspec.to_builtins(tried.way), "rms_N": tried.worst_N}
-    return Outcome(result | {"daemon_share": taken.daemon, "file": None if out is None else str(out)}, text)
+    result = {"scene": scene.name, "way": msgspec.to_builtins(way), "rms_N": rms_N}
+    return Outcome(result | {"daemon_share": daemon_share, "file": None if out is None else str(out)}, text)
 
 
-Served = tuple[Tried, Share]
-
-
-def _max_wanted(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
+def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
     """Return the most exact of `ways` that takes at most `share`, or for None the cheapest within `tolerance_N`.
 
     Raises CommandError (REFUSED) where no way does, ValueError where there is none at all.
     """
-
-    def price(way: Served) -> float:
-        return way[1].daemon
-
-    def error_N(way: Served) -> float:
-        return way[0].worst_N
-
-    asked, most, limited, best, unit = "--tolerance", tolerance_N, error_N, price, "N"
-    if share is not None:
-        asked, most, limited, best, unit = "--share", share, price, error_N, "of a processor"
-    fits = [way for way in ways if limited(way) <= most]
+    bounds = ("--tolerance", 1, tolerance_N, "N") if share is None else ("--share", 0, share, "of a processor")
+    asked, bounded, most, unit = bounds
+    fits = [way for way in ways if way.figures[bounded] <= most]
     if not fits:
+        least = min(way.figures[bounded] for way in ways)
         raise CommandError(
             Exit.REFUSED,
             "no_way",
-            f"{asked} = {most:g}: allowed is at least {min(map(limited, ways)):.3g} {unit}",
+            f"{asked} = {most:g}: allowed is at least {least:.3g} {unit}",
             "tormagctl scene explain shows every way that was measured",
         )
-    return min(fits, key=best)
+    return min(fits, key=lambda way: way.figures[1 - bounded])
 
 
 def _write(name: str, way: OperatingPoint, out: Path) -> None:
