@@ -6,7 +6,9 @@ import datetime
 import json
 import math
 import re
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,6 +39,8 @@ from tormagd.physics.inserts import insert
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
+from tormagd_client.errors import UnreachableError
+from tormagd_client.messages import encode_ticks
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)
@@ -301,6 +305,20 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, t
         0.001,
         30.0,
     )
+
+
+def test_ticks_of_an_enabled_device_are_waited_for_no_longer_than_stated(monkeypatch):
+    """A batch from before `enable` comes, then none: the wait is not begun again."""
+    now_s, old = [0.0], encode_ticks([(1, "DISABLED")], ("t_ns", "operating_state"))
+
+    def poll(wait_ms):
+        now_s[0] += min(wait_ms * 1e-3, 0.9)
+        return wait_ms > 900
+
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    with pytest.raises(UnreachableError, match="within 1 s"):
+        calibrate_run._drop_old(SimpleNamespace(poll=poll, recv_multipart=lambda: [old]), 1.0, "ipc://x")
+    assert now_s == [pytest.approx(1.0)]
 
 
 @pytest.mark.parametrize(

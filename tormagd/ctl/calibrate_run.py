@@ -13,7 +13,7 @@ import numpy.typing as npt
 import zmq
 from tqdm import tqdm
 
-from tormagd.ctl.operate import home
+from tormagd.ctl.operate import require_no_fault
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
 from tormagd.interrupt import interrupted_by
@@ -190,25 +190,24 @@ def reach(client: Client, scene_most_N: float) -> Range:
 
 @contextmanager
 def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: float) -> Iterator[Run]:
-    """Home where needed, enable, and give a `Run`; at the end of the context disable, so that the gap opens.
+    """Home and enable as far as needed, and give a `Run`; at the end of the context disable, so that the gap opens.
 
     Disables after an error, too. Within the context SIGINT and SIGTERM are only noted: the `Run` raises for them.
-    Raises CommandError as `home` does, for ticks of another version, and `interrupted_run`. Raises UnreachableError
-    where nobody takes setpoints, or no ticks of an enabled device come within `wait_s`; ClientError where the daemon
-    refuses to enable.
+    Raises CommandError in FAULT, for ticks of another version, and `interrupted_run`; as `Client.arm`. Raises
+    UnreachableError where nobody takes setpoints, or no ticks of an enabled device come within `wait_s`.
     """
     context = zmq.Context()
     try:
         ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
         client.require_taken()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            status = client.status()
-            if not status.is_homed:
-                home(client, HOMING_S, is_waiting=True)
-            if is_interrupted():
-                raise interrupted_run()
-            if status.operating_state != "ENABLED":
-                _enable(client)
+            require_no_fault(client.status(), "nothing is calibrated")  # nor is a fault cleared that nobody has seen
+
+            def given(_command: str) -> None:
+                if is_interrupted():
+                    raise interrupted_run()
+
+            client.arm(HOMING_S, given)
             try:
                 _drop_old(ticks, wait_s, endpoints.recording)
                 yield Run(endpoints, client, ticks, columns, is_interrupted)
@@ -229,7 +228,7 @@ def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
     """
     # the newest tick from before `enable` took effect must not be read as a fall out of ENABLED
     until_s = time.monotonic() + wait_s
-    while time.monotonic() < until_s and ticks.poll(round(wait_s * 1e3)):
+    while (left_s := until_s - time.monotonic()) > 0.0 and ticks.poll(round(left_s * 1e3)):
         try:
             batch = decode_ticks(ticks.recv_multipart()[-1])
         except MessageError as error:
@@ -248,20 +247,3 @@ def _other_version(address: str, error: ValueError) -> CommandError:
         f"the ticks at {address} are not this version's: {error}",
         "check the endpoint, and that tormagd and tormagctl are of the same version",
     )
-
-
-def _enable(client: Client) -> None:
-    """Enable the device, and try again for SILENT_S where its measurements are not fresh.
-
-    Raises ClientError for any other refusal, and for this one after SILENT_S.
-    """
-    # on a busy machine the newest measurement may be a little old once
-    until_s = time.monotonic() + SILENT_S
-    while True:
-        try:
-            client.request("enable")
-        except ClientError as error:
-            if error.code != "not_fresh" or time.monotonic() > until_s:
-                raise
-        else:
-            return
