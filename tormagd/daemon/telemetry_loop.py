@@ -87,10 +87,8 @@ class TelemetryLoop:
         not_granted: list[str],
         config_file: str | None,
     ) -> None:
-        self.config = config
-        "Replaced by a reload, which changes only keys that are looked at each time they are used."
-        self._core, self._not_granted, self._config_file = core, tuple(not_granted), config_file
-        self._control, self._inference, self._profiles = control, inference, profiles
+        self._not_granted, self._config_file = tuple(not_granted), config_file
+        self._control, self._inference = control, inference
         self._connection, self._endpoint = connection, endpoint
         self._phases, self._causes, self._box = phases, causes, box
         self.timing = RateGroup("telemetry", 1_000_000_000 // config.rates.telemetry_hz)
@@ -101,25 +99,27 @@ class TelemetryLoop:
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
         self._way = Way(core.scene.budget)
-        self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
         self.topics = Topics(config, core, control, inference, endpoint)
         self.scene_change: SceneChange | None = None
         "What changes the scene; None until the daemon sets it."
         self._service = Service()
-        self._status: msgspec.Raw | None = None
         self._mark: Mark | None = None
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // config.rates.telemetry_hz
         self._answers, self._told_s = 0, -math.inf
         self._histograms = self._in_turn()
         self._reports: dict[str, Any] = {}
-        self._reported_s, self._reported_state = -math.inf, connection.state
+        self._reported_state = connection.state
+        self.run_scene(config, core, profiles)
 
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
         """Publish and report on `core` from now on, with its configuration and profiles; reports are made anew."""
-        self.config, self._core, self.topics.core, self._profiles = config, core, core, profiles
+        self.config = config
+        "Replaced by a reload, which changes only keys that are looked at each time they are used."
+        self._core, self.topics.core, self._profiles = core, core, profiles
         self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
         self._way.budget = core.scene.budget
-        self._status, self._reported_s = None, -math.inf
+        self._status: msgspec.Raw | None = None
+        self._reported_s = -math.inf
 
     def record(self, _beat: Beat) -> None:
         """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing.

@@ -10,7 +10,7 @@ import numpy as np
 
 from tormagd.dashboard.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
 from tormagd.following import in_words
-from tormagd.recording.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, Glance, codes_of, quantities
+from tormagd.recording.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, Glance, codes_in, quantities
 from tormagd.recording.reader import RecordingFile, Seen
 from tormagd.safety.codes import FAULTS, LIMITS
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
@@ -149,8 +149,8 @@ class Recorded:
             t_s=(self._start_ns * 1e-9 + times_s).tolist(),
             **curves,
             operating_state=now.get("operating_state") or "",
-            held=_held(shown, from_s, at_s, codes_of(now, "limits")),
-            faults=list(codes_of(now, "faults")),
+            held=_held(shown, from_s, at_s, codes_in(now.get("limits"))),
+            faults=list(codes_in(now.get("faults"))),
             belief=believed(snapshots, at_s),
             late_counts=late_counts(each for each in late_us if each is not None),
         )
@@ -207,7 +207,7 @@ def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> lis
     held_s: defaultdict[str, float] = defaultdict(float)
     steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
     for place in shown.within(from_s, at_s):
-        for code in codes_of(shown.messages[place], "limits"):
+        for code in codes_in(shown.messages[place].get("limits")):
             held_s[code] += float(steps_s[place])
     found = [Held(code, each_s / max(at_s - from_s, STEP_S), code in now) for code, each_s in held_s.items()]
     return sorted(found, key=lambda held: -held.share)

@@ -270,14 +270,8 @@ def _number(value: object) -> float | None:
     return value if value.__class__ is float or value.__class__ is int else None
 
 
-def codes_of(message: Mapping[str, Any], kind: str) -> tuple[str, ...]:
-    """Return a message's codes of this kind, empty where it has none; odd characters become "?", 64 at most are
-    kept."""
-    return _codes(message.get(kind))
-
-
-def _codes(told: object) -> tuple[str, ...]:
-    """Return the codes in a field's value, in characters that every picture can show."""
+def codes_in(told: object) -> tuple[str, ...]:
+    """Return the codes in a field's value, empty for None; odd characters become "?", 64 at most are kept."""
     words = (told,) if isinstance(told, str) else told if isinstance(told, tuple | list) else ()
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 
@@ -404,7 +398,7 @@ class _Codes:
         if 0 < passed_ns <= BREAK_NS:
             self._step_ns = passed_ns
         self._hold(min(max(passed_ns, 0), self._step_ns))
-        self._now = [(kind, code) for kind in KINDS if (told := message.get(kind)) for code in _codes(told)]
+        self._now = [(kind, code) for kind in KINDS if (told := message.get(kind)) for code in codes_in(told)]
         self._now_ns = since_ns
 
     def _hold(self, for_ns: int) -> None:
