@@ -81,7 +81,8 @@ class SealingFile:
         """Write a seal of all bytes before it, keep its digest in `digest`, and return the seal's bytes. Raises
         OSError."""
         digest = _digest(self._hash, is_last)
-        record = Record(SEAL, 0, _BODY.pack(is_last, digest)).raw()
+        body = _BODY.pack(is_last, digest)
+        record = Record(SEAL, 0, body).head + body
         self.write(record)
         self.digest = digest.hex()
         return record
@@ -187,21 +188,21 @@ class _Check:
 
         Also adds a record of the summary to its CRC, and notes where the summary begins.
         """
-        raw = record.raw() if record.opcode != END else b""
         if self._hash is not None:
-            self._hash.update(raw)
+            self._hash.update(record.head)  # apart: a chunk is a megabyte, and joining would copy it
+            self._hash.update(record.body)
         else:
-            self._head += raw
+            self._head += record.head + record.body
             if record.opcode == Opcode.METADATA and not self._by:
                 self._begin(record)
             if record.opcode not in (Opcode.HEADER, Opcode.METADATA):
                 self._head.clear()  # there is more than a beginning, and it does not say that it is sealed
         if self._summary_at and record.opcode != Opcode.FOOTER:
-            self._crc = zlib.crc32(raw, self._crc)
+            self._crc = zlib.crc32(record.body, zlib.crc32(record.head, self._crc))
         if record.opcode == Opcode.SUMMARY_OFFSET and not self._offsets_at:
             self._offsets_at = record.at
         if record.opcode == Opcode.DATA_END:
-            self._summary_at = record.at + len(raw)
+            self._summary_at = record.at + HEAD.size + len(record.body)
 
     def _begin(self, record: Record) -> None:
         """Begin the hash with all bytes so far, where this metadata record says that the file is sealed.
@@ -231,7 +232,7 @@ class _Check:
     def _end(self, record: Record) -> None:
         """Note a footer whose offsets or CRC do not fit the file."""
         footer = Footer.read(ReadDataStream(BytesIO(record.body)))
-        own = zlib.crc32(record.raw()[: _FOOTER_BYTES - 4], self._crc)
+        own = zlib.crc32((record.head + record.body)[: _FOOTER_BYTES - 4], self._crc)
         told = (footer.summary_start, footer.summary_offset_start, footer.summary_crc)
         if told != (self._summary_at, self._offsets_at, own) or len(record.body) != _FOOTER_BYTES - HEAD.size:
             self._note("its footer does not fit what it ends", record.at)

@@ -40,9 +40,10 @@ class Record(NamedTuple):
     at: int
     body: bytes
 
-    def raw(self) -> bytes:
-        """Return the record's bytes with their head."""
-        return HEAD.pack(self.opcode, len(self.body)) + self.body
+    @property
+    def head(self) -> bytes:
+        """Return the head of nine bytes before the body: kind and length."""
+        return HEAD.pack(self.opcode, len(self.body))
 
     def read(self, kind: Any) -> Any:
         """Parse the body as the type `kind` of `mcap.records`. Raises McapError, ValueError, struct.error."""
