@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tormagd.assembly.profile import ProfileError
-from tormagd.bounded_file import read_bounded
+from tormagd.bounded_file import in_place_of, read_bounded
 from tormagd.config import Config, load_config
 from tormagd.control.believe.strength import device_bounds
 from tormagd.ctl.waveform import read_csv
@@ -263,3 +263,11 @@ def test_the_same_mistake_is_told_in_the_same_words(tmp_path: Path, text: str | 
             read(path)
         said.add(str(refused.value).removeprefix("signal.file = "))
     assert len(said) == 1
+
+
+def test_what_could_not_be_written_whole_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(UnicodeEncodeError), in_place_of(tmp_path / "a") as beside:
+        beside.write_text("half of it\ud800", "utf-8")
+    with pytest.raises(IsADirectoryError, match="this is a folder"), in_place_of(tmp_path):
+        pass
+    assert not [*tmp_path.iterdir()]

@@ -237,6 +237,17 @@ def test_an_interface_that_is_not_there_says_how_it_comes(
 # -- behind an adapter on a serial line ----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("error", [BlockingIOError(errno.EAGAIN, "held"), can.CanInitializationError("no answer")])
+def test_an_adapter_that_cannot_be_opened_is_let_go(
+    line: Line, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(can, "Bus", Mock(side_effect=error))
+    before = set(Path("/proc/self/fd").iterdir())
+    with pytest.raises(BackendError, match="another program" if isinstance(error, OSError) else "no answer"):
+        opened(line.adapter)
+    assert set(Path("/proc/self/fd").iterdir()) == before
+
+
 def test_lines_of_an_adapter_pass_both_ways(line: Line) -> None:
     backend = opened(line.adapter)
     backend.send(Home(7))

@@ -68,6 +68,12 @@ def test_a_lost_drive_is_made_good_by_the_next_hello(trip: RoundTrip) -> None:
     assert trip.least_s == pytest.approx(3 * PERIOD_S)
 
 
+def test_round_trips_that_a_status_contradicts_are_forgotten(trip: RoundTrip) -> None:
+    """One lost Drive makes all of them a period too long; the second shows in the Status of tick 1320."""
+    exchange(trip, range(1, 1_324), 3, lost=frozenset({1_010, 1_300}))
+    assert trip.usual_s == trip.least_s == pytest.approx(3 * PERIOD_S)
+
+
 def test_an_answer_to_what_has_not_been_sent_ends_the_count(trip: RoundTrip) -> None:
     exchange(trip, range(1, 1_400), 1)
     trip.drive(10, 5.0)

@@ -110,6 +110,7 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
             ("given", ROWS + "0,0,nan,40,1\n", (), "row 2, field_mT: 'nan'"),
             ("absent", "", (), "cannot be read"),
             ("given", GOOD, ("--out", "absent/m.safetensors"), "cannot write"),
+            ("given", GOOD, ("--out", "."), "cannot write .: allowed is a file"),
             ("given", GOOD, ("--hidden", "0"), "hidden = 0"),
             ("given", GOOD, ("--epochs", "0"), "epochs = 0"),
             ("given", GOOD, ("--insert", "two words"), "insert"),

@@ -12,7 +12,7 @@ import pytest
 from tormagd.assembly.build import build_core
 from tormagd.config import Config
 from tormagd.lab.errors import LabError
-from tormagd.lab.tactile import branches, experiment, models, report, shipped
+from tormagd.lab.tactile import branches, experiment, held, models, report, shipped
 from tormagd.lab.tactile.models import QUICK
 from tormagd.lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
 from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
@@ -205,6 +205,12 @@ def test_neighbours_decide_on_the_pad_and_nothing_on_the_brake(monkeypatch: pyte
     assert all(row["worst_force_error_N"] < 1e-3 for row in pad.values())
     assert all(row["other_answers"] == 0.0 for row in brake.values())
     assert len(pad) == len(brake) == len(branches.NEIGHBOURS)
+
+
+def test_a_hold_that_ends_in_its_first_second_says_by_what(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(held, "_whole", lambda _case: iter([(1.0, 50.0, None, "SENSOR")]))
+    with pytest.raises(LabError, match="plant pad_1: SENSOR ends the hold"):
+        held.hold(held.Case("pad_1", relaxation=True, is_learning=True))
 
 
 def test_a_model_whose_force_rises_everywhere_has_no_contact_where_it_falls(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -292,6 +292,9 @@ def test_what_an_insert_states_itself_goes_before_its_matrix_and_eq_5() -> None:
         _ = usual.force_range
     with pytest.raises(DomainError, match="estimate_N"):
         _ = MeasuredForceRange(3.1, 0.1).thesis_estimate_N
+    for needs in ("elastomer", "masses_g"):
+        with pytest.raises(DomainError, match="X: shore_hardness = 20 is not allowed"):
+            getattr(Insert("X", 20, 0.25, 160.0), needs)
 
 
 @pytest.mark.parametrize(

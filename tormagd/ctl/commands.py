@@ -63,7 +63,10 @@ class Within(NamedTuple):
 
 def port(text: str) -> int:
     """Parse a TCP port; 0 takes one that is free. Raises ArgumentTypeError."""
-    return int(Within(0, 65_535)(text))
+    value = Within(0, 65_535)(text)
+    if not value.is_integer():
+        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number, 0..65535")
+    return int(value)
 
 
 def rates(text: str) -> tuple[float, ...]:

@@ -229,11 +229,11 @@ def open_can(device: Device, options: CanOptions) -> CanBackend:
             ignore_config=True,  # what applies stands in our configuration, not in a file of python-can's
             **_of_the_interface(options),
         )
-    except BlockingIOError as error:
-        raise BackendError(f"{name}: another program holds it", remedy="tormagctl ports says which") from error
     except (can.CanError, OSError, ValueError) as error:
         if held is not None:
             os.close(held)
+        if isinstance(error, BlockingIOError):
+            raise BackendError(f"{name}: another program holds it", remedy="tormagctl ports says which") from error
         number = _errno(error)
         reason, remedy = os.strerror(number) if number else str(error), ""
         if options.interface == "socketcan" and number in ABSENT:

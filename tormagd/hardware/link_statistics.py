@@ -47,7 +47,7 @@ class RoundTrip:
     answered, moves them further apart.
 
     A Status names the last Drive that the device accepted. Round trips count only once a Status confirms them. Where it
-    contradicts them, the recent ones are forgotten but for that of the Drive it names. One lost Drive alone looks like
+    contradicts them, all are forgotten but that of the Drive it names. One lost Drive alone looks like
     an answer that is still on its way. Round trips are then one period too long until the next Identity.
     """
 
@@ -104,7 +104,7 @@ class RoundTrip:
     def status(self, drive_counter: int) -> None:
         """Take the counter of the last Drive that the device accepted: count the round trips since the last Status.
 
-        Where the counter contradicts them, or is the first, drop the recent round trips and count this Drive's alone.
+        Where the counter contradicts them, or is the first, drop all round trips and count this Drive's alone.
         Before the first State nothing happens.
         """
         state, lead = self._state, self._lead
@@ -117,6 +117,7 @@ class RoundTrip:
         else:
             self._lead = drive_counter - state
             self._recent.clear()
+            self._usual.clear()
             round_trip_s = self._newest_s - self._sent_s[drive_counter]
             if round_trip_s >= 0.0 and (self._newest - drive_counter) % 256 < 128:
                 self._take(round_trip_s)

@@ -82,14 +82,22 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
         """Shear modulus, permeability and friction of the insert.
 
         What the insert does not state comes from Eq. 5 and from its matrix. Raises `DomainError` outside Eq. 5's range
-        and `Elastomer`'s, KeyError where the friction is needed from a matrix that is not in `MATRICES`.
+        and `Elastomer`'s, and where the friction is needed from a matrix that is not in `MATRICES`.
         """
         mu_r, friction = self.relative_permeability, self.friction_coefficient
         return Elastomer(
             self.shear_modulus_Pa,
             relative_permeability(self.cip_fraction) if mu_r is None else mu_r,
-            MATRICES[self.shore_hardness].friction_coefficient if friction is None else friction,
+            self.matrix.friction_coefficient if friction is None else friction,
         )
+
+    @property
+    def matrix(self) -> Matrix:
+        """The silicone of the insert's hardness. Raises `DomainError` where none of `MATRICES` has it."""
+        known = ", ".join(map(str, MATRICES))
+        allowed = f"one of a [[matrix]], {known}; or state friction_coefficient"
+        require_that(self.shore_hardness in MATRICES, f"{self.name}: shore_hardness", self.shore_hardness, allowed)
+        return MATRICES[self.shore_hardness]
 
     @property
     def shear_modulus_Pa(self) -> float:
@@ -107,11 +115,11 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
     def masses_g(self) -> dict[str, float]:
         """Mass of each content in 100 cc, g: matrix, cip, slacker, thinner. The matrix fills what the others leave.
 
-        Raises KeyError where the insert's matrix is not in `MATRICES`.
+        Raises `DomainError` where the insert's matrix is not in `MATRICES`.
         """
         matrix_fraction = 1.0 - self.cip_fraction - self.slacker_fraction - self.thinner_fraction
         return {
-            "matrix": 100.0 * matrix_fraction * MATRICES[self.shore_hardness].density_g_cc,
+            "matrix": 100.0 * matrix_fraction * self.matrix.density_g_cc,
             "cip": 100.0 * self.cip_fraction * CIP_DENSITY_G_CC,
             "slacker": 100.0 * self.slacker_fraction * SLACKER_DENSITY_G_CC,
             "thinner": 100.0 * self.thinner_fraction * THINNER_DENSITY_G_CC,

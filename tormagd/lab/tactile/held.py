@@ -24,6 +24,7 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
 from tormagd.control.move.watch import SENSOR_FAULT_S
 from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
+from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.options import WORKERS, within
 from tormagd.model.displacement import Turn
@@ -66,7 +67,7 @@ def hold(case: Case) -> dict[str, Any]:
     Errors are shares of the force asked for, one a second. The greatest and the mean are of magnitudes, the last has
     its sign, positive for too much. `shares` has every tenth, with signs. `limits` has the share of the time that each
     limit was there, `held_s` the seconds. `fault` names the fault that ended the hold; it is empty where none did.
-    Raises PlantError for a plant that cannot be loaded or has no pad, ValueError for a fault in the first second.
+    Raises PlantError for a plant that cannot be loaded or has no pad, LabError for a fault in the first second.
     """
     shares, limits, last_mm, fault = [], Counter[str](), math.nan, ""
     for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
@@ -75,6 +76,8 @@ def hold(case: Case) -> dict[str, Any]:
         shares.append(force_N / FORCE_N - 1.0)
         last_mm = gap_mm
         limits.update(map(str, plan.limits))
+    if not shares:
+        raise LabError(f"plant {case.plant}: {fault} ends the hold in its first second: allowed is one that is held")
     absolute = np.abs(shares)
     return case._asdict() | {
         "force_error": float(absolute.max()),

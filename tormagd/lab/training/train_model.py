@@ -50,8 +50,8 @@ def run(options: argparse.Namespace) -> Found:
     Raises LabError for data or an option that is refused, DomainError as `fit`, OSError where the model cannot be
     written.
     """
-    if not options.out.parent.is_dir():
-        raise LabError(f"cannot write {options.out}: {options.out.parent} is not a directory")
+    if options.out.is_dir() or not options.out.parent.is_dir():
+        raise LabError(f"cannot write {options.out}: allowed is a file in a folder that exists")
     model, training = fit(options, read_csv(options.data))
     save_model(options.out, model)
     report = {"out": str(options.out), "data_sha256": model.metadata.training_data_sha256, **model.metadata.metrics}
