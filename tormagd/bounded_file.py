@@ -30,8 +30,8 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 def in_place_of(path: Path) -> Iterator[Path]:
     """Give a path beside `path` to write to, which replaces `path` at the end.
 
-    After an error, inside or at the end, that file is removed and `path` stays as it was. Raises OSError where `path`
-    is a folder, before anything is written, or cannot be replaced.
+    After an error, inside or at the end, that file is removed and `path` stays as it was. Raises
+    IsADirectoryError where `path` is a folder, before anything is written, and OSError where it cannot be replaced.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))

@@ -271,6 +271,7 @@ CHROMIUM = next(
 OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars")
 PHONE = 600
 "A narrower window is a phone's."
+LONGEST_S = 60.0
 
 
 class Page:
@@ -318,9 +319,10 @@ class Page:
         return said["result"].get("value")
 
     async def until(self, expression: str) -> None:
-        """Waits for it to be true."""
-        while not await self.ask(expression):
-            await asyncio.sleep(0.05)
+        """Waits for it to be true. Raises TimeoutError where it is not: a wrong page must not hang the suite."""
+        async with asyncio.timeout(LONGEST_S):
+            while not await self.ask(expression):
+                await asyncio.sleep(0.05)
 
 
 @asynccontextmanager
@@ -395,6 +397,7 @@ async def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Pa
         await page.until(FITS)
         fake_daemon.is_silent = True
         await page.until("document.querySelector('#silence').textContent.startsWith('nothing heard for')")
+        assert await page.ask("document.querySelector('#state').className") == ""
 
 
 @needs_chromium

@@ -76,6 +76,14 @@ def test_the_screen_fits_and_says_what_the_device_does(seen: Seen, width: int, h
     assert {"▁", "█"} <= set(text)
 
 
+@pytest.mark.parametrize(("width", "height"), [(40, 20), (80, 18)])
+def test_a_small_terminal_cuts_the_loops_and_no_fault(seen: Seen, width: int, height: int) -> None:
+    lines = drawn(in_fault(seen)._replace(silent_s=7.0), width, height)[:height]
+    assert "nothing heard for 7 s" in lines[0]
+    assert [line.split()[0] for line in lines if line[1:5].strip()][7] == "FAULT"
+    assert any("next:" in line for line in lines)
+
+
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_a_fault_and_its_remedy_come_before_the_limits(seen: Seen, width: int, height: int) -> None:
     lines = drawn(in_fault(seen), width, height)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from statistics import fmean
 from typing import NamedTuple
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -65,19 +65,21 @@ CURVES = (
 
 
 def screen(seen: Seen, width: int, height: int) -> RenderableType:
-    """Return the whole screen: state, curves, loops and link, then faults and limits with remedies, as far as they fit.
+    """Return the whole screen: state, curves, loops and link, then faults and limits with remedies.
 
-    `width` and `height` are in characters.
+    `width` and `height` are in characters. What stands last is cut where there is no room: then loops and link do.
     """
     more = max(height - STANDARD_ROWS, 0) // len(CURVES)
     wide = width - 2
-    parts = (
-        _head(seen, wide),
-        _curves(seen, wide, max(more, 1), is_apart=more > 0),
-        _timing(seen.status, wide),
-        _codes(seen, wide),
-    )
-    return Padding(Group(*(line for part in parts for line in (part, Text()))), (0, 1))
+    head, curves = _head(seen, wide), _curves(seen, wide, max(more, 1), is_apart=more > 0)
+    timing, codes = _timing(seen.status, wide), _codes(seen, wide)
+    whole = _below_each_other(head, curves, timing, codes)
+    is_cut = len(Console(width=width).render_lines(whole)) > height
+    return _below_each_other(head, curves, codes, timing) if is_cut else whole
+
+
+def _below_each_other(*parts: RenderableType) -> RenderableType:
+    return Padding(Group(*[line for part in parts for line in (Text(), part)][1:]), (0, 1))
 
 
 def _head(seen: Seen, width: int) -> Text:
@@ -86,13 +88,13 @@ def _head(seen: Seen, width: int) -> Text:
     Over SILENT_S it says, too, how long nothing was heard.
     """
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
-    state = printable(newest.operating_state)
+    state, is_silent = printable(newest.operating_state), seen.silent_s > SILENT_S
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
     head = Text.assemble(
-        (f" {state} ", STATE_STYLES.get(state, "reverse")),
+        (f" {state} ", "reverse" if is_silent else STATE_STYLES.get(state, "reverse")),
+        *([(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")] if is_silent else []),
         (f"  {', '.join(flags)}", "" if newest.is_homed else "yellow"),
         torque(newest.measured_cf, status.roller_radius_mm),
-        *([(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")] if seen.silent_s > SILENT_S else []),
         no_wrap=True,
         overflow="ellipsis",
     )
@@ -236,14 +238,16 @@ def columns(
 
 
 def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
-    """Return the range of all known values, widened to `least` so that noise does not look like a signal; 0..least for
-    none."""
+    """Return the range of all known values, widened to `least` so that noise does not look like a signal.
+
+    It is not widened below 0, and 0..least for none.
+    """
     known = [value for value in values if value is not None]
     if not known:
         return 0.0, least
     low, high = min(known), max(known)
     wider = max(least - (high - low), 0.0) / 2.0
-    return low - wider, high + wider
+    return (0.0, least) if low >= 0.0 > low - wider else (low - wider, high + wider)
 
 
 def sparkline(values: Sequence[float | None], low: float, high: float, rows: int) -> list[str]:

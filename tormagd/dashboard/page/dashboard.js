@@ -198,6 +198,12 @@ function show(frame) {
   showPortrait();
 }
 
+// what was true before is no longer green
+function showSilence(why) {
+  at("silence").textContent = why;
+  at("state").className = "";
+}
+
 function live() {
   const events = new EventSource("live");
   const on = (name, act) => events.addEventListener(name, (event) => act(JSON.parse(event.data)));
@@ -230,9 +236,9 @@ function live() {
   });
   on("portrait", (told) => { portrait = told.portrait; });
   on("silence", ({seconds: silent_s, why}) => {
-    at("silence").textContent = `nothing heard for ${silent_s.toFixed(0)} s ${why}`;
+    showSilence(`nothing heard for ${silent_s.toFixed(0)} s ${why}`);
   });
-  events.onerror = () => { at("silence").textContent = "tormagctl dashboard has ended, or restarts"; };
+  events.onerror = () => showSilence("tormagctl dashboard has ended, or restarts");
 }
 
 // ---- a recording
@@ -272,12 +278,13 @@ function recording() {
   }, [overview.t_s, overview.low_N, overview.high_N]);
 
   async function seek(at_s) {
-    slider.value = at_s;
-    const marked = overview.marks.filter(([mark_s]) => mark_s <= slider.value && mark_s > slider.value - about.shown_s);
-    at("moment").textContent = [`${Number(slider.value).toFixed(2)} of ${duration_s.toFixed(2)} s`,
+    at_s = Number(at_s);
+    slider.value = at_s;  // it rounds to its steps, and a fault may begin between two
+    const marked = overview.marks.filter(([mark_s]) => mark_s <= at_s && mark_s > at_s - about.shown_s);
+    at("moment").textContent = [`${at_s.toFixed(2)} of ${duration_s.toFixed(2)} s`,
       ...marked.map(([mark_s, text]) => `${mark_s.toFixed(2)} s: ${text}`)].join("; ");
     strip.redraw(false, false);
-    const number = ++asked, frame = await (await fetch(`frame?at_s=${slider.value}`)).json();
+    const number = ++asked, frame = await (await fetch(`frame?at_s=${at_s}`)).json();
     if (number !== asked) return;  // a newer one is on its way
     for (const name of Object.keys(kept)) kept[name] = frame[name];
     show(frame);
