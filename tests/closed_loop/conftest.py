@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 
+import msgspec
 import pytest
 
 from tormagd.assembly.build import Core, build_core
@@ -48,10 +49,14 @@ def make(core: Core) -> Maker:
 
 @pytest.fixture(scope="session")
 def arm(make: Maker) -> Maker:
-    """A loop that is armed, at the open gap."""
+    """A loop that is armed, at the open gap. Its device was left open: the way home is short."""
 
-    def armed(*plant_and_hand: object, planned: bool = True, **options: object) -> ClosedLoop:
-        loop = make(*plant_and_hand, planned=planned, **options)
+    def armed(
+        plant: str | PlantParameters = "sample_1", *hand: Hand, planned: bool = True, **options: object
+    ) -> ClosedLoop:
+        parameters = load_plant(plant) if isinstance(plant, str) else plant
+        left_open = msgspec.structs.replace(parameters.assumed, start_left_mm=47.0, start_right_mm=46.5)
+        loop = make(msgspec.structs.replace(parameters, assumed=left_open), *hand, planned=planned, **options)
         loop.arm(None if planned else gap_plan(OPEN_MM))
         return loop
 

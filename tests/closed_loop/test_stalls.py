@@ -89,7 +89,7 @@ def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedL
     assert integrals[2] == pytest.approx(before, abs=0.02)
 
 
-@pytest.mark.parametrize("stall_ms", SHORT_MS)
+@pytest.mark.parametrize("stall_ms", [8, 47])
 def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int, render) -> None:
     """Half way up a step the device goes on with the duty it has. No more than that comes of it."""
     render(holding, 1.7, 0.08)
@@ -124,14 +124,14 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
     )
 
 
-@pytest.mark.parametrize("stop_ms", SHORT_MS)
+@pytest.mark.parametrize("stop_ms", [4, *SHORT_MS[1:]])
 def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(
     holding: ClosedLoop, stop_ms: int, render
 ) -> None:
     holding.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
     samples = render(holding, FORCE_N, 0.6)
     assert samples[-1].safety.faults == ()
-    assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 5)
+    assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 4)
     assert Limit.HOST_STALL not in limits_of(samples)
     assert max(abs(sample.truth.force_N - FORCE_N) for sample in samples) < ALLOWED_N
 
