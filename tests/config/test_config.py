@@ -219,7 +219,7 @@ INNER = st.sampled_from(
 )
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(tables=st.dictionaries(KEYS, st.one_of(SCALARS, st.dictionaries(INNER, SCALARS, max_size=3)), max_size=3))
 def test_whatever_stands_in_the_file_is_taken_or_refused_as_a_configuration(write, tables: dict[str, object]) -> None:
     lines = [f"{key} = {_toml(value)}" for key, value in tables.items()]

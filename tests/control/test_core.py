@@ -376,7 +376,6 @@ def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_
 
 
 @pytest.mark.long
-@settings(max_examples=60, deadline=None)
 @given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
 def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:
     """However they follow each other, held or moving; the duty right after each is none."""

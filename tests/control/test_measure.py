@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from firmware_protocol.codec import Switches
 from tormagd.control.measure import Measure
@@ -62,7 +62,6 @@ def test_a_device_clock_that_does_not_advance_gives_no_speed(look: Look, measure
     assert look(measure(6, device_time_s=device_time_s, left_mm=-6.0)) is last
 
 
-@settings(max_examples=40, deadline=None)
 @given(speed=st.floats(-40.0, 40.0), dt_s=st.floats(2e-4, 5e-3))
 def test_speeds_are_those_of_a_steady_motion(measure, speed: float, dt_s: float) -> None:
     look = Look()
@@ -115,7 +114,6 @@ def test_displacement_saturates_where_friction_is_mobilised(follow_handle) -> No
     assert [follow_handle(way).handle.displacement_mm for way in (forth, forth + back)] == [MOBILISED_MM] * 2
 
 
-@settings(max_examples=60, deadline=None)
 @given(wobble=st.lists(st.floats(-TURN_MM, 0.0), min_size=1, max_size=30))
 def test_a_wobble_below_the_threshold_is_no_reversal(follow_handle, wobble: list[float]) -> None:
     turn = follow_handle([0.0, 1.0, 3.0, *(3.0 + offset for offset in wobble)]).handle.turn
@@ -134,7 +132,6 @@ def test_slow_creep_back_is_a_reversal_in_the_end(follow_handle) -> None:
     assert follow_handle([0.0, 3.0, *steps]).handle.turn.direction == -1.0
 
 
-@settings(max_examples=60, deadline=None)
 @given(positions=st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=60))
 def test_displacement_never_leaves_its_range(follow_handle, positions: list[float]) -> None:
     handle = follow_handle(positions).handle

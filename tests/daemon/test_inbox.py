@@ -6,7 +6,7 @@ from typing import Any
 import msgpack
 import msgspec
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.config import Sources
 from tormagd.control.records import TimedSetpoint, Wall
@@ -416,7 +416,6 @@ def test_the_report_fits_into_an_answer_whatever_the_sources_call_themselves(pub
     assert msgspec.convert(decode(answer, Reply).result, SetpointReport) == report
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     events=st.lists(
         st.tuples(

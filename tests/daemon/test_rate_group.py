@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 from msgspec.structs import astuple
 
 from tormagd.daemon.rate_group import ERROR_PERIODS, HORIZON_NS, SHARES, Histogram, RateGroup
@@ -38,7 +38,6 @@ def test_before_the_first_run_everything_is_zero(group: RateGroup) -> None:
     assert set(astuple(report.lateness_us)) == set(astuple(report.exec_us)) == {0.0}
 
 
-@settings(max_examples=100, deadline=None)
 @given(values=st.lists(st.floats(0.0, 1e5), min_size=1, max_size=300))
 def test_percentiles_are_exact_to_the_width_of_their_bin(values: list[float]) -> None:
     histogram = Histogram()

@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -355,7 +355,6 @@ def through_the_wire(message: Message) -> Message:
     return decode(FUNCTION[type(message)], encode(message))
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     start=st.tuples(st.floats(-55.0, 55.0), st.floats(-55.0, 55.0), st.floats(0.0, 0.6), st.floats(0.0, 120.0)),
     moves=st.lists(

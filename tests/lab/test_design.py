@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.lab.design import optimisation
 from tormagd.lab.design.brake import Brake
@@ -67,7 +67,6 @@ def test_a_region_out_of_reach_is_not_covered_and_one_inside_is_whole(brake: Bra
         )
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     least=st.floats(0.0, 5.0),
     width=st.floats(0.01, 5.0),

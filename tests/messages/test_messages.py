@@ -6,7 +6,7 @@ from typing import Any
 import msgpack
 import msgspec
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd_client.messages import (
     MAX_DISPLACEMENT_MM,
@@ -263,13 +263,11 @@ def test_deep_nesting_is_decoded_or_refused(depth: int, one: bytes) -> None:
     assert request.command == "x"
 
 
-@settings(max_examples=300)
 @given(data=st.binary(max_size=200), kind=st.sampled_from(TYPES))
 def test_random_bytes_are_a_message_error(data: bytes, kind: type[Any]) -> None:
     refusal(data, kind)
 
 
-@settings(max_examples=120)
 @given(
     base=st.sampled_from([SETPOINT, REQUEST]),
     changes=st.dictionaries(

@@ -351,7 +351,6 @@ def test_late_carriages_set_out_sooner() -> None:
     assert told(step_N, 0.75, lag_s=0.03).force_N > told(step_N, 0.75).force_N + 1e-3
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=60), st.floats(1e-4, 1.0), st.floats(0.0, 0.03))
 def test_no_path_is_faster_than_the_gap_or_beyond_what_was_asked(
     ahead_N: list[float], spacing_s: float, lag_s: float

@@ -49,7 +49,6 @@ def continuous(motor: Motor) -> StateSpace:
     return StateSpace(a, [[motor.supply_V / inductance_H], [0.0], [0.0]], [[0.0, 0.0, 1.0]], [[0.0]])
 
 
-@settings(max_examples=60, deadline=None)
 @given(motor=motors, period_s=periods)
 def test_the_step_response_is_that_of_the_held_continuous_motor(motor: Motor, period_s: float) -> None:
     ours = zero_order_hold(motor, period_s)
@@ -62,7 +61,6 @@ def test_the_step_response_is_that_of_the_held_continuous_motor(motor: Motor, pe
     np.testing.assert_allclose(response, expected.ravel(), rtol=1e-6, atol=1e-9 * np.abs(expected).max())
 
 
-@settings(max_examples=40, deadline=None)
 @given(motor=motors)
 def test_full_speed_is_what_full_duty_comes_to(motor: Motor) -> None:
     slowest_s = max(mechanical_time_s(motor), 2e-3 * motor.inductance_mH / motor.resistance_ohm)
@@ -134,7 +132,6 @@ ENDS = {
 }
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     motor=st.builds(Motor, **{name: st.sampled_from(both) for name, both in ENDS.items()}),
     gain=st.sampled_from([5e-324, 3.6, 1_000.0]),

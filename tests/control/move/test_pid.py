@@ -96,7 +96,6 @@ def test_a_carriage_at_its_switch_closes_as_any_other() -> None:
     )
 
 
-@settings(max_examples=40, deadline=None)
 @given(position=positions, back_calculation_s=st.floats(0.01, 0.2), error=st.floats(15.0, 50.0))
 def test_back_calculation_balances_growth(position: Position, back_calculation_s: float, error: float) -> None:
     """Standing saturation comes to P / Ti + (limit - P - I) / Tt = 0, within the limit."""

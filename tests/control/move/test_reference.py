@@ -82,7 +82,6 @@ def test_a_step_takes_hardly_longer_than_its_limits_ask() -> None:
     assert ticks * DT_S < 1.3 * 2.0 * math.sqrt(1.0 / LIMITS.gap_acceleration_mm_s2)
 
 
-@settings(max_examples=60, deadline=None)
 @given(start=st.floats(60.0, 80.0), speed=st.floats(-0.8, 0.8).map(lambda share: share * LIMITS.gap_speed_mm_s))
 def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, speed: float) -> None:
     reference, target, is_limited = Reference(start), start, True
@@ -106,7 +105,6 @@ def test_being_held_back_is_said() -> None:
     assert is_limited
 
 
-@settings(max_examples=60, deadline=None)
 @given(start=gaps, target=gaps, dt_s=periods)
 @example(start=95.0, target=45.0, dt_s=1e-5)
 @example(start=95.0, target=45.0, dt_s=0.1)
@@ -148,7 +146,6 @@ def test_a_target_that_turns_is_met_where_it_turns() -> None:
     assert excess[True] < 0.1
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     references=st.lists(st.tuples(gaps, st.floats(-40.0, 40.0), periods), min_size=1, max_size=40),
     lag_s=st.floats(0.0, 0.02),
