@@ -1,11 +1,13 @@
 """The fault matrix: on either bus each fault has the name and the end that it should have."""
 
 import faults
+import msgspec
 import pytest
 from fault_matrix.cases import CAN, MATRIX, OPENS, SERIAL, Injection
 from fault_matrix.recovery import recover
 
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.parameters import PlantParameters, load_plant
 
 NAMED = {item.name: item for item in MATRIX}
 LOSING = (
@@ -63,8 +65,15 @@ JUDGED_S = 1.5
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A force is followed by then, on either device."""
-    monkeypatch.setattr(faults, "INJECTED_S", 4.2)
+    """The device was left open, and homes within 1.4 s; two seconds later a force is followed, by either."""
+
+    def left_open(name: str) -> PlantParameters:
+        plant = load_plant(name)
+        near = msgspec.structs.replace(plant.assumed, start_left_mm=47.0, start_right_mm=46.5)
+        return msgspec.structs.replace(plant, assumed=near)
+
+    monkeypatch.setattr("fault_matrix.rig.load_plant", left_open)
+    monkeypatch.setattr(faults, "INJECTED_S", 3.3)
     monkeypatch.setattr(faults, "USUAL_S", 0.6)
 
 
