@@ -131,7 +131,7 @@ def test_impossible_regions_brakes_and_speeds_are_refused(
 
 
 THESIS_SPEED_MM_S = 25.0 / 3.0
-FEW = 15
+FEW = 8
 "Generations."
 
 
@@ -142,7 +142,7 @@ def found(problem: Problem, start: Design) -> Outcome:
 
 @pytest.fixture
 def few_generations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An evolution that ends at less than a third: what it keeps only gets better."""
+    """An evolution that ends at less than a fifth: what it keeps only gets better."""
     monkeypatch.setattr(optimisation, "_GENERATIONS", FEW)
 
 

@@ -110,7 +110,7 @@ def over_loads(seed: int) -> Iterator[Case]:
         yield Case(share * max_radial_moment_Tm(elastomer, geometry), elastomer, geometry)
 
 
-@pytest.mark.parametrize(("cases", "count"), [(over_gaps, 500), (over_loads, 500)])
+@pytest.mark.parametrize(("cases", "count"), [(over_gaps, 200), (over_loads, 200)])
 def test_float64_force_and_slope_agree_with_50_digits(cases: Callable[[int], Iterator[Case]], count: int) -> None:
     admitted = 0
     for case in islice(cases(1), count):
@@ -236,7 +236,7 @@ def test_agrees_with_magpylib(magnet: CuboidMagnet) -> None:
 
 def test_agrees_with_the_published_sum_for_any_block_out_to_the_last_gap() -> None:
     rng = np.random.default_rng(1)
-    for edges_m in 10 ** rng.uniform(-3.0, 0.0, (150, 3)):
+    for edges_m in 10 ** rng.uniform(-3.0, 0.0, (60, 3)):
         width_m, depth_m, thickness_m = map(float, edges_m)
         magnet = CuboidMagnet(width_m, depth_m, thickness_m, 1.3)
         last_mm = 49.999e3 * min(width_m, depth_m, thickness_m)
