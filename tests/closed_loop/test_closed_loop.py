@@ -15,10 +15,8 @@ from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Rates
 from tormagd.control.records import TimedSetpoint
-from tormagd.exact import packed, plain
 from tormagd.lab.tactile.held import Case, hold
 from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import RefusedError
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd.simulation.hand import PressingHand, RecordedHand, ReversingHand
@@ -176,18 +174,6 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
     assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
-def test_stop_opens_and_has_to_be_cleared(armed: ClosedLoop) -> None:
-    publish(armed, lambda time_s: 1.2, 0.8)
-    armed.command("stop")
-    samples = list(armed.run(2.2))
-    assert (faults_of(samples), samples[-1].truth.gap_mm) == ((Fault.STOPPED,), pytest.approx(OPEN_MM, abs=0.3))
-    with pytest.raises(RefusedError):
-        armed.command("enable")
-    armed.command("clear-fault")
-    armed.command("enable")
-    assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
-
-
 # -- faults: those that are put into a running pulse are rows of the fault matrix --------------------------------------
 
 
@@ -202,20 +188,6 @@ def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) ->
     assert loop.device.truth.gap_mm > OPEN_MM - 2.0
 
 
-# -- repetition ----------------------------------------------------------------------------------------------------
-
-
-def trace(loop: ClosedLoop, seconds: float) -> list[bytes]:
-    return [
-        packed(plain([sample, loop.stepper, loop.planner])) for sample in published(loop, pulse_N, seconds, rate_hz=100)
-    ]
-
-
-def test_a_run_repeats_itself_and_another_seed_does_not(arm) -> None:
-    first, again, other = (trace(arm(seed=seed), 0.2) for seed in (1, 1, 2))
-    assert first == again != other
-
-
 def test_a_loop_without_a_planner_wants_plans(make) -> None:
     with pytest.raises(ValueError, match="allowed is a plan"):
         make(planned=False).tick()
@@ -224,13 +196,12 @@ def test_a_loop_without_a_planner_wants_plans(make) -> None:
 # -- the second plant, whose laws are of another form than everything that the core was made with ----------------------
 
 
-@pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_a_force_is_found_on_a_plant_of_other_structure(
-    arm: Callable[..., ClosedLoop], render: Callable[[ClosedLoop, float, float], list[Sample]], direction: float
+    arm: Callable[..., ClosedLoop], render: Callable[[ClosedLoop, float, float], list[Sample]]
 ) -> None:
     """Generous: 50 mN after two seconds and a half at each level, ten times what it is, and no more than 0.1 N over."""
     loop = arm("second")
-    for asked_N in (0.8, 2.0, 1.2) if direction > 0.0 else (2.0, 0.8, 1.6):
+    for asked_N in (0.8, 2.0, 1.2):
         samples = render(loop, asked_N, 3.0)
         assert samples[-1].safety.faults == ()
         felt_N = [sample.truth.force_N for sample in samples[-500:]]

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rendering.device_draws import drawn_device
 
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
@@ -393,23 +392,18 @@ def played(loop, waveform):
 
 
 # where a hand turns it is planned for as slow, by the model's Stribeck friction: sample 2's fades sooner
-@pytest.mark.parametrize(
-    ("plant", "mean_N", "worst_N"),
-    [(load_plant("sample_2"), 0.04, 0.065), (drawn_device(57), 0.03, 0.06)],
-    ids=["sample_2", "57"],
-)
-def test_what_is_asked_teaches_the_device(plant, mean_N: float, worst_N: float) -> None:
-    """Synthetic devices, none of which chose a constant of the learning."""
-    core = build_core(Config())
-    loop = ClosedLoop(Config(), core.stepper(), core.planner(), VirtualDevice(plant, ReversingHand(2.0), seed=5))
+def test_what_is_asked_teaches_the_device() -> None:
+    """A synthetic device, which chose no constant of the learning."""
+    core, device = build_core(Config()), VirtualDevice(load_plant("sample_2"), ReversingHand(2.0), seed=5)
+    loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
     loop.arm()
     learning, judging = lesson(Range(core.portrait.min_N, 2.0))
     assert learning.duration_s + judging.duration_s < 60.0
     played(loop, learning)
     found = judged(played(loop, judging), judging, 0.0)
     assert found["steps"] == 6
-    assert abs(found["mean_error_N"]) < mean_N
-    assert abs(found["worst_error_N"]) < worst_N
+    assert abs(found["mean_error_N"]) < 0.04
+    assert abs(found["worst_error_N"]) < 0.065
 
 
 def test_the_lesson_covers_the_range_and_nothing_else() -> None:
