@@ -59,9 +59,10 @@ def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
 
 
 def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
-    fit, is_held = observe(DeviceFit(), 1.0, 9.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
+    fit, is_held = observe(DeviceFit(1.0, 0.05), 2.0, 6.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
     assert is_held
     assert fit.scale == BOUNDS.max_scale
+    assert fit.force_N(2.0) == pytest.approx(6.0, abs=0.1), "the offset takes what is left"
 
 
 def test_force_and_model_are_each_others_inverse() -> None:

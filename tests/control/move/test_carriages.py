@@ -7,7 +7,7 @@ import pytest
 from firmware_protocol.codec import DriveMode, Switches
 from tormagd.config import Config
 from tormagd.control.move.carriages import EXCHANGE_S, MAX_ACCELERATION_SCALE
-from tormagd.control.move.motor import electrical_time_s
+from tormagd.control.move.motor import electrical_time_s, pull_V
 from tormagd.control.move.reference import APPROACH_S, CARRY_S
 from tormagd.safety.codes import Limit
 
@@ -97,6 +97,21 @@ def test_less_supply_takes_more_duty(make_bench) -> None:
     assert (duties[9.0], duties[14.5]) == pytest.approx((duties[12.0] * 12.0 / 9.0, duties[12.0] * 12.0 / 14.5))
     # a supply that is not there does not make the duty boundless
     assert duties[0.0] == duties[3.0] == pytest.approx(duties[12.0] * 2.0)
+
+
+def test_the_magnets_pull_is_fed_forward_to_open_and_not_to_close(make_bench) -> None:
+    """The carriages follow exactly, so that a duty is what their motion takes."""
+    duties: dict[float, list[float]] = {60.0: [], 46.0: []}
+    for stated_V in (0.0, 1.5):
+        for aim_mm, found in duties.items():
+            bench = make_bench(motor={"pull_V": stated_V})
+            bench.enabled(**bench.gap(48.0))
+            for _ in range(30):
+                output = bench.step(aim_mm, **bench.there)
+            found.append(output.left_duty)
+    (free, opening), (closing_free, closing) = duties.values()
+    assert opening - free == pytest.approx(pull_V(1.5, 48.0) / CONFIG.motor.supply_V, rel=0.05)
+    assert closing == closing_free < 0.0
 
 
 def test_limits_name_what_holds_back(running) -> None:

@@ -125,6 +125,12 @@ def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench
     assert bench.stepper.safety.needs_homing
 
 
+@pytest.mark.parametrize("gap_mm", [40.5, 99.5])
+def test_carriages_that_overran_a_switch_by_a_little_are_no_fault(bench, gap_mm: float) -> None:
+    bench.step(count=20, **bench.gap(gap_mm))
+    assert not bench.faults
+
+
 @pytest.mark.parametrize("switch", [Switches.LEFT_OPEN, Switches.RIGHT_OPEN])
 def test_an_open_switch_far_from_where_its_carriage_reads_is_a_fault(running, switch: Switches) -> None:
     """Counts were lost, or the switch is stuck: then nothing is driven by either."""
