@@ -125,9 +125,8 @@ def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench
     assert bench.stepper.safety.needs_homing
 
 
-@pytest.mark.parametrize("gap_mm", [40.5, 99.5])
-def test_carriages_that_overran_a_switch_by_a_little_are_no_fault(bench, gap_mm: float) -> None:
-    bench.step(count=20, **bench.gap(gap_mm))
+def test_carriages_that_overran_their_open_switches_by_a_little_are_no_fault(bench) -> None:
+    bench.step(count=20, **bench.gap(99.5))
     assert not bench.faults
 
 
