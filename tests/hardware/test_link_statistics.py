@@ -83,6 +83,16 @@ def test_an_answer_to_what_has_not_been_sent_ends_the_count(trip: RoundTrip) -> 
     assert trip.report() == known
 
 
+def test_a_status_tells_no_round_trip_of_a_drive_that_was_not_sent_or_is_not_answered_yet(trip: RoundTrip) -> None:
+    trip.drive(10, 5.0)
+    trip.state(1, 5.001)
+    trip.status(100)
+    assert trip.report() is None
+    trip.drive(11, 5.002)
+    trip.status(11)
+    assert trip.report() is None
+
+
 # -- clock ---------------------------------------------------------------------------------------------------------
 
 
