@@ -175,3 +175,17 @@ def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: f
     loop.command("disable")
     assert named_s(loop, seconds=4.0) == math.inf
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("shift_mm", [-0.6, 0.6])
+def test_a_zero_that_has_shifted_is_named_at_the_open_switch(closed: Opens, side: str, shift_mm: float) -> None:
+    """As counts that are lost, or a firmware that remembers a zero over a reset, leave it."""
+    loop = closed("serial")
+    firmware, zero = loop.simulated.firmware, f"_{side}_zero_mm"
+    setattr(firmware, zero, getattr(firmware, zero) - shift_mm)
+    held(loop, HALF_MM, 0.2)
+    assert loop.stepper.safety.faults == ()
+    loop.command("disable")
+    held(loop, CLOSED_MM, SHOULD_S + 1.0)  # behind its zero a carriage creeps
+    assert loop.stepper.safety.faults == (Fault.OUT_OF_STROKE,)

@@ -53,7 +53,7 @@ from tormagd.control.move.opening import Opening
 from tormagd.control.move.pid import Pid
 from tormagd.control.move.reference import Reference, Speeds, follow, target_of
 from tormagd.control.move.watch import Watch
-from tormagd.control.plausible import is_outside, leap_between
+from tormagd.control.plausible import is_contradicted, is_outside, leap_between
 from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.sight import Sight
 from tormagd.hardware.link import DeviceLink
@@ -225,7 +225,7 @@ def plausible(_: object, draw: Draw) -> object:
     one, other = measured(draw), measured(draw)
     leap = leap_between(one, other, 8.0, draw.now_s, draw.bounded(draw.now_s))
     is_back = leap is not None and leap.has_come_back(one, 8.0, draw.now_s)
-    return [leap, is_back, is_outside(other, 45.0, 95.0, False, False)]
+    return [leap, is_back, is_outside(other, 45.0, 95.0), is_contradicted(other, 0, 45.0, 95.0)]
 
 
 # -- believe -------------------------------------------------------------------------------------------------------

@@ -176,6 +176,15 @@ MATRIX = (
         is_driven=False,
     ),
     Injection(
+        "homing: left open switch stuck",
+        ("HOMING",),
+        STAYS,
+        "switch_stuck_left",
+        within_ms=6_000.0,
+        excitation=HOMING,
+        is_driven=False,
+    ),
+    Injection(
         "first motion the wrong way",
         ("WRONG_DIRECTION",),
         OPENS,

@@ -1,7 +1,9 @@
-"""Plausibility of the encoders: no step faster than any motor, no place outside the stroke."""
+"""Plausibility of encoders and end switches: no step faster than any motor, no place that is none, no switch against
+its place."""
 
 from typing import Final, final
 
+from firmware_protocol.codec import Switches
 from firmware_protocol.value import Value
 from tormagd.control.records import Measured
 
@@ -13,6 +15,17 @@ OVERRUN_MM: Final = 2.5
 "A carriage may overrun its switches, and be found beyond the closed end, by less than this."
 CLOSED_END_MM: Final = 45.0
 "The device's smallest gap. A scene that closes less far may begin with carriages that another scene has left closer."
+OPEN_SWITCH_MM: Final = 0.4
+"An open switch changes this near the zero that homing found there to 0.3 mm."
+CLOSED_SWITCH_MM: Final = 1.0
+"A closed switch closes this near the closed end: the stroke is known to 2 %."
+TOLD_S: Final = 0.02
+"The place of a carriage is up to this much older, or newer, than the word of its switches."
+
+_LEFT_OPEN: Final = int(Switches.LEFT_OPEN)
+_RIGHT_OPEN: Final = int(Switches.RIGHT_OPEN)
+_LEFT_CLOSED: Final = int(Switches.LEFT_CLOSED)
+_RIGHT_CLOSED: Final = int(Switches.RIGHT_CLOSED)
 
 
 @final
@@ -70,14 +83,41 @@ def leap_between(
     return Leap(now_s, left_mm, right_mm, within_s, last.left_mm, last.right_mm)
 
 
-def is_outside(measured: Measured, closed_mm: float, open_mm: float, is_left_open: bool, is_right_open: bool) -> bool:
+def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
     """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`.
 
-    A place more than OVERRUN_MM outside the stroke is impossible, and NaN. So is one as far from the open end while the
-    carriage's open switch is closed (`is_left_open`, `is_right_open`). A `closed_mm` over CLOSED_END_MM counts as that.
+    A place more than OVERRUN_MM outside the stroke is impossible, and NaN. A `closed_mm` over CLOSED_END_MM counts as
+    that.
     """
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
-    home_mm = open_mm / 2.0 - OVERRUN_MM
-    left_min_mm = home_mm if is_left_open else min_mm
-    right_min_mm = home_mm if is_right_open else min_mm
-    return not (left_min_mm <= measured.left_mm <= max_mm and right_min_mm <= measured.right_mm <= max_mm)
+    return not (min_mm <= measured.left_mm <= max_mm and min_mm <= measured.right_mm <= max_mm)
+
+
+def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm: float) -> bool:
+    """Tell whether an end switch of a homed device contradicts its carriage's place, for gaps from `closed_mm` to
+    `open_mm`.
+
+    `switches` are bits of `Switches`, of about the time of `measured`. An open switch is to be closed at the open end,
+    and only there. A closed switch is to be closed near the closed end only: no scene goes on to it.
+    """
+    inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
+    is_open, is_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0
+    if _is_contradicted(measured.left_mm, measured.left_mm_s, is_open, is_closed, inner_mm, home_mm):
+        return True
+    is_open, is_closed = switches & _RIGHT_OPEN != 0, switches & _RIGHT_CLOSED != 0
+    return _is_contradicted(measured.right_mm, measured.right_mm_s, is_open, is_closed, inner_mm, home_mm)
+
+
+def _is_contradicted(
+    at_mm: float, speed_mm_s: float, is_open: bool, is_closed: bool, inner_mm: float, home_mm: float
+) -> bool:
+    """Tell whether a carriage at `at_mm` contradicts its open or its closed switch, closed where `is_open` or
+    `is_closed`.
+
+    The open end is at `home_mm`. The closed switch may be closed up to `inner_mm`.
+    """
+    moved_mm = TOLD_S * abs(speed_mm_s)
+    if is_closed and at_mm > inner_mm + moved_mm:
+        return True
+    near_mm = OPEN_SWITCH_MM + moved_mm
+    return at_mm < home_mm - near_mm if is_open else at_mm > home_mm + near_mm

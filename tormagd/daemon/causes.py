@@ -93,7 +93,8 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
         Fault.STATUS_STALE: f"for {(stepper.time_s - measurement.reported_s) * 1e3:.0f} ms",
         Fault.LINK_DEGRADED: str(measurement.link),
         Fault.CLOCK: f"by {measurement.link.clock_drift:+.1%}",
-        Fault.OUT_OF_STROKE: f"left {measurement.left_mm:.1f} mm, right {measurement.right_mm:.1f} mm from home",
+        Fault.OUT_OF_STROKE: f"left {measurement.left_mm:.1f} mm, right {measurement.right_mm:.1f} mm from home, where "
+        f"the switches say {measurement.switches.name}",
         **({} if leap is None else {Fault.ENCODER: str(leap)}),
         **dict.fromkeys(homing.faults, str(homing)),
         **dict.fromkeys(opening.faults, str(opening)),

@@ -127,7 +127,7 @@ FAULTS: dict[Fault, Explanation] = {
         "somebody gave the stop command", "tormagctl arm when it is safe to go on", Reaction.OPENING, 100.0, "at once"
     ),
     Fault.HOST_STALL: Explanation(
-        "the control loop stood still for longer than the device waits, and the device opened the gap by itself",
+        "the control loop stood still for longer than the device waits, 50 ms, and the device opened the gap by itself",
         "run `tormagctl doctor`; look for load on this machine; then `tormagctl arm`",
         Reaction.OPENING,
         51.0,
@@ -157,7 +157,7 @@ FAULTS: dict[Fault, Explanation] = {
         "at once",
     ),
     Fault.WRONG_DIRECTION: Explanation(
-        "a carriage moved the other way than it was driven",
+        "a carriage moved the other way than it was driven, for 0.1 s, or for 3 mm while it homed",
         "swap the two wires of its motor, or the two phases of its encoder; do not enable before homing opens the gap",
         Reaction.OPENING,
         200.0,
@@ -189,7 +189,7 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_THERE,
     ),
     Fault.DEVICE_COMMAND_TIMEOUT: Explanation(
-        "the device heard no valid drive command in time and opened the gap",
+        "the device heard no valid drive command for 50 ms and opened the gap",
         "tormagctl arm",
         Reaction.OPENING,
         51.0,
@@ -198,7 +198,7 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_OVERCURRENT: Explanation(
         "a motor drew more current than allowed",
-        "look for a blocked carriage, then `tormagctl arm`",
+        "look for a blocked carriage, and while it homes for a dead or swapped open switch; then `tormagctl arm`",
         Reaction.OPENING,
         500.0,
         "while a blocked carriage is driven",
@@ -206,14 +206,14 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_END_STOP: Explanation(
         "a carriage reached its closed end stop",
-        "tormagctl arm",
+        "where none was near it, check switch and encoder; then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
         "at once",
         Position.LOST_THERE,
     ),
     Fault.DEVICE_SKEW: Explanation(
-        "the device saw its carriages apart",
+        "the device saw its carriages over 2 mm apart",
         "look for a blocked carriage, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
@@ -238,14 +238,14 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.DEVICE_RETRACT_FAILED: Explanation(
         "the device could not open the gap",
-        "remove the insert by hand; check motors and supply",
+        "remove the insert by hand; check motors, open switches and supply",
         Reaction.HELD,
         6000.0,
         "while it opens",
         Position.LOST_THERE,
     ),
     Fault.HOMING: Explanation(
-        "homing took too long, or ended without having found both switches",
+        "homing took over 12 s, missed a switch, or backed off from one that stays closed",
         "check the open switches and the screws, then `tormagctl arm`",
         Reaction.OPENING,
         12100.0,
@@ -253,7 +253,7 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.ENCODER: Explanation(
-        "an encoder moved faster than any motor can: it has lost or invented counts",
+        "an encoder moved three times as fast as any motor can: it has lost or invented counts",
         "check the encoder's cable and screen, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
@@ -261,8 +261,8 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.OUT_OF_STROKE: Explanation(
-        "a homed carriage reads an impossible position, or one far from the switch that it closes: counts were lost, "
-        "homing found a wrong zero, or a switch is stuck",
+        "a homed carriage reads a place over 2.5 mm outside the stroke, or over 0.4 mm from what its switch says. "
+        "Counts were lost, homing found a wrong zero, or a switch is stuck, dead or swapped",
         "check switches and encoders, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
@@ -270,28 +270,28 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.MEASUREMENT_STALE: Explanation(
-        "the device fell silent, or its states came too late to close the loop",
+        "no state came for `device.measurement_timeout_ms`, 50 ms, or they came too late to close the loop",
         "check cable and supply, and the round trip in `tormagctl firmware`; then `tormagctl arm`",
         Reaction.OPENING,
         52.0,
         "at once; 50 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.SENSE_STALE: Explanation(
-        "the device sends no Sense any more: force and handle are not measured, and the scene needs them",
+        "the device sends no Sense for 100 ms: force and handle are not measured, and the scene needs them",
         "look at the firmware and at `refused` in `tormagctl firmware`; then `tormagctl arm`",
         Reaction.OPENING,
         102.0,
         "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.STATUS_STALE: Explanation(
-        "the device sends no Status any more: its faults, switches and supply are not known",
+        "the device sends no Status for 100 ms: its faults, switches and supply are not known",
         "look at the firmware and at `refused` in `tormagctl firmware`; then `tormagctl arm`",
         Reaction.OPENING,
         102.0,
         "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.LINK_DEGRADED: Explanation(
-        "the answers of the device come so late that the position loop would swing",
+        "the device answers so late that the position loop would swing: over 0.8 of what it bears, 11 ms at 1 kHz",
         "look at the round trip in `tormagctl firmware`: a USB adapter's latency timer (`tormagctl doctor`), a hub, "
         "a full bus; then `tormagctl arm`",
         Reaction.OPENING,
@@ -299,14 +299,14 @@ FAULTS: dict[Fault, Explanation] = {
         "over some round trips",
     ),
     Fault.CLOCK: Explanation(
-        "the device's clock runs far too fast or too slow, or stands: no speed and no timeout of its is what it says",
+        "the device's clock is off by over 10 %, or stands: no speed and no timeout of its is what it says",
         "check the firmware's timer and its clock source; then `tormagctl arm`",
         Reaction.OPENING,
         4000.0,
         "over some seconds",
     ),
     Fault.SKEW: Explanation(
-        "the two carriages moved apart from each other",
+        "the two carriages are over `limits.skew_fault_mm` apart, 1 mm",
         "look for dirt or wear on the slower screw, then `tormagctl arm`",
         Reaction.OPENING,
         100.0,
@@ -314,7 +314,7 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.FOLLOWING_ERROR: Explanation(
-        "the gap did not follow its reference",
+        "the gap did not follow its reference for `limits.following_time_s`, 0.25 s",
         "look for something that blocks a carriage, then `tormagctl arm`",
         Reaction.OPENING,
         1000.0,
@@ -322,21 +322,21 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.OVER_FORCE: Explanation(
-        "the measured force stayed over what the scene allows; the gap opens at the device's own bounded speed",
+        "on a brake the measured force stayed over 1.25 times the scene's most_N, and 0.1 N, for 100 ms",
         "compare force sensor and gap: is it the insert and the model that the scene names? Then `tormagctl arm`",
         Reaction.OPENING,
         150.0,
         "while the handle moves",
     ),
     Fault.SENSOR: Explanation(
-        "the force sensor reads what no believable device gives at this gap, and the scene needs it",
+        "over 2 s of sliding the force sensor read what no believable device gives, and the scene needs it",
         "check sensor, cable and zero, and that the insert is the scene's; then `tormagctl arm`",
         Reaction.OPENING,
         3000.0,
         "over 2 s of sliding",
     ),
     Fault.NO_MOTION: Explanation(
-        "a carriage away from its open end was driven and its encoder did not move",
+        "a carriage not at its open switch was driven for `limits.no_motion_time_s`, 60 ms, and its encoder stood",
         "look for a block or a loose encoder, then `tormagctl arm`",
         Reaction.OPENING,
         250.0,
@@ -344,7 +344,7 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.NOT_OPENING: Explanation(
-        "the gap is to be open, and a carriage did not begin, stopped, went back or was slower than the device says",
+        "the gap is to be open, and a carriage that stood, went back or was slower than the device says is 0.35 s late",
         "the insert still brakes: remove it by hand; check screws, motors and supply, then `tormagctl arm`",
         Reaction.HELD,
         500.0,
@@ -534,28 +534,28 @@ LIMITS: dict[Limit, Explanation] = {
         "while a carriage is driven",
     ),
     Limit.SKEW: Explanation(
-        "the carriages are further apart than usual",
+        "the carriages are over `limits.skew_warning_mm` apart",
         "look at the slower screw",
         Reaction.HELD,
         100.0,
         "while a carriage moves",
     ),
     Limit.HOST_STALL: Explanation(
-        "the control loop stood still for some milliseconds; then the gap was held until the device had answered",
+        "the control loop stood still for 5 to 50 ms; then the gap was held until the device had answered",
         "run `tormagctl doctor`; look for load on this machine",
         Reaction.HELD,
         51.0,
         "once the loop runs again",
     ),
     Limit.DEVICE_SILENT: Explanation(
-        "the device has sent no new state for some milliseconds; the gap is held until it does",
+        "the device has sent no new state for 5 to 50 ms; the gap is held until it does",
         "look at the round trip in `tormagctl firmware`",
         Reaction.HELD,
         51.0,
         "at once",
     ),
     Limit.SENSE_STALE: Explanation(
-        "the device sends no Sense: force and handle are not measured, and nothing is learned",
+        "the device sends no Sense for 20 ms: force and handle are not measured, and nothing is learned",
         "look at the firmware and at `refused` in `tormagctl firmware`",
         Reaction.HELD,
         51.0,
@@ -569,7 +569,7 @@ LIMITS: dict[Limit, Explanation] = {
         "at once",
     ),
     Limit.LINK_DEGRADED: Explanation(
-        "the wire loses or damages messages, or takes so long that little is left of the loop's margin",
+        "the wire loses or damages over 2 % of the messages, or takes over 0.4 of what the loop bears, 6 ms at 1 kHz",
         "check cable, termination and adapter; look at the link in `tormagctl firmware`",
         Reaction.HELD,
         1000.0,

@@ -68,6 +68,18 @@ def test_a_carriage_that_closes_is_named_before_it_has_gone_far(home: Home, left
     assert "back towards closed" in str(home.homing)
 
 
+@pytest.mark.parametrize("mode", [DeviceMode.HOMING, DeviceMode.LATCHED])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_carriage_that_closes_with_its_open_switch_closed_has_a_switch_that_is_stuck(
+    home: Home, side: str, mode: DeviceMode
+) -> None:
+    stuck = {"switches": Switches[f"{side.upper()}_OPEN"], "faults": DeviceFault.HOMING_FAILED}
+    for mm in range(round(BACKS_OFF_MM) + 1):
+        home.look(**stuck, **{f"{side}_mm": -8.0 - mm})
+    home.look(**stuck, mode=mode, **{f"{side}_mm": -8.1 - mm})
+    assert home.faults[0] is Fault.HOMING
+
+
 def test_a_firmware_that_gives_up_on_the_wrong_way_is_asked_which_way_it_went(home: Home) -> None:
     home.travel(-1.0, 0.4)
     assert not home.faults

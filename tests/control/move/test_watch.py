@@ -126,14 +126,29 @@ def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench
 
 
 def test_carriages_that_overran_their_open_switches_by_a_little_are_no_fault(bench) -> None:
-    bench.step(count=20, **bench.gap(99.5))
+    bench.step(count=20, switches=Switches.HOMED | Switches.LEFT_OPEN | Switches.RIGHT_OPEN, **bench.gap(99.5))
     assert not bench.faults
 
 
-@pytest.mark.parametrize("switch", [Switches.LEFT_OPEN, Switches.RIGHT_OPEN])
-def test_an_open_switch_far_from_where_its_carriage_reads_is_a_fault(running, switch: Switches) -> None:
-    """Counts were lost, or the switch is stuck: then nothing is driven by either."""
-    assert running.run_into(Fault.OUT_OF_STROKE, switches=Switches.HOMED | switch) == 1
+@pytest.mark.parametrize("side", ["LEFT", "RIGHT"])
+@pytest.mark.parametrize(
+    ("switch", "borne_mm", "wrong_mm"),
+    [
+        ("OPEN", -0.35, -0.45),
+        ("", 0.35, 0.45),  # the open switch is dead, or the zero has shifted
+        ("CLOSED", -24.0 - 0.05, -24.0 + 0.05),
+    ],
+)
+def test_a_switch_that_its_carriage_contradicts_is_a_fault(
+    bench, side: str, switch: str, borne_mm: float, wrong_mm: float
+) -> None:
+    """Counts were lost, the zero is wrong, or the switch is stuck, dead or another's."""
+    other_mm = f"{'right' if side == 'LEFT' else 'left'}_mm"
+    mm, switches = f"{side.lower()}_mm", Switches.HOMED | (Switches[f"{side}_{switch}"] if switch else Switches(0))
+    bench.step(count=50, switches=switches, **{mm: borne_mm, other_mm: -20.0})
+    assert not bench.faults
+    # a carriage that moves is at another place by the next Status
+    assert 1 < bench.run_into(Fault.OUT_OF_STROKE, switches=switches, **{mm: wrong_mm, other_mm: -20.0}) <= 20
 
 
 def test_a_switch_that_is_newer_than_the_position_says_nothing(running) -> None:

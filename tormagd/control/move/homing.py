@@ -105,9 +105,8 @@ class Homing:
     def _follow(self, now_s: float, measurement: Measurement) -> None:
         """Watch a homing that goes on, and set the first fault that shows; else leave `faults`.
 
-        In this order: WRONG_DIRECTION, HOMING after LONGEST_S, OVER_FORCE after OVER_S of too much force, STATUS_STALE.
-        The first is of a carriage over BACKS_OFF_MM towards closed from where it was most open. That counts from the
-        beginning, and again from when the device sets its zero.
+        In this order: `_went_back` over BACKS_OFF_MM, HOMING after LONGEST_S, OVER_FORCE after OVER_S of too much
+        force, STATUS_STALE.
         """
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
@@ -116,7 +115,7 @@ class Homing:
         self.over_s = self.over_s + (now_s - self.time_s) if abs(measurement.force_N) > self.max_N else 0.0
         self.time_s = now_s
         if max(self.went_back_mm) > BACKS_OFF_MM:
-            self.faults = (Fault.WRONG_DIRECTION,)
+            self.faults = (self._went_back(BACKS_OFF_MM, measurement),)
         elif now_s - self.began_s > LONGEST_S:
             self.faults = (Fault.HOMING,)
         elif self.over_s > OVER_S:
@@ -128,7 +127,7 @@ class Homing:
         """Judge a homing that has ended, and set `faults`; it is done, given up, or ended by a request to open.
 
         A homed device that has not shown both open switches has the fault HOMING. One that latched after a carriage
-        went over WENT_BACK_MM towards closed has WRONG_DIRECTION. Others have none.
+        went over WENT_BACK_MM towards closed has that of `_went_back`. Others have none.
         """
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN
@@ -136,7 +135,18 @@ class Homing:
             if self.switches != _BOTH_OPEN:
                 self.faults = (Fault.HOMING,)
         elif measurement.is_latched and max(self.went_back_mm) > WENT_BACK_MM:
-            self.faults = (Fault.WRONG_DIRECTION,)
+            self.faults = (self._went_back(WENT_BACK_MM, measurement),)
+
+    def _went_back(self, most_mm: float, measurement: Measurement) -> Fault:
+        """Return the fault of a carriage that has gone over `most_mm` towards closed from where it was most open.
+
+        HOMING where its open switch is closed there: the device believes a switch that is stuck, or another's. Else
+        WRONG_DIRECTION. The way counts from the beginning, and again from when the device sets its zero.
+        """
+        left_mm, right_mm = self.went_back_mm
+        is_left_stuck = left_mm > most_mm and measurement.is_left_open
+        is_right_stuck = right_mm > most_mm and measurement.is_right_open
+        return Fault.HOMING if is_left_stuck or is_right_stuck else Fault.WRONG_DIRECTION
 
 
 def _outermost_mm(outermost_mm: float, last_mm: float, now_mm: float) -> float:

@@ -7,7 +7,7 @@ from firmware_protocol.codec import DeviceMode
 from tormagd.config import Config
 from tormagd.control.believe.strength import SCALE_SD
 from tormagd.control.move.motor import delay_margin_s
-from tormagd.control.plausible import Leap, is_outside
+from tormagd.control.plausible import Leap, is_contradicted, is_outside
 from tormagd.control.records import Measured
 from tormagd.control.sight import Sight, unsensed_s
 from tormagd.hardware.measurement import Measurement
@@ -146,10 +146,12 @@ class Watch:
             if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
                 faults.append(Fault.ENCODER)
         elif measured.is_homed and not safety.needs_homing:
-            # switches come with Status: without a new State, positions are older than the switches
-            is_left_open = not sight.is_blind and measurement.is_left_open
-            is_right_open = not sight.is_blind and measurement.is_right_open
-            if is_outside(measured, self._closed_mm, self._open_mm, is_left_open, is_right_open):
+            # switches come with Status: an older Status, or an older State, is of another place
+            is_told = not sight.is_blind and measurement.reported_s >= measurement.received_s
+            switches: int = measurement.switches
+            if is_outside(measured, self._closed_mm, self._open_mm) or (
+                is_told and is_contradicted(measured, switches, self._closed_mm, self._open_mm)
+            ):
                 faults.append(Fault.OUT_OF_STROKE)
         if safety.is_driven:
             faults += self._of_link(now_s, measurement, sight)
