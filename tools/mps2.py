@@ -1,8 +1,8 @@
 """The firmware on an emulated Cortex-M4, in virtual time: its figures, and the pulse of `make run` beside what the same
 sources do on this computer.
 
-Instructions are those that QEMU has executed, to 40 in a wake, and no cycles: a Cortex-M4 takes one or more for each,
-and waits for its flash. The emulated UART takes any byte at once, so no baud rate is overrun.
+Instructions are those that QEMU has executed, to 40 in a wake, and no cycles: a Cortex-M4 takes one or more for each.
+The emulated UART takes any byte at once, so no baud rate is overrun.
 """
 
 import argparse
