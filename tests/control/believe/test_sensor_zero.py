@@ -13,6 +13,7 @@ from tormagd.control.believe.sensor_zero import (
     MAX_ZERO_N,
     TARED_SD_N,
     UNKNOWN_SD_N,
+    Level,
     SensorZero,
 )
 
@@ -99,6 +100,14 @@ def test_levels_that_say_nothing_are_not_compared(turn: dict[str, float]) -> Non
     """Too far apart, too short, or of a sensor that is broken rather than off its zero."""
     zero, _ = strokes(**({"off_N": 0.2, "number": 2, "is_tared": False} | turn))  # type: ignore[arg-type]
     assert zero.zero_N == 0.0
+
+
+def test_a_level_is_a_mean_that_forgets() -> None:
+    level = Level(1.0, 2.0, 40.0, PERIOD_S, 0.0).heard(2.0, 4.0, 44.0, PERIOD_S, PERIOD_S)
+    assert (level.reading_N, level.model_N, level.rate_mm_s) == pytest.approx((1.5, 3.0, 42.0))
+    assert (level.heard_s, level.until_s) == (2.0 * PERIOD_S, PERIOD_S)
+    old = Level(1.0, 2.0, 40.0, 100.0 * LEVEL_S, 0.0).heard(2.0, 2.0, 40.0, PERIOD_S, PERIOD_S)
+    assert old.reading_N == pytest.approx(1.0 + PERIOD_S / LEVEL_S)
 
 
 def test_a_level_takes_its_time() -> None:
