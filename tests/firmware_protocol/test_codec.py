@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import itertools
 import json
 import math
 import random
@@ -229,14 +230,13 @@ def test_a_step_is_python_s_round_of_the_quotient(layout: Layout, data: st.DataO
     assert struct.unpack(layout.format, encode(message))[layout.signals.index(signal)] == step
 
 
-@pytest.mark.parametrize("power", [15, 16, 31, 50, 51, 52, 53, 60, 900])
-@pytest.mark.parametrize("less", [-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0, 1.5])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_wrapping_steps_are_right_where_floats_thin_out(power: int, less: float, sign: float) -> None:
+def test_wrapping_steps_are_right_where_floats_thin_out() -> None:
     scale = period(State, "device_time_s") / 65536
-    value = sign * (2.0**power + less) * scale
-    (_, _, step, _, _) = struct.unpack("<hhHBB", encode(STATE.replaced(device_time_s=value)))
-    assert step == round(value / scale) % 65536
+    powers, less = (15, 16, 31, 50, 51, 52, 53, 60, 900), (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0, 1.5)
+    for sign, power, by in itertools.product((-1.0, 1.0), powers, less):
+        value = sign * (2.0**power + by) * scale
+        (_, _, step, _, _) = struct.unpack("<hhHBB", encode(STATE.replaced(device_time_s=value)))
+        assert step == round(value / scale) % 65536, value
 
 
 def test_periods() -> None:
