@@ -119,13 +119,15 @@ class CompiledFirmware:
         self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
         library.tormag_device_init(self._device, ctypes.byref(parameters_of(plant)))
         self._output: Output = OFF
+        self._known: View | None = None
+        """What can be read of the device; None once something has happened to it."""
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         """Act on one message of the host and return what to answer; messages of a device are ignored.
 
         Raises EncodeError for a message that has no form on the wire, DecodeError for one that the C codec refuses.
         """
-        payload = encode(message)
+        payload, self._known = encode(message), None
         answer: int = _library().tormag_bridge_receive(
             self._device, time_s, FUNCTION[type(message)], payload, len(payload), seen(sensors)
         )
@@ -136,7 +138,7 @@ class CompiledFirmware:
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
         """Run one 1 kHz tick, as `Firmware.tick`: a Status every twentieth time, None otherwise. Raises EncodeError as
         `status`."""
-        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
+        payload, self._known = ctypes.create_string_buffer(MAX_PAYLOAD), None
         length: int = _library().tormag_bridge_tick(self._device, time_s, seen(sensors), payload)
         _require_sent(length, sensors)
         return _decoded(Status, payload.raw) if length else None
@@ -189,9 +191,10 @@ class CompiledFirmware:
         return self._output
 
     def _view(self) -> View:
-        view = View()
-        _library().tormag_bridge_view(self._device, ctypes.byref(view))
-        return view
+        if self._known is None:
+            self._known = View()
+            _library().tormag_bridge_view(self._device, ctypes.byref(self._known))
+        return self._known
 
 
 def parameters_of(plant: PlantParameters) -> CParameters:
