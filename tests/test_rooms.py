@@ -88,6 +88,7 @@ TOOL_ROOMS = {
     "extremes": set(),
     "rendering": {"machines"},
     "fault_matrix": set(),
+    "risk": {"fault_matrix"},
     "endurance": {"machines"},
     "benchmarks": {"machines", "rendering"},
 }

@@ -1,6 +1,8 @@
-"""Writes docs/states.md from the tables of `tormagd/safety`, and docs/fault-matrix.md from docs/evidence/faults.json.
+"""Writes docs/states.md from the tables of `tormagd/safety`, docs/fault-matrix.md from docs/evidence/faults.json, and
+docs/risk.html from both, the conformance kit and the test tree.
 
-Two tests hold the pages to what they are made from. `python tools/safety_pages.py` after a change of either.
+Tests hold the pages to what they are made from: `python tools/safety_pages.py` after a change. It names the risk page's
+red rows.
 """
 
 import json
@@ -9,14 +11,17 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from fault_matrix.cases import LEFT_OUT
+from risk.named_tests import named_tests
+from risk.page import page, red_rows
+from risk.rows import Row, judgement, rows
 
 from tormagd.lab.pages import table
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, Guard, OperatingState, Refusal, Transition
 
-DOCS = Path(__file__).parents[1] / "docs"
-STATES, MATRIX = DOCS / "states.md", DOCS / "fault-matrix.md"
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+STATES, MATRIX, RISK = DOCS / "states.md", DOCS / "fault-matrix.md", DOCS / "risk.html"
 EVIDENCE = DOCS / "evidence" / "faults.json"
 
 HELD = {"named": "named", "safe": "ended safe", "in_time": "reacted in their stated time", "recovered": "recovered"}
@@ -42,10 +47,20 @@ within 0.15 N.
 
 
 def main() -> int:
-    """Writes both pages."""
+    """Writes the pages, and names the red rows."""
     STATES.write_text(states_page(), encoding="utf-8")
-    MATRIX.write_text(matrix_page(json.loads(EVIDENCE.read_text(encoding="utf-8"))), encoding="utf-8")
+    record = json.loads(EVIDENCE.read_text(encoding="utf-8"))
+    MATRIX.write_text(matrix_page(record), encoding="utf-8")
+    risks = risk_rows(record)
+    RISK.write_text(page(risks), encoding="utf-8")
+    for name, missing in red_rows(risks).items():
+        print(f"red: {name}: no {', no '.join(missing)}")
     return 0
+
+
+def risk_rows(record: dict[str, Any]) -> list[Row]:
+    """The rows of the risk page, of a run of the matrix. Raises ValueError where a person judges what is no row."""
+    return rows(named_tests(ROOT / "tests"), record["figures"]["cells"], judgement(DOCS / "risk.toml"))
 
 
 def states_page() -> str:
@@ -62,13 +77,12 @@ def matrix_page(record: dict[str, Any]) -> str:
     for cell in cells:
         lines.setdefault((cell["fault"], *_outcome(cell)), []).append(cell)
     buses = Counter(fault for fault, *_ in lines)
-    rows = []
+    made = []
     for (fault, named, reaction, leads_out), alike in lines.items():
         name = fault if buses[fault] == 1 else f"{fault} ({alike[0]['bus']})"
         safe_s = [cell["seconds"] for cell in alike if cell["seconds"] is not None]
-        rows.append((name, named, reaction, f"{max(safe_s):.3f} s" if safe_s else "-", leads_out))
-    never = "\n## What is no row, and why\n\n" + table(("fault", "why"), [*LEFT_OUT.items()])
-    return _MATRIX_HEAD + says + table(("fault", "named as", "reaction", "safe after", "leads out"), rows) + never
+        made.append((name, named, reaction, f"{max(safe_s):.3f} s" if safe_s else "-", leads_out))
+    return _MATRIX_HEAD + says + table(("fault", "named as", "reaction", "safe after", "leads out"), made)
 
 
 def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:

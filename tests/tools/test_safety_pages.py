@@ -1,11 +1,15 @@
 """The pages that are made of tables and of evidence are what these make of them."""
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import pytest
 import safety_pages
 from fault_matrix.cases import MATRIX
+from risk import rows as risk
+from risk.named_tests import named_tests
+from risk.page import page as risk_page, red_rows
 
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import ROWS, Refusal
@@ -13,12 +17,25 @@ from tormagd.scenes.scene import load_scene
 
 RECORD = json.loads(safety_pages.EVIDENCE.read_text(encoding="utf-8"))
 CELLS = RECORD["figures"]["cells"]
+RISKS = safety_pages.risk_rows(RECORD)
+RED = """
+fault: PLAN_FAILED FOLLOWING_ERROR NOT_FINITE DEVICE_UNCOMMANDED_MOTION DEVICE_SCHEMA_MISMATCH DEVICE_HOMING_FAILED SKEW
+limit: CEILING TAKEOVER DEVICE_SILENT SOURCE_LOSS SOURCE_SELDOM SOURCE_LATE SOURCE_JITTER LOW_CONFIDENCE TRIM
+limit: MODEL_RANGE SENSOR_ZERO OFFSET_UNKNOWN
+cause: no_supply flood turns_round homes_shut worn_out scale real_device
+kit: overcurrent retract_failed uncommanded_motion supply temperature watchdog
+"""
+"The red rows that are known: no cell of the matrix, nothing that can be done, or a check that takes a bench."
 
 
 @pytest.mark.parametrize(
     ("page", "expected"),
-    [(safety_pages.STATES, safety_pages.states_page()), (safety_pages.MATRIX, safety_pages.matrix_page(RECORD))],
-    ids=["of the tables", "of the evidence"],
+    [
+        (safety_pages.STATES, safety_pages.states_page()),
+        (safety_pages.MATRIX, safety_pages.matrix_page(RECORD)),
+        (safety_pages.RISK, risk_page(RISKS)),
+    ],
+    ids=["of the tables", "of the evidence", "of both and the tests"],
 )
 def test_a_page_is_that_of_what_it_is_made_of(page: Path, expected: str) -> None:
     assert page.read_text(encoding="utf-8") == expected, "python tools/safety_pages.py writes it anew"
@@ -63,3 +80,53 @@ def test_what_is_seen_at_once_is_stated_so() -> None:
         assert FAULTS[fault].safe_ms == 51.0
     late = [code for code, row in FAULTS.items() if row.safe_ms > 100.0 and row.shows.startswith("at once")]
     assert late == [Fault.SENSE_STALE, Fault.STATUS_STALE], "streams that are missed after 100 ms of nothing"
+
+
+# -- risk ----------------------------------------------------------------------------------------------------------
+
+
+def test_no_row_is_red_but_those_that_are_known() -> None:
+    """Another one lost its control, its code, its tests or its evidence; or one is mended."""
+    kinds = (line.split(": ") for line in RED.split("\n") if line)
+    known = {f"{kind}.{name}" for kind, names in kinds for name in names.split()}
+    red = red_rows(RISKS)
+    assert {name: red.get(name, "no more") for name in red.keys() ^ known} == {}
+
+
+def test_a_row_that_loses_what_it_is_made_of_turns_red(monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = Fault.DEVICE_SKEW
+    monkeypatch.setattr(risk, "FAULTS", {code: row for code, row in FAULTS.items() if code is not gone})
+    monkeypatch.setattr(risk, "LIMITS_OF", {})
+    monkeypatch.setattr(risk, "MATRIX", [row for row in MATRIX if row.device != "overheated"])
+    named = named_tests(safety_pages.ROOT / "tests")
+    red = red_rows(risk.rows(named, [cell | {"safe": "CLOCK" not in cell["limits"]} for cell in CELLS], {}))
+    assert red[f"fault.{gone}"] == ("control", "code")
+    assert red["fault.DEVICE_TEMPERATURE"] == ("evidence",)
+    assert (red["limit.CLOCK"], red["limit.STALE"]) == (("hazard", "evidence"), ("hazard",))
+    assert red_rows(risk.rows({}, CELLS, {})).keys() == {row.name for row in RISKS}, "without any test"
+
+
+def test_a_test_names_what_it_uses_in_its_module(tmp_path: Path) -> None:
+    test = tmp_path / "daemon" / "test_one.py"
+    test.parent.mkdir()
+    test.write_text(
+        "def test_a(by_name):\n    assert NAMES\n\n\nNAMES = [Fault.SKEW, 'no CLOCK']\n\n\n"
+        "def by_name():\n    'Not OUT_OF_STROKE.'\n    return Limit.RATE\n\n\ndef test_b():\n    assert Fault.HOMING\n"
+    )
+    named = named_tests(tmp_path)
+    for name in ("fault.SKEW", "CLOCK", "limit.RATE", "daemon/test_one.py::test_a", "fault.HOMING"):
+        assert named[name] == Counter({"daemon/test_one.py": 1})
+    assert "OUT_OF_STROKE" not in named
+
+
+def test_a_person_judges_rows_that_there_are(tmp_path: Path) -> None:
+    judged = tmp_path / "risk.toml"
+    judged.write_text("[fault.SKEW]\nseverity = 'minor <1>'\n")
+    assert "<td>minor &lt;1&gt;</td><td></td></tr>" in risk_page(risk.rows({}, [], risk.judgement(judged)))
+    judged.write_text("[fault.SKEWED]\nprobability = 'remote'\n")
+    with pytest.raises(ValueError, match=r"fault\.SKEWED: no row"):
+        risk.rows({}, [], risk.judgement(judged))
+    for wrong in ("kind = 'x'", "severity = 3", f"severity = '{'x' * 61}'"):
+        judged.write_text(f"[fault.SKEW]\n{wrong}\n")
+        with pytest.raises(ValueError, match=r"severity|kind"):
+            risk.judgement(judged)

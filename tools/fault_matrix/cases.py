@@ -244,19 +244,3 @@ MATRIX = (
         is_driven=False,
     ),
 )
-
-
-LEFT_OUT = {
-    "motor that turns round in the middle of a run": "it is named (WRONG_DIRECTION after 31 ms), but is not safe: the "
-    "device's own opening then presses that side shut",
-    "bus-off of either node": "in virtual time it is a cable that is pulled; tests/hardware",
-    "NaN from a sensor": "the wire carries integers; tests/control",
-    "position that wraps": "every 117 mm, and carriages travel 25; tests/hardware",
-    "sensor's zero that drifts slowly": "it takes minutes and reversals; held by tests/closed_loop",
-    "flood of setpoints or requests": "what is not read is decided by sockets; tools/endure.py siege and tests/daemon",
-    "SIGKILL, SIGSTOP, SIGTERM, CPU hogs": "as far as a device can see they are silence, stalls and `disable`; with "
-    "real processes in tools/endure.py stalls and tests/end_to_end",
-    "disk full or slow": "nothing that controls writes to one; held by tests/recording",
-    "clock of the host set": "the daemon's own clock is monotonic; of a publisher's there is a row",
-}
-"""What else may fail, and why it is no row of the matrix."""

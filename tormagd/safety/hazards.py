@@ -1,0 +1,122 @@
+"""Which hazardous situation each code controls, and causes that no code names, in the terms of ISO 14971.
+
+It is written for a person who analyses the risk of a device, and certifies nothing.
+"""
+
+from typing import Final, NamedTuple
+
+from firmware_protocol.conformance.check import Hazard
+
+HARMS: Final[dict[Hazard, str]] = {
+    Hazard.SHUT: "a hand that cannot draw back what it moves",
+    Hazard.CLOSES: "a hand that is stopped in the middle of a motion, or pushes against what is not there",
+    Hazard.OPENS: "a hand that stumbles forward where it leaned against a force",
+    Hazard.MISLED: "a motion that was decided by a wrong force",
+    Hazard.WORN: "none at once; the device fails later",
+}
+"The harm that may come of each."
+FAULTS_OF: Final[dict[Hazard, str]] = {
+    Hazard.SHUT: "STOPPED HOST_STALL LINK_LOST PLAN_FAILED DEVICE_SUPPLY DEVICE_COMMAND_TIMEOUT DEVICE_RETRACT_FAILED "
+    "FOLLOWING_ERROR NO_MOTION NOT_OPENING DEVICE_NOT_RUNNING",
+    Hazard.CLOSES: "NOT_FINITE WRONG_DIRECTION DEVICE_UNCOMMANDED_MOTION LINK_DEGRADED OVER_FORCE",
+    Hazard.MISLED: "DEVICE_SCHEMA_MISMATCH DEVICE_HOMING_FAILED HOMING ENCODER OUT_OF_STROKE MEASUREMENT_STALE "
+    "SENSE_STALE STATUS_STALE CLOCK SENSOR",
+    Hazard.WORN: "DEVICE_TEMPERATURE DEVICE_OVERCURRENT DEVICE_END_STOP DEVICE_SKEW SKEW",
+}
+"The faults that control it, by their names: one that went is missed."
+LIMITS_OF: Final[dict[Hazard, str]] = {
+    Hazard.CLOSES: "OTHER_SOURCE RANGE CEILING OVER_FORCE",
+    Hazard.OPENS: "STALE TAKEOVER HOST_STALL DEVICE_SILENT ENCODER",
+    Hazard.MISLED: "SOURCE_LOSS SOURCE_SELDOM SOURCE_LATE SOURCE_JITTER LOW_CONFIDENCE TRIM MODEL_RANGE SENSOR "
+    "DEVICE_OR_SENSOR SENSOR_ZERO OFFSET_UNKNOWN HANDLE_LOST SENSE_STALE LINK_DEGRADED CLOCK",
+    Hazard.WORN: "SKEW",
+}
+"The limits that do."
+HARMLESS: Final = "NO_SETPOINT STANDBY F_MIN F_MAX RATE SATURATED"
+"Limits that tell what the device can do, and control no hazard."
+
+
+class Cause(NamedTuple):
+    """A cause that no code of its own names."""
+
+    name: str
+    hazard: Hazard
+    cause: str
+    control: str = ""
+    "What is done about it; empty: nothing can be."
+    test: str = ""
+    "A test of it, as FILE::FUNCTION within tests; empty: none."
+    cell: str = ""
+    "A row of the fault matrix that shows it; empty: none."
+
+
+CAUSES: Final = (
+    Cause("no_supply", Hazard.SHUT, "the motors have no supply: nothing opens the gap, and friction holds the force"),
+    Cause(
+        "killed",
+        Hazard.SHUT,
+        "the daemon is killed or stopped, or takes no processor time",
+        "the device opens by itself after 50 ms",
+        "end_to_end/test_daemon.py::test_a_daemon_that_is_killed_unplugged_and_ended",
+        "daemon killed or cable cut",
+    ),
+    Cause(
+        "bus_off",
+        Hazard.SHUT,
+        "a node leaves the CAN bus (bus-off)",
+        "LINK_LOST; the device opens by itself after 50 ms",
+        "hardware/test_connection.py::test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended",
+        "cable pulled: nothing goes either way",
+    ),
+    Cause(
+        "flood",
+        Hazard.SHUT,
+        "requests or setpoints come in a flood, and a stop waits",
+        "stop and disable go first; what is read is bounded",
+        "daemon/test_endpoint.py::test_a_flood_is_drained_in_bounded_portions",
+    ),
+    Cause(
+        "turns_round",
+        Hazard.CLOSES,
+        "a motor turns round in the middle of a run: WRONG_DIRECTION after 31 ms, but the device's own opening presses "
+        "that side shut",
+    ),
+    Cause(
+        "homes_shut",
+        Hazard.CLOSES,
+        "a firmware that watches no direction homes the wrong way: WRONG_DIRECTION after 3 mm, but no host can stop a "
+        "homing",
+    ),
+    Cause(
+        "worn_out", Hazard.CLOSES, "the gearbox is worn out, and the motors have no supply: the magnets close the gap"
+    ),
+    Cause(
+        "damage",
+        Hazard.OPENS,
+        "an adapter or a driver damages Sense or Status, which carry no checksum of their own",
+        "it is named as a fault of the device; no force is lost faster than in any fault",
+        "hardware/test_backends.py::test_a_damaged_line_is_counted_and_the_next_is_read",
+        "5% of the frames damaged",
+    ),
+    Cause(
+        "scale",
+        Hazard.MISLED,
+        "encoders count too much: the closed switch, which would contradict them, is never reached",
+    ),
+    Cause(
+        "clock_set",
+        Hazard.MISLED,
+        "a publisher's clock is set",
+        "its offset is estimated anew; the daemon's own is monotonic",
+        "daemon/test_inbox.py::test_a_clock_that_is_set_makes_no_setpoint_older_or_younger",
+        "publisher's clock set forward by an hour",
+    ),
+    Cause(
+        "real_device",
+        Hazard.MISLED,
+        "a real device does not keep the protocol: the firmware that runs today is the simulated one's",
+        "the conformance kit, below",
+        "firmware_protocol/test_conformance.py::test_the_c_sources_pass",
+    ),
+)
+"Every cause known that is not a code's."
