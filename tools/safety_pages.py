@@ -47,11 +47,18 @@ within 0.15 N.
 
 
 def main() -> int:
-    """Writes the pages, and names the red rows."""
-    STATES.write_text(states_page(), encoding="utf-8")
+    """Writes the pages, and names the red rows. Returns 1 where docs/risk.toml judges what is no row, or not as it may.
+
+    Nothing has been written then.
+    """
     record = json.loads(EVIDENCE.read_text(encoding="utf-8"))
+    try:
+        risks = risk_rows(record)
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 1
+    STATES.write_text(states_page(), encoding="utf-8")
     MATRIX.write_text(matrix_page(record), encoding="utf-8")
-    risks = risk_rows(record)
     RISK.write_text(page(risks), encoding="utf-8")
     for name, missing in red_rows(risks).items():
         print(f"red: {name}: no {', no '.join(missing)}")
@@ -59,7 +66,7 @@ def main() -> int:
 
 
 def risk_rows(record: dict[str, Any]) -> list[Row]:
-    """The rows of the risk page, of a run of the matrix. Raises ValueError where a person judges what is no row."""
+    """The rows of the risk page, of a run of the matrix. Raises ValueError where docs/risk.toml does not fit."""
     return rows(named_tests(ROOT / "tests"), record["figures"]["cells"], judgement(DOCS / "risk.toml"))
 
 

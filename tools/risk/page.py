@@ -1,5 +1,6 @@
 """The risk page in HTML: a table for each hazardous situation, red where something is missing."""
 
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 
@@ -65,6 +66,10 @@ def _line(row: Row) -> str:
     cells = [(name, getattr(row, name)) for name in COLUMNS]
     cells += [("", row.judged.severity), ("", row.judged.probability)]
     told = "".join(
-        f'<td class="gap">no {name}</td>' if name in row.missing else f"<td>{escape(text)}</td>" for name, text in cells
+        f'<td class="gap">no {name}</td>' if name in row.missing else f"<td>{_shown(text)}</td>" for name, text in cells
     )
     return f'<tr id="{row.name}"{" class=red" * bool(row.missing)}>{told}</tr>\n'
+
+
+def _shown(text: str) -> str:
+    return re.sub("`(.+?)`", r"<code>\1</code>", escape(text))

@@ -1,6 +1,5 @@
 """The rows of the risk page: one of each fault, limit, cause without a code, and check of the conformance kit."""
 
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from firmware_protocol.conformance.examination import CHECKS
 from risk.named_tests import Named
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation
 from tormagd.safety.hazards import CAUSES, FAULTS_OF, HARMLESS, LIMITS_OF
+from tormagd.toml_file import convert
 
 VERDICTS = ("named", "safe", "in_time", "recovered")
 KIT = "firmware_protocol/test_conformance.py"
@@ -62,8 +62,8 @@ def rows(named: Named, cells: Sequence[Mapping[str, Any]], judged: Mapping[str, 
 
 
 def judgement(path: Path) -> dict[str, Judged]:
-    """Return what a person judges, by the name of the row. Raises ValueError for another key, or a longer text."""
-    tables = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), dict[str, dict[str, Judged]])
+    """Return what a person judges, by the name of the row. Raises ConfigError naming file, key and what is allowed."""
+    tables = convert(path, dict[str, dict[str, Judged]])
     return {f"{kind}.{name}": judged for kind, table in tables.items() for name, judged in table.items()}
 
 
