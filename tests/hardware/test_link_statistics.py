@@ -83,6 +83,16 @@ def test_an_answer_to_what_has_not_been_sent_ends_the_count(trip: RoundTrip) -> 
     assert trip.report() == known
 
 
+def test_a_state_that_overtakes_the_status_of_the_drive_before_contradicts_nothing(trip: RoundTrip) -> None:
+    exchange(trip, range(1, 256), 1)
+    known = trip.report()
+    trip.state(255, 0.256)
+    trip.drive(0, 0.256)
+    trip.state(0, 0.257)
+    trip.status(255)
+    assert trip.report() == known == {"least": 1e3, "p50": 1e3, "p99": 1e3}
+
+
 def test_a_status_tells_no_round_trip_of_a_drive_that_was_not_sent_or_is_not_answered_yet(trip: RoundTrip) -> None:
     trip.drive(10, 5.0)
     trip.state(1, 5.001)
