@@ -136,13 +136,14 @@ def streams() -> Iterator[bytes]:
 
 
 def lives() -> Iterator[bytes]:
-    """Frames on a device's line. Then lives that home and run; there comes each message, or each sensor goes wrong, or
+    """Frames on a device's line. Then lives that home and run. There comes each message twice, each sensor goes wrong or
     leaps to and fro, or the host falls silent."""
     vectors = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
     for vector in vectors["valid"]:
         yield in_pieces(bytes.fromhex(vector["frame"]), 31, lambda size: size << 3 | 4)
     for vector in vectors["valid"][::3]:
-        yield ARMED + b"\x05" + bytes((vector["function"],)) + bytes.fromhex(vector["payload"]) + 2 * OPEN + 4 * WAIT
+        said = b"\x05" + bytes((vector["function"],)) + bytes.fromhex(vector["payload"])
+        yield ARMED + 2 * said + 2 * OPEN + 4 * WAIT
     for what in range(32):
         spoil = bytes((what << 3 | 2,))
         for value, other in ((b"\x00\x14", b"\x00\x0c"), (b"\xff\x7f", b"\x00\x80")):

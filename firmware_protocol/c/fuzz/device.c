@@ -254,7 +254,7 @@ static void spoil(struct world *world, unsigned int what)
         world->extra_counts[what / 16u] = value * 65536; /* as far as 32 bits go */
         break;
     case 1u:
-        world->extra_counts[what / 16u] += value;
+        world->extra_counts[what / 16u] = (int32_t)((uint32_t)world->extra_counts[what / 16u] + (uint32_t)value);
         break;
     case 2u:
         sensors->current_A[what / 16u] = value / 1000.0;
