@@ -136,8 +136,8 @@ def streams() -> Iterator[bytes]:
 
 
 def lives() -> Iterator[bytes]:
-    """Frames on a device's line. Then lives that home and run. There comes each message twice, each sensor goes wrong or
-    leaps to and fro, or the host falls silent."""
+    """Frames on a device's line. Then lives that home and run. There comes each message twice, each sensor goes wrong
+    or leaps to and fro, or the host falls silent."""
     vectors = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
     for vector in vectors["valid"]:
         yield in_pieces(bytes.fromhex(vector["frame"]), 31, lambda size: size << 3 | 4)
