@@ -42,7 +42,8 @@ def arm(client: Client, timeout_s: float) -> Outcome:
     """Have the daemon clear faults, home and enable, as far as needed, within `timeout_s`, and say each step on stderr.
 
     The outcome tells the steps `given` (none: it was armed already), state and seconds. Raises CommandError (REFUSED)
-    where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables: the gap opens.
+    where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables, and so
+    does the end of `timeout_s`: the gap opens.
     """
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))

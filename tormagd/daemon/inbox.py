@@ -429,7 +429,8 @@ def _refuse_way(setpoint: Setpoint) -> None:
 def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
     """Raise MessageError where the source's stamps do not count ns, or where this is not known yet.
 
-    Notes the stamp for this judgement, and that the source was heard at `now_s`.
+    A stamp within a day of our clock counts ns at once. Others are refused until LOOKED_AT messages show what they
+    count. Notes the stamp for this judgement, and that the source was heard at `now_s`.
     """
     unit = source.unit
     unit.hear(now_s, setpoint.stamp_ns, realtime_ns)

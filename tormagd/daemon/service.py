@@ -71,7 +71,7 @@ def status_line(
     """Return one line for `systemctl status`: the operating state with its faults, or the scene.
 
     Then comes the next command, if one is needed: `tormagctl status` with faults, `tormagctl arm` where it is not
-    homed. While the link does not run, its state, `cause` and `remedy` come instead.
+    homed. While the link does not run, its state, `cause` and `remedy` stand in place of the next command.
     """
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:

@@ -33,7 +33,10 @@ class SocketFile:
         self._identity = _identity(path)
 
     def close(self) -> None:
-        """Close the socket, and remove its path and its lock, unless others have been put in their place."""
+        """Close the socket, and remove its path and its lock, unless others have been put in their place.
+
+        Call it once.
+        """
         self.listener.close()
         if self._identity is not None and _identity(self._path) == self._identity:
             with contextlib.suppress(OSError):

@@ -81,7 +81,7 @@ class Moments:
 
 
 class Recorded:
-    """A recording with messages, for the page; times are seconds since its first message.
+    """A recording with messages, for the page; times given to it are seconds since its first message.
 
     Keeps the stretch that was read last, with its ticks and snapshots.
     """

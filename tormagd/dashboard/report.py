@@ -132,7 +132,7 @@ def _moments(codes: Codes, _lasts_s: float) -> str:
 
 
 def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each mark, its text in its recording's column."""
+    """Return a row for each mark, one recording after the other: seconds since its start, its text in its column."""
     rows = []
     for place, each in enumerate(of):
         for mark in each.overview.marks:

@@ -242,7 +242,8 @@ def summary_of(path: Path) -> tuple[Contents, Overview] | None:
 def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
     """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview.
 
-    Messages are not read. Raises UNREADABLE for damage.
+    Messages are not read. Raises any of the exceptions in UNREADABLE for damage; `readable` makes them a
+    RecordingError.
     """
     at = file.seek(0, 2) - TAIL_BYTES
     file.seek(max(0, at))

@@ -165,7 +165,8 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
 def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
     """Give the script's commands and setpoints at their times, and return what was met.
 
-    A refused command is given again for PATIENCE_S. Limits count while ENABLED or PAUSED.
+    A refused command is given again for PATIENCE_S, and those behind it wait; then it is noted in `refused`. Limits
+    count while ENABLED or PAUSED, by `period_s` a tick.
     """
     happened = Happened({}, {}, [])
     setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))

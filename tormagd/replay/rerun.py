@@ -164,7 +164,7 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
     """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first.
 
-    Raises ReplayError where no snapshot has a tick after it.
+    `records` are the ticks by their index in `entries`. Raises ReplayError where no snapshot has a tick after it.
     """
     found: int | None = None
     waiting: int | None = None

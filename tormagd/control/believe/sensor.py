@@ -127,7 +127,7 @@ class SensorTrust:
         The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1. `reading_N` is the force against this
         motion, less the sensor's zero, which is known to within `zero_sd_N`; in a dispute it counts as known. The
         model's force is `model_N`. The reading stands for `dt_s` > 0. All arguments are finite. In a dispute, updates
-        `lead_N`.
+        `lead_N` >= 0: it follows readings above the fit, by RISES_N_S at most, and else returns to 0.
         """
         if self.is_disputed:
             zero_sd_N = 0.0  # a reversal has to tell the zero first

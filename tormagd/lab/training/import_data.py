@@ -174,7 +174,11 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
 
 
 def _stated(text: str) -> tuple[str, Stated]:
-    """Return the quantity, the column's name and unit of `QUANTITY=NAME[:UNIT]`; no unit is None. Raises LabError."""
+    """Return the quantity, the column's name and unit of `QUANTITY=NAME[:UNIT]`; no unit is None.
+
+    A name with a colon needs a unit. Raises LabError for an unknown quantity, no `=`, or a unit that is not the
+    quantity's; the name is not checked.
+    """
     quantity, equals, column = text.partition("=")
     name, colon, unit = column.rpartition(":")
     if not colon:
