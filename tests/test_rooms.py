@@ -46,8 +46,11 @@ MAY_IMPORT = {
     "recording": FILES | {"following", "messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "following", "messages", "output", "recording", "safety"},
+    "commission": {"config", "control", "dashboard", "safety"},
     "ctl": FILES
     | {
+        "commission",
+        "safety",
         "command_line",
         "dashboard",
         "following",

@@ -6,28 +6,22 @@ import datetime
 import json
 import math
 import re
-import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
+from tormagd.commission import course
+from tormagd.commission.finding import Finding
 from tormagd.config import Config
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
-from tormagd.ctl import (
-    calibrate as ctl_calibrate,
-    calibrate_device,
-    calibrate_motors as ctl_calibrate_motors,
-    calibrate_run,
-)
+from tormagd.ctl import calibrate as ctl_calibrate, calibrate_device, calibrate_motors as ctl_calibrate_motors
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
-from tormagd.ctl.calibrate_device import ARRIVED_S, COLUMNS as DEVICE_COLUMNS, STEP_S, judged, lesson
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
-from tormagd.ctl.calibrate_run import Range
+from tormagd.ctl.calibrate_run import Progress, Range
 from tormagd.ctl.outcome import CommandError
 from tormagd.lab.training import calibration
 from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
@@ -38,8 +32,6 @@ from tormagd.physics.inserts import insert
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
-from tormagd_client.errors import UnreachableError
-from tormagd_client.messages import encode_ticks
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)
@@ -215,7 +207,7 @@ def test_displacement_is_what_the_daemon_calls_it():
 
 
 def test_what_ctl_may_not_import_is_equal():
-    assert (calibration.COLUMNS, calibrate_run.MOVING_MM_S) == (FILE_COLUMNS, MOVING_MM_S)
+    assert (calibration.COLUMNS, course.MOVING_MM_S) == (FILE_COLUMNS, MOVING_MM_S)
 
 
 def test_a_sweep_file_that_is_none_says_why(tmp_path):
@@ -274,17 +266,19 @@ def test_a_motor_log_with_a_hole_is_refused():
 
 
 class Played:
-    """A run whose ticks are these whatever is asked."""
+    """A run that finds this, whatever is asked."""
 
-    def __init__(self, ticks) -> None:
-        self._ticks = ticks
+    def __init__(self, found) -> None:
+        self._found = found
+        self.progress = Progress()
 
-    def wait_for_handle(self, force_N: float) -> None:
-        assert force_N > 0.6
+    def follow(self, course):
+        course.close()
+        return self._found
 
-    def play(self, waveform, bar):
+    def play(self, waveform):
         assert waveform.at(0.0).force_N > 0.6
-        return self._ticks
+        return self._found
 
 
 def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, tmp_path, monkeypatch, ctl):
@@ -304,20 +298,6 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, t
         0.001,
         30.0,
     )
-
-
-def test_ticks_of_an_enabled_device_are_waited_for_no_longer_than_stated(monkeypatch):
-    """A batch from before `enable` comes, then none: the wait is not begun again."""
-    now_s, old = [0.0], encode_ticks([(1, "DISABLED")], ("t_ns", "operating_state"))
-
-    def poll(wait_ms):
-        now_s[0] += min(wait_ms * 1e-3, 0.9)
-        return wait_ms > 900
-
-    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
-    with pytest.raises(UnreachableError, match="within 1 s"):
-        calibrate_run._drop_old(SimpleNamespace(poll=poll, recv_multipart=lambda: [old]), 1.0, "ipc://x")
-    assert now_s == [pytest.approx(1.0)]
 
 
 @pytest.mark.parametrize(
@@ -372,64 +352,11 @@ def test_a_refused_fit_is_the_commands_refusal(tmp_path):
     assert not (tmp_path / "m.safetensors").exists()
 
 
-# -- `--device`: what it asks teaches the daemon the device (in virtual time), and what it refuses ---------------------
+# -- `--device`: what becomes of its findings; tests/commission has its courses ----------------------------------------
 
 
-FORCES = Range(0.6, 2.0)
-_, JUDGING = lesson(FORCES)
-
-
-def played(loop, waveform):
-    """The ticks of one waveform, as `Run.play` gives them."""
-    start_s = loop.now_s
-    rows = [
-        (sample.time_s, sample.measured.force_N, sample.measured.handle.rate_mm_s)
-        for sample in loop.run(
-            waveform.duration_s, lambda now_s: TimedSetpoint(waveform.at(now_s - start_s).force_N, now_s, 0.25)
-        )
-    ]
-    return dict(zip(DEVICE_COLUMNS, np.array(rows).T, strict=True))
-
-
-# where a hand turns it is planned for as slow, by the model's Stribeck friction: sample 2's fades sooner
-def test_what_is_asked_teaches_the_device() -> None:
-    """A synthetic device, which chose no constant of the learning."""
-    core, device = build_core(Config()), VirtualDevice(load_plant("sample_2"), ReversingHand(2.0), seed=5)
-    loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
-    loop.arm()
-    learning, judging = lesson(Range(core.portrait.min_N, 2.0))
-    assert learning.duration_s + judging.duration_s < 60.0
-    played(loop, learning)
-    found = judged(played(loop, judging), judging, 0.0)
-    assert found["steps"] == 6
-    assert abs(found["mean_error_N"]) < 0.04
-    assert abs(found["worst_error_N"]) < 0.065
-
-
-def test_the_lesson_covers_the_range_and_nothing_else() -> None:
-    for waveform in lesson(FORCES):
-        asked = [waveform.at(t_s).force_N for t_s in np.arange(0.0, waveform.duration_s + 0.01, 0.01)]
-        assert (min(asked), max(asked)) == pytest.approx((FORCES.least_N + 0.1, FORCES.most_N), abs=0.02)
-
-
-def steps(error_N: float = 0.0, rate_mm_s: float = 40.0):
-    """Ticks of the JUDGING steps: the force arrives late, and then is off by `error_N`."""
-    time_s = np.arange(0.0, JUDGING.duration_s, 1e-3)
-    late = time_s % STEP_S < ARRIVED_S
-    asked = np.array([JUDGING.at(t_s).force_N for t_s in time_s])
-    values = (7.0 + time_s, np.where(late, 0.1, asked + error_N), np.full(len(time_s), rate_mm_s))
-    return dict(zip(DEVICE_COLUMNS, values, strict=True))
-
-
-def test_steps_are_judged_once_they_have_arrived_and_without_the_sensors_zero() -> None:
-    found = judged(steps(error_N=0.05), JUDGING, 0.02)
-    assert found["mean_error_N"] == found["worst_error_N"] == pytest.approx(0.03)
-    assert found["noise_N"] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_handle_that_hardly_moves_is_refused() -> None:
-    with pytest.raises(CommandError, match="moved in 0% of the time"):
-        judged(steps(rate_mm_s=1.0), JUDGING, 0.0)
+def finding(value_mN):
+    return Finding("steps", value_mN, 0.0, "mN", -60.0, 60.0, "look")
 
 
 @pytest.fixture
@@ -437,7 +364,9 @@ def calibrated(fake_daemon, monkeypatch, ctl):
     """Runs the command beside a daemon that says so."""
 
     def run(**status):
-        monkeypatch.setattr(calibrate_device, "armed", lambda *_: contextlib.nullcontext(Played(steps(error_N=0.01))))
+        monkeypatch.setattr(
+            calibrate_device, "armed", lambda *_: contextlib.nullcontext(Played([finding(-3.0), finding(10.0)]))
+        )
         monkeypatch.setattr(calibrate_device, "KEPT_WITHIN_S", 0.2)
         fake_daemon.says(**{"setpoint_age_ms": None, "least_N": 0.6} | status)
         return ctl(*fake_daemon.at, "--json", "calibrate", "--yes", "--device")

@@ -8,10 +8,11 @@ import pytest
 
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
+from tormagd.commission.course import Columns
 from tormagd.config import Config, load_config
 from tormagd.control.records import TimedSetpoint
 from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
-from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Columns, Range
+from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
 from tormagd.lab.motor import command, fit, identification

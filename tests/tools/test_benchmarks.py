@@ -18,9 +18,9 @@ from benchmarks.inverse_report import ROOT
 
 from firmware_protocol.c.build import BuildError
 from tormagd.assembly.build import build_core
+from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG, corner_margins
 from tormagd.config import Config, RealTime, load_config
 from tormagd.lab.told import lines
-from tormagd.lab.tune_position import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG, corner_margins
 from tormagd.scenes.scene import shipped_scenes
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.parameters import load_plant

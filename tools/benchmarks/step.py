@@ -14,12 +14,12 @@ import msgspec
 import numpy as np
 
 from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.commission.gains import corner_margins
 from tormagd.config import Config, Motor
 from tormagd.control.core import Stepper
 from tormagd.control.move.motor import margins, zero_order_hold
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.bench_sweep import gap_plan
-from tormagd.lab.tune_position import corner_margins
 from tormagd.scenes.scene import EVERY_TERM, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand

@@ -16,10 +16,11 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from tormagd.commission.course import Columns, handle_moved
 from tormagd.config import Config
 from tormagd.ctl.calibrate_device import calibrate_device
 from tormagd.ctl.calibrate_motors import calibrate_motors
-from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, Run, armed, interrupted_run, reach, seconds_bar
+from tormagd.ctl.calibrate_run import SOURCE, Range, Run, armed, interrupted_run, known_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.interrupt import interrupted_by
@@ -39,6 +40,7 @@ POLL_S = 0.2
 
 
 def calibrate_insert(
+    config: Config,
     endpoints: Endpoints,
     scene: Scene,
     insert: str,
@@ -50,20 +52,14 @@ def calibrate_insert(
     """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`.
 
     `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. Raises as `armed` and
-    `Run.play`. Raises CommandError (REFUSED) for an unknown insert, a still handle, another publisher, or a sweep or
+    `Run.follow`. Raises CommandError (REFUSED) for an unknown insert, a still handle, another publisher, or a sweep or
     fit that is not good enough. Then there is neither file.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
-        forces = reach(client, scene.force.most_N)
-        if not forces.most_N > forces.least_N:
-            raise CommandError(
-                Exit.REFUSED,
-                "no_range",
-                f"the daemon's scene ends at {forces.most_N:g} N, under the least force of {forces.least_N:g} N",
-                "run the daemon with a scene that asks for more force",
-            )
-        with armed(endpoints, client, COLUMNS, wait_s) as run:
+        known = known_of(config, client, scene.force.most_N)
+        forces = Range(known.least_N, known.most_N)
+        with armed(endpoints, client, forces.least_N) as run:
             sweeps = [_sweep(run, forces, number, rates_N_s) for number in range(len(rates_N_s))]
     with tempfile.TemporaryDirectory(prefix="tormag") as folder:
         table = Path(folder) / "sweep.csv"
@@ -81,14 +77,14 @@ def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> 
     """Tell the person how to turn the handle, wait until it moves, play one sweep, and return its ticks by COLUMNS.
 
     `number` counts from 0, and picks the rate and the pace that is asked for. Shows a progress bar. Raises as
-    `Run.wait_for_handle` and `Run.play`.
+    `Run.follow`.
     """
     waveform = up_and_down(forces, rates_N_s[number])
     label = f"sweep {number + 1} of {len(rates_N_s)}"
     print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
-    run.wait_for_handle(forces.least_N)
-    with seconds_bar(waveform.duration_s, label) as bar:
-        return run.play(waveform, bar)
+    run.follow(handle_moved(forces.least_N))
+    run.progress.begin(label, waveform.duration_s)
+    return run.play(waveform)
 
 
 def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
@@ -212,17 +208,17 @@ def calibrate(
     with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
         scene = load_scene(config.scene)
     if not is_agreed:
-        _agree()
+        agree()
     most_N = scene.force.most_N
     if out is None:
-        return calibrate_device(endpoints, most_N, wait_s)
+        return calibrate_device(config, endpoints, most_N, wait_s)
     if insert is None:
         return calibrate_motors(endpoints, most_N, out, side, wait_s)
-    return calibrate_insert(endpoints, scene, insert, out, csv, rates_N_s, wait_s)
+    return calibrate_insert(config, endpoints, scene, insert, out, csv, rates_N_s, wait_s)
 
 
-def _agree() -> None:
-    """Wait until a person presses Enter. Raises CommandError (USAGE) where stdin is no terminal."""
+def agree() -> None:
+    """Wait until a person presses Enter: the carriages may move. Raises CommandError (USAGE) without a terminal."""
     if not is_terminal(sys.stdin):
         raise usage_error("stdin is no terminal: nobody can agree to the carriages moving", "a script says --yes")
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)

@@ -10,7 +10,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, armed, reach, seconds_bar
+from tormagd.commission.course import Columns
+from tormagd.ctl.calibrate_run import SOURCE, Range, armed, reach
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd_client.blocking import Client
@@ -64,7 +65,7 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
     """Drive both carriages through `excitation`, and write the log of one to the new file `path`.
 
-    The gap opens in the end. Raises as `reach`, `armed` and `Run.play`. Raises CommandError (REFUSED) for a control
+    The gap opens in the end. Raises as `reach`, `armed` and `Run.follow`. Raises CommandError (REFUSED) for a control
     rate under MIN_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this shows only
     after the drive.
     """
@@ -78,11 +79,9 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
                 f"the daemon controls {hz:.0f} times a second: allowed for a motor log is 1000",
                 "state control_hz = 1000 under [rates] in its configuration, and start it again",
             )
-        with (
-            armed(endpoints, client, COLUMNS, wait_s) as run,
-            seconds_bar(waveform.duration_s, "motors") as bar,
-        ):
-            columns = run.play(waveform, bar)
+        with armed(endpoints, client, waveform.least_N) as run:
+            run.progress.begin("motors", waveform.duration_s)
+            columns = run.play(waveform)
     log = motor_log(columns, side)
     rows = len(log["t_s"])
     with path.open("x", newline="", encoding="utf-8") as file:

@@ -1,30 +1,29 @@
 """A calibration run through the daemon: arm, publish forces, collect control ticks, open the gap whatever happens."""
 
-import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 import zmq
-from tqdm import tqdm
 
-from tormagd.ctl.operate import require_no_fault
+from tormagd.commission.course import COLUMNS, Columns, Course, Device, Found, Heard, Row, StoppedError, drive, watch
+from tormagd.commission.known import Known
+from tormagd.commission.of_force import enabled
+from tormagd.config import Config
+from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
 from tormagd.interrupt import interrupted_by
-from tormagd.recording.ticks import Value, decode_ticks, listening
+from tormagd.recording.ticks import decode_ticks, listening
+from tormagd.safety.codes import FAULTS
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError
 from tormagd_client.wire import keys_of
-
-Columns = dict[str, npt.NDArray[np.float64]]
 
 SOURCE = "calibrate"
 RATE_HZ = 200.0
@@ -34,8 +33,6 @@ SILENT_S = 1.0
 "Ticks come every 20 ms; without any for this long the daemon has gone."
 RECENT_SETPOINT_MS = 1_000.0
 HOMING_S = 30.0
-MOVING_MM_S = 5.0
-HANDLE_PATIENCE_S = 30.0
 
 
 def interrupted_run() -> CommandError:
@@ -59,20 +56,36 @@ class Range(NamedTuple):
     most_N: float
 
 
-def seconds_bar(duration_s: float, label: str) -> "tqdm[Any]":
-    """Return a progress bar over `duration_s`, shown only where stderr is a terminal."""
-    return tqdm(
-        total=duration_s,
-        desc=label,
-        bar_format="{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s",
-        disable=not is_terminal(sys.stderr),
-    )
+class Progress:
+    """A line of progress on a terminal's stderr: what is done, for how long, and how long it takes. It is one line."""
+
+    def __init__(self) -> None:
+        self._label, self._lasts_s, self._begun_s, self._is_shown = "", 0.0, 0.0, is_terminal(sys.stderr)
+
+    def begin(self, label: str, lasts_s: float) -> None:
+        """Begin to show `label`, which takes about `lasts_s`."""
+        self.end()
+        self._label, self._lasts_s, self._begun_s = label, lasts_s, time.monotonic()
+
+    def show(self) -> None:
+        """Show the time since `begin`."""
+        if self._is_shown and self._label:
+            since_s = time.monotonic() - self._begun_s
+            print(
+                f"\r{self._label}: {since_s:.0f} of about {self._lasts_s:.0f} s ", end="", file=sys.stderr, flush=True
+            )
+
+    def end(self) -> None:
+        """Remove the line."""
+        if self._is_shown and self._label:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        self._label = ""
 
 
-class Run:
-    """An armed device: forces go out, control ticks come in. Made by `armed`.
+class Run(Device):
+    """The daemon's device for courses: commands and forces go out, control ticks come in. Made by `connected`.
 
-    Holds the sockets, the names of the columns that are read, and when the daemon was last heard.
+    Holds the sockets, and when the daemon was last heard.
     """
 
     def __init__(
@@ -80,91 +93,78 @@ class Run:
         endpoints: Endpoints,
         client: Client,
         ticks: "zmq.Socket[bytes]",
-        columns: Sequence[str],
         is_interrupted: Callable[[], bool],
     ) -> None:
-        self._endpoints, self._client, self._columns = endpoints, client, tuple(columns)
+        self._endpoints, self._client = endpoints, client
         self._ticks, self._is_interrupted = ticks, is_interrupted
         self._heard_s = time.monotonic()
+        self.progress = Progress()
 
-    def play(self, waveform: Waveform, bar: "tqdm[Any]") -> Columns:
-        """Publish `waveform` in real time, and return what its ticks tell: an array for each column asked for.
+    def follow(self, course: Course[Found]) -> Found:
+        """Run `course` in real time, and return what it found.
 
-        NaN is a value not known, or a word. `bar` advances by the seconds that passed. Raises CommandError: FAULT or
-        REFUSED where a tick is not ENABLED, REFUSED where the person interrupts. UNREACHABLE is a daemon without ticks
-        for SILENT_S, or with those of another version.
+        Raises CommandError: FAULT or REFUSED where the course stops, REFUSED where the person interrupts. UNREACHABLE
+        is a daemon without ticks for SILENT_S, or with those of another version. Raises as `Client.request`.
         """
-        rows: list[list[float]] = []
-        start_s = time.monotonic()
-        while (t_s := time.monotonic() - start_s) < waveform.duration_s:
-            rows += self.exchange(waveform.at(t_s).force_N)
-            bar.update(time.monotonic() - start_s - t_s)
-        table = np.array(rows, dtype=np.float64).reshape(-1, len(self._columns))
-        return dict(zip(self._columns, table.T, strict=True))
+        try:
+            return drive(course, self)
+        except StoppedError as error:
+            kind = Exit.FAULT if error.code in FAULTS else Exit.REFUSED
+            raise CommandError(kind, error.code, error.cause, error.remedy) from error
+        finally:
+            self.progress.end()
 
-    def exchange(self, force_N: float) -> list[list[float]]:
-        """Publish one force, valid for VALID_FOR_MS, and return the rows of ticks until the next is due, 1/RATE_HZ
-        later.
+    def play(self, waveform: Waveform) -> Columns:
+        """Publish `waveform` in real time, and return its ticks. Raises as `follow`."""
+        return self.follow(watch(waveform.duration_s, lambda t_s: waveform.at(t_s).force_N))
 
-        Raises as `play`.
+    def command(self, name: str) -> None:
+        """Give a command. `disable` is tried whatever happens; raises ClientError where another one is refused."""
+        if name == "enable":
+            _enable(self._client)
+        elif name == "disable":
+            # in FAULT the gap opens already, and a daemon that has gone has opened it
+            with suppress(ClientError):
+                self._client.request(name)
+        else:
+            self._client.request(name)
+
+    def exchange(self, force_N: float | None) -> Heard:
+        """Publish one force, valid for VALID_FOR_MS, and return the ticks until the next is due, 1/RATE_HZ later.
+
+        None publishes nothing. Raises as `follow`.
         """
         if self._is_interrupted():
             raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
-        self._client.publish(force_N, VALID_FOR_MS)
-        rows: list[list[float]] = []
+        if force_N is not None:
+            self._client.publish(force_N, VALID_FOR_MS)
+        self.progress.show()
+        rows: list[Row] = []
         while (left_s := due_s - time.monotonic()) > 0.0:
             if self._ticks.poll(max(1, round(left_s * 1e3))):
                 rows += self._rows(self._ticks.recv_multipart()[-1])
         if time.monotonic() - self._heard_s > SILENT_S:
             raise unreachable(self._endpoints.recording, f"no control ticks for {SILENT_S:g} s")
-        return rows
+        return Heard(time.monotonic(), rows)
 
-    def wait_for_handle(self, force_N: float) -> None:
-        """Publish one force until the handle moves at MOVING_MM_S or more; needs the column `handle_rate_mm_s`.
+    def _rows(self, data: bytes) -> list[Row]:
+        """Return a batch's ticks by COLUMNS, and note that the daemon was heard.
 
-        Raises as `play`, and CommandError (REFUSED) where the handle stands still for HANDLE_PATIENCE_S.
-        """
-        rate = self._columns.index("handle_rate_mm_s")
-        until_s = time.monotonic() + HANDLE_PATIENCE_S
-        while not any(abs(row[rate]) >= MOVING_MM_S for row in self.exchange(force_N)):
-            if time.monotonic() > until_s:
-                raise CommandError(
-                    Exit.REFUSED,
-                    "handle_still",
-                    f"the handle stood still for {HANDLE_PATIENCE_S:g} s",
-                    f"turn it to and fro, at {MOVING_MM_S:g} mm/s or more at the roller, while it runs",
-                )
-
-    def _rows(self, data: bytes) -> list[list[float]]:
-        """Decode a batch into rows of floats, NaN for a word or an unknown value, and note that the daemon was heard.
-
-        Raises CommandError where the batch is another version's. For a tick that was not ENABLED it asks the daemon
-        why: raises CommandError (FAULT or REFUSED), or as `Client.status`.
+        Raises CommandError where the batch is another version's.
         """
         try:
             batch = decode_ticks(data)
-            state, *places = [batch.columns.index(name) for name in ("operating_state", *self._columns)]
+            places = [batch.columns.index(name) for name in COLUMNS]
         except (MessageError, ValueError) as error:
-            raise _other_version(self._endpoints.recording, error) from error
+            raise CommandError(
+                Exit.UNREACHABLE,
+                "unintelligible",
+                f"the ticks at {self._endpoints.recording} are not this version's: {error}",
+                "check the endpoint, and that tormagd and tormagctl are of the same version",
+            ) from error
         self._heard_s = time.monotonic()
-        for row in batch.rows:
-            self._require_enabled(row[state])
-        # what is a word or not known is NaN
-        taken = [[row[place] for place in places] for row in batch.rows]
-        return [[float(each) if isinstance(each, int | float) else math.nan for each in row] for row in taken]
-
-    def _require_enabled(self, state: Value) -> None:
-        """Raise CommandError (FAULT or REFUSED) unless a tick's state is ENABLED; asks the daemon for the fault."""
-        if state == "ENABLED":
-            return
-        first = next(iter(self._client.status().fault_details), None)
-        raise CommandError(
-            Exit.FAULT if state == "FAULT" else Exit.REFUSED,
-            "not_enabled",
-            f"the device went {state} during the run: {'somebody gave a command' if first is None else first.code}",
-            "run it again when you are ready" if first is None else first.remedy,
-        )
+        return [[row[place] for place in places] for row in batch.rows]
 
 
 def reach(client: Client, scene_most_N: float) -> Range:
@@ -188,62 +188,69 @@ def reach(client: Client, scene_most_N: float) -> Range:
     return Range(status.least_N, min(status.most_N, scene_most_N))
 
 
-@contextmanager
-def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: float) -> Iterator[Run]:
-    """Home and enable as far as needed, and give a `Run`; at the end of the context disable, so that the gap opens.
+def known_of(config: Config, client: Client, scene_most_N: float, weight_N: float | None = None) -> Known:
+    """Return what courses know: the configuration, the daemon's control period, and the forces of `reach`.
 
-    Disables after an error, too. Within the context SIGINT and SIGTERM are only noted: the `Run` raises for them.
-    Raises CommandError in FAULT, for ticks of another version, and `interrupted_run`; as `Client.arm`. Raises
-    UnreachableError where nobody takes setpoints, or no ticks of an enabled device come within `wait_s`.
+    Raises as `reach`, and CommandError (REFUSED) where they leave no range.
+    """
+    forces = reach(client, scene_most_N)
+    known = Known(config, 1.0 / client.status().rates["control"].hz, forces.least_N, forces.most_N, weight_N)
+    if not known.force_N(0.0) < forces.most_N:
+        raise CommandError(
+            Exit.REFUSED,
+            "no_range",
+            f"the daemon's scene ends at {forces.most_N:g} N, under the least force of {forces.least_N:g} N",
+            "run the daemon with a scene that asks for more force",
+        )
+    return known
+
+
+@contextmanager
+def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
+    """Give a `Run`; at the end of the context disable, so that the gap opens. Disables after an error, too.
+
+    Within the context SIGINT and SIGTERM are only noted: the `Run` raises for them. Raises UnreachableError where
+    nobody takes setpoints.
     """
     context = zmq.Context()
     try:
         ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
         client.require_taken()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            require_no_fault(client.status(), "nothing is calibrated")  # nor is a fault cleared that nobody has seen
-
-            def given(_command: str) -> None:
-                if is_interrupted():
-                    raise interrupted_run()
-
-            client.arm(HOMING_S, given)
+            run = Run(endpoints, client, ticks, is_interrupted)
             try:
-                _drop_old(ticks, wait_s, endpoints.recording)
-                yield Run(endpoints, client, ticks, columns, is_interrupted)
-            except BaseException:
-                # in FAULT the gap opens already, and a daemon that has gone has opened it: the first error counts
-                with suppress(ClientError):
-                    client.request("disable")
-                raise
-            client.request("disable")
+                yield run
+            finally:
+                run.command("disable")
     finally:
         context.destroy(linger=0)
 
 
-def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
-    """Receive ticks until a whole batch is ENABLED.
+@contextmanager
+def armed(endpoints: Endpoints, client: Client, force_N: float) -> Iterator[Run]:
+    """Home where needed, enable with the setpoint `force_N`, and give a `Run`.
 
-    Raises UnreachableError where none is within `wait_s`, CommandError for a message of another version.
+    At the end the gap opens, as in `connected`. Raises as `home` and `Run.follow`.
     """
-    # the newest tick from before `enable` took effect must not be read as a fall out of ENABLED
-    until_s = time.monotonic() + wait_s
-    while (left_s := until_s - time.monotonic()) > 0.0 and ticks.poll(round(left_s * 1e3)):
+    with connected(endpoints, client) as run:
+        if not client.status().is_homed:
+            home(client, HOMING_S, is_waiting=True)
+        run.follow(enabled(force_N))
+        yield run
+
+
+def _enable(client: Client) -> None:
+    """Enable the device, and try again for SILENT_S where its measurements are not fresh.
+
+    Raises ClientError for any other refusal, and for this one after SILENT_S.
+    """
+    # on a busy machine the newest measurement may be a little old once
+    until_s = time.monotonic() + SILENT_S
+    while True:
         try:
-            batch = decode_ticks(ticks.recv_multipart()[-1])
-        except MessageError as error:
-            raise _other_version(address, error) from error
-        states = [dict(zip(batch.columns, row, strict=True)).get("operating_state") for row in batch.rows]
-        if set(states) == {"ENABLED"}:
+            client.request("enable")
+        except ClientError as error:
+            if error.code != "not_fresh" or time.monotonic() > until_s:
+                raise
+        else:
             return
-    raise unreachable(address, f"no control ticks of an enabled device within {wait_s:g} s")
-
-
-def _other_version(address: str, error: ValueError) -> CommandError:
-    """Return the error (UNREACHABLE) for ticks that cannot be read."""
-    return CommandError(
-        Exit.UNREACHABLE,
-        "unintelligible",
-        f"the ticks at {address} are not this version's: {error}",
-        "check the endpoint, and that tormagd and tormagctl are of the same version",
-    )

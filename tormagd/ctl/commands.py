@@ -310,6 +310,24 @@ COMMANDS = {
             option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),
         ),
     ),
+    "commission": Command(
+        "guided: judge this device row by row, in a page and a file; then let the daemon begin from what it showed",
+        "commission.commission",
+        ("config", "endpoints", "wait_s"),
+        (
+            option("folder", type=Path, metavar="FOLDER", help="for the page and the findings, by serial number"),
+            option("--resume", dest="is_resumed", action="store_true", help="go on after the steps that are done"),
+            option(
+                "--weight-N",
+                dest="weight_N",
+                type=Within(0.05, 50.0, " N"),
+                metavar="N",
+                help="a weight to hang from the force sensor, which gives its gain",
+            ),
+            option("--conformance", type=Path, metavar="FILE", help="what the conformance kit printed with --json"),
+            option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),
+        ),
+    ),
     "plot": Command(
         "draw a recording: forces, gap, duty, limits and faults",
         "report.plot",

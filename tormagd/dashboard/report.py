@@ -2,7 +2,7 @@
 elsewhere."""
 
 import base64
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from itertools import pairwise
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tormagd.dashboard.html import page, table
 from tormagd.dashboard.recorded import believed, moments
 from tormagd.following import in_words
 from tormagd.recording.overview import BREAK_NS, LATE_US, Codes
@@ -17,10 +18,6 @@ from tormagd.recording.plot import figure, picture
 from tormagd.recording.reader import RecordingFile
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation
 
-STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:80rem;margin:2rem auto;padding:0 1rem}
-img{max-width:100%}table{border-collapse:collapse;margin:.5rem 0}h2{margin-top:2rem}
-th,td{padding:.25rem .8rem;text-align:left;vertical-align:top;border-bottom:1px solid #ddd}
-.bad{color:#b71c1c;font-weight:600}"""
 MAX_TOLD = 20
 "How many moments of one fault are listed."
 
@@ -33,22 +30,20 @@ def report(of: Sequence[RecordingFile]) -> str:
         f"<h1>{escape(' and '.join(names))}</h1>",
         *(_sealed(each) for each in of),
         *_succession(of),
-        _table(["", *names], _figures(of)),
+        table(["", *names], _figures(of)),
         *(_picture(each) for each in of),
         "<h2>What held the force back</h2>",
         _codes(of, "limits", LIMITS, _held),
         "<h2>Faults</h2>",
         _codes(of, "faults", FAULTS, _moments),
         "<h2>Marks</h2>",
-        _table(["", *names], _marks(of)),
+        table(["", *names], _marks(of)),
         "<h2>What was believed of the device at the end</h2>",
-        _table(["", *names], _belief(of)),
+        table(["", *names], _belief(of)),
         "<h2>The machine: how late control ticks began</h2>",
-        _table(["µs", *names], _lateness(of)),
+        table(["µs", *names], _lateness(of)),
     ]
-    title = escape(f"tormagd: {', '.join(names)}")
-    head = f'<meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>\n'
+    return page(f"tormagd: {', '.join(names)}", parts)
 
 
 def _sealed(of: RecordingFile) -> str:
@@ -116,7 +111,7 @@ def _codes(
         why = texts.get(code)
         when = ["" if codes is None else told(codes, lasts_s) for codes, lasts_s in known]
         rows.append([code, *when, why.cause if why else "", why.remedy if why else ""])
-    return _table(["", *(each.path.name for each in of), "why", "what to do"], rows)
+    return table(["", *(each.path.name for each in of), "why", "what to do"], rows)
 
 
 def _held(codes: Codes, lasts_s: float) -> str:
@@ -169,12 +164,3 @@ def _lateness(of: Sequence[RecordingFile]) -> list[list[str]]:
 def _rows(columns: Sequence[Mapping[str, str]]) -> list[list[str]]:
     """Return a row for each key of any column, with each column's value, empty where it has none."""
     return [[key, *(column.get(key, "") for column in columns)] for key in dict.fromkeys(k for c in columns for k in c)]
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return an HTML table of these texts, escaped; "None." where it has no row."""
-    lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
-    if not lines:
-        return "<p>None.</p>"
-    head = "".join(f"<th>{escape(each)}</th>" for each in heads)
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"

@@ -27,6 +27,7 @@ import numpy as np
 from scipy.signal import butter, decimate, sosfiltfilt
 from scipy.stats import t as student
 
+from tormagd.commission.regression import sandwich
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd.lab.motor.log import Log
@@ -149,22 +150,9 @@ def linear(rows: Array, target: Array, blocks: Array) -> Fit:
     scaled = rows / scale
     values, *_ = np.linalg.lstsq(scaled, target, rcond=None)
     residual = target - scaled @ values
-    covariance = _sandwich(scaled, residual, blocks) / np.outer(scale, scale)
+    covariance = sandwich(scaled, residual, blocks) / np.outer(scale, scale)
     deviations = float(student.ppf(0.975, max(len(np.unique(blocks)) - len(values), 1)))
     return Fit(values / scale, covariance, deviations, float(np.linalg.norm(residual) / np.linalg.norm(target)))
-
-
-def _sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
-    """Return the covariance (p x p) of least-squares coefficients by the sandwich over blocks (Liang and Zeger 1986).
-
-    Rows (n x p) and residuals (n) of one number in `blocks` (n) may be correlated; corrected for few blocks.
-    """
-    labels, index = np.unique(blocks, return_inverse=True)
-    scores = np.zeros((len(labels), jacobian.shape[1]))
-    np.add.at(scores, index, jacobian * residual[:, None])
-    bread = np.linalg.inv(jacobian.T @ jacobian)
-    count = len(labels) / max(len(labels) - jacobian.shape[1], 1)
-    return np.asarray(bread @ (scores.T @ scores) @ bread * count)
 
 
 class Volts(NamedTuple):

@@ -1,0 +1,118 @@
+"""A simulated device in virtual time that courses run on; what its wire says may be altered."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+import msgspec
+import pytest
+
+from firmware_protocol.codec import Message
+from tormagd.assembly.build import build_core
+from tormagd.closed_loop import ClosedLoop
+from tormagd.commission.course import COLUMNS, Course, Found, Heard, drive
+from tormagd.commission.finding import Finding
+from tormagd.commission.known import Known
+from tormagd.commission.sequence import STEPS, Step, Stopped, sequence
+from tormagd.config import Config, Rates
+from tormagd.control.records import TimedSetpoint
+from tormagd.daemon.telemetry import tick_record
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.safety.operating_state import RefusedError
+from tormagd.simulation.device import MessageDevice, VirtualDevice
+from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.hand import ReversingHand
+from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.plant import Truth
+from tormagd_client.messages import TickRecord
+
+CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
+PLACES = [TickRecord.__struct_fields__.index(name) for name in COLUMNS]
+MONOTONIC = COLUMNS.index("monotonic_s")
+Altered = Callable[[float, Message], Message]
+"From the time, s, and a message of the device to what arrives of it."
+
+
+class AlteringLine:
+    """A device whose line alters what it says."""
+
+    def __init__(self, device: VirtualDevice, alters: Altered) -> None:
+        self._device, self._alters = device, alters
+        self._stream = FrameStream()
+
+    @property
+    def messages(self) -> MessageDevice:
+        return self._device.messages
+
+    @property
+    def truth(self) -> Truth:
+        return self._device.truth
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        self._device.receive(now_s, data)
+
+    def transmit(self, now_s: float) -> bytes:
+        said = self._stream.unpack(self._device.transmit(now_s))
+        return b"".join(self._stream.pack(self._alters(now_s, message)) for message in said)
+
+
+class Bench:
+    """A core and its simulated device. A setpoint comes every 5 ms, as from `tormagctl`."""
+
+    def __init__(
+        self,
+        plant: PlantParameters,
+        faults: Iterable[str] = (),
+        alters: Altered = lambda now_s, message: message,
+        stall_ticks: int = 0,
+    ) -> None:
+        core = build_core(CONFIG)
+        self.least_N = core.portrait.min_N
+        device = VirtualDevice(plant, ReversingHand(2.0), [parse_fault(fault) for fault in faults], seed=3)
+        self.loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), AlteringLine(device, alters))
+        self._stall_ticks = stall_ticks
+        self.ends_s = math.inf
+        for _ in range(200):
+            self.loop.tick()
+
+    def command(self, name: str) -> None:
+        """As `tormagctl` gives it: a `disable` that is refused is over."""
+        try:
+            self.loop.command(name)
+        except RefusedError:
+            if name != "disable":
+                raise
+
+    def exchange(self, force_N: float | None) -> Heard:
+        """Five ticks with one setpoint."""
+        if self.loop.now_s >= self.ends_s:
+            raise KeyboardInterrupt
+        setpoint = None if force_N is None else TimedSetpoint(force_N, self.loop.now_s, 0.25)
+        rows = []
+        for number in range(5):
+            for _ in range(self._stall_ticks if number == 0 else 0):
+                self.loop.skip()
+            sample = self.loop.tick(setpoint)
+            record = tick_record(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
+            row = msgspec.to_builtins(record)
+            row[TickRecord.__struct_fields__.index("monotonic_s")] = sample.time_s
+            rows.append([row[place] for place in PLACES])
+        return Heard(self.loop.now_s, rows)
+
+    def follow(self, course: Course[Found]) -> Found:
+        """What a course finds."""
+        return drive(course, self)
+
+    def commission(
+        self, steps: Sequence[Step] = STEPS, weight_N: float | None = None
+    ) -> tuple[dict[str, list[Finding]], Stopped | None]:
+        """The findings by step, and why it stopped."""
+        found: dict[str, list[Finding]] = {}
+        known = Known(CONFIG, 1e-3, self.least_N, 2.0, weight_N)
+        course = sequence(steps, known, {}, lambda step: None, lambda step, each: found.update({step.name: list(each)}))
+        return found, self.follow(course)
+
+
+@pytest.fixture(scope="session")
+def bench() -> type[Bench]:
+    """Makes a simulated device to commission."""
+    return Bench

@@ -1,0 +1,117 @@
+"""Commissioning simulated devices in virtual time: healthy draws pass, and what a fault changes turns red."""
+
+import random
+
+import msgspec
+import pytest
+from rendering.device_draws import drawn_device
+
+from firmware_protocol.codec import Sense, State
+from tormagd.commission.page import page_of
+from tormagd.commission.report import Report, begun
+from tormagd.commission.sequence import STEPS, Stopped
+from tormagd.simulation.parameters import load_plant
+
+SAMPLE = load_plant("sample_1")
+AT_REST = ("link and host", "homing")
+
+
+def with_part(name, **changes):
+    """Sample 1 with changes in one of its parts."""
+    return msgspec.structs.replace(SAMPLE, **{name: msgspec.structs.replace(getattr(SAMPLE, name), **changes)})
+
+
+def chosen(*names):
+    return [step for step in STEPS if step.name in (*AT_REST, *names)]
+
+
+def red(found):
+    return [each.name for row in found.values() for each in row if not each.is_fine]
+
+
+def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench):
+    found, stopped = bench(drawn_device(44)).commission()
+    report = msgspec.structs.replace(begun(None, 7, 0, None), findings=found, stopped=stopped)
+    assert (red(found), stopped, report.is_sound) == ([], None, True)
+    page = page_of(report)
+    assert "Every row passed" in page
+    assert "No report was given" in page
+    assert page.count("<td>pass</td>") == sum(map(len, found.values())) > 30
+    kept = msgspec.json.decode(msgspec.json.encode(report), type=Report)
+    assert "+0" in page_of(msgspec.structs.replace(begun(kept, 7, 1, None), findings=found))
+
+
+def slipping():
+    """The left coupling loses 1% of what it goes towards closed."""
+    lost_mm, last_mm = 0.0, None
+
+    def alters(now_s, message):
+        nonlocal lost_mm, last_mm
+        if not isinstance(message, State):
+            return message
+        at_mm, last = message.left_position_mm, last_mm
+        lost_mm += 0.01 * max((at_mm if last is None else last) - at_mm, 0.0)
+        last_mm = at_mm
+        return message.replaced(left_position_mm=round(560.0 * (at_mm + lost_mm)) / 560.0)
+
+    return alters
+
+
+def sensing(changed):
+    """A sensor that reads what `changed` makes of the force."""
+    return lambda now_s, message: (
+        message.replaced(force_N=changed(message.force_N)) if isinstance(message, Sense) else message
+    )
+
+
+NOISE = random.Random(1)
+
+
+@pytest.mark.parametrize(
+    ("steps", "device", "expected"),
+    [
+        ((), {"faults": ["answers_half"]}, "messages lost or damaged"),
+        ((), {"plant": with_part("firmware", reply_jitter_us=5000.0)}, "periods with the device's answer"),
+        ((), {"faults": ["clock=+2%"]}, "device's clock runs fast by"),
+        ((), {"plant": with_part("electronics", supply_V=10.0)}, "supply"),
+        ((), {"stall_ticks": 2}, "periods kept"),
+        (("sensor",), {"alters": sensing(lambda force_N: force_N + 0.2)}, "sensor's zero"),
+        (("sensor",), {"alters": sensing(lambda force_N: force_N + NOISE.gauss(0.0, 0.06))}, "sensor's noise"),
+        (("sensor",), {"alters": sensing(lambda force_N: 0.05 * round(force_N / 0.05))}, "sensor's resolution"),
+        (("steps", "way back"), {"alters": slipping()}, "left switch, after the forces, at"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_the_row_of_what_a_fault_changes_turns_red(bench, steps, device, expected):
+    found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
+    assert (expected in red(found), stopped) == (True, None)
+
+
+@pytest.mark.parametrize(
+    ("steps", "device", "step", "code"),
+    [
+        ((), {"faults": ["motor_reversed_left"]}, "homing", "DEVICE_UNCOMMANDED_MOTION"),
+        ((), {"faults": ["switch_dead_left"]}, "homing", "DEVICE_RETRACT_FAILED"),
+        (("steps",), {"plant": with_part("assumed", closed_mm=34.0)}, "steps", "DEVICE_END_STOP"),
+    ],
+    ids=["wiring", "switch dead", "switch 12 mm off"],
+)
+def test_a_device_that_cannot_go_on_stops_with_its_fault_on_the_page(bench, steps, device, step, code):
+    found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
+    assert (stopped.step, stopped.code) == (step, code)
+    page = page_of(msgspec.structs.replace(begun(None, 7, 0, None), findings=found, stopped=stopped))
+    assert code in page
+    assert stopped.remedy.split()[0] in page
+
+
+def test_an_abort_at_any_time_opens_the_gap(bench):
+    times = random.Random(20)
+    for _ in range(6):
+        device = bench(SAMPLE)
+        device.ends_s = times.uniform(3.0, 20.0)
+        with pytest.raises(KeyboardInterrupt):
+            device.commission(chosen("steps", "carriages"))
+        last = [device.loop.tick() for _ in range(3000)][-1]
+        assert last.truth.gap_mm > 94.0
+    page = page_of(msgspec.structs.replace(begun(None, 7, 0, None), stopped=Stopped("steps", "interrupted", "x", "y")))
+    assert "The gap was told to open" in page

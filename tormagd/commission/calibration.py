@@ -1,0 +1,61 @@
+"""The calibration of a device: tables of a configuration, by its commissioning, from which a daemon begins."""
+
+import itertools
+import math
+
+import msgspec
+
+from tormagd.commission.gains import Corners, stiffest, tunings
+from tormagd.commission.report import Report
+from tormagd.config import Config
+
+DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03)
+SURELY = 0.15
+"The identified motor is off by less, a warm one's resistance included."
+RESTED, RELAXED = 1.45, 0.7
+"A device that has rested, or is cold, is stronger by less than this; one that is relaxed and warm is weaker by less."
+DIGITS = "{:.4g}"
+
+
+def calibration(report: Report, config: Config) -> str:
+    """Return the tables [motor], [position] and [trim] of the device of `report`, as TOML; `config` was in force.
+
+    A table is left out where its findings are not known, or where no gain is robust.
+    """
+    motor, values = config.motor, report.values
+
+    def share(name: str) -> float:
+        return (values.get(f"left {name}", math.nan) + values.get(f"right {name}", math.nan)) / 2.0
+
+    resistance, back_emf = share("resistance over motor.resistance_ohm"), share("voltage for speed over the configured")
+    measured = {
+        "resistance_ohm": motor.resistance_ohm * resistance,
+        "back_emf_V_s": motor.back_emf_V_s * back_emf,
+        "inertia_kg_m2": motor.inertia_kg_m2 * share("inertia over motor.inertia_kg_m2"),
+        "coulomb_V": motor.coulomb_V * share("friction over the configured") * resistance / back_emf,
+    }
+    lines = [f"# device {report.serial_number}, by `tormagctl commission`; {len(report.failed)} rows failed"]
+    if all(math.isfinite(value) for value in measured.values()):
+        lines += _table("motor", measured)
+        lines += _position(msgspec.structs.replace(config, motor=msgspec.structs.replace(motor, **measured)))
+    strength = values.get("force over the model's: magnets, insert, or sensor's gain")
+    if strength is not None:
+        bounds = {"least": min(RELAXED * strength, 1.0), "most": max(RESTED * strength, 1.0)}
+        lines += _table("trim", bounds)
+    return "\n".join(lines) + "\n"
+
+
+def _position(config: Config) -> list[str]:
+    """Return the table [position] with the stiffest gains that are robust around the motor of `config`."""
+    position = config.position
+    grid = itertools.product(DERIVATIVE_TIMES_S, (position.derivative_filter_s,), (position.integral_time_s,))
+    period_s = 1.0 / config.rates.control_hz
+    best = stiffest(tunings(config, grid, Corners(SURELY, (period_s,), ("resistance_ohm", "inertia_kg_m2"))))
+    if best is None:
+        return []
+    margins = f"# margins within {SURELY:.0%}: {best.gain_margin_dB:.1f} dB, {best.phase_margin_deg:.0f} degrees"
+    return [margins, *_table("position", {name: getattr(best, name) for name in best._fields[:4]})]
+
+
+def _table(name: str, values: dict[str, float]) -> list[str]:
+    return [f"[{name}]", *(f"{key} = {DIGITS.format(value)}" for key, value in values.items()), ""]

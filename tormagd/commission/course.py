@@ -1,0 +1,190 @@
+"""A course asks a device for something tick after tick, and says what it showed. It has no clock and does no I/O.
+
+A course is a generator. It yields what to ask for, is sent what was heard since, and returns what it found. Time is
+what it is told. So virtual time and a live device run the same courses.
+"""
+
+import math
+from collections.abc import Callable, Generator, Iterable, Sequence
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.commission.finding import Finding
+from tormagd.safety.codes import FAULTS, Fault
+
+Columns: TypeAlias = dict[str, npt.NDArray[Any]]
+Row: TypeAlias = Sequence[Any]
+"One control tick: a value for each of COLUMNS."
+Found = TypeVar("Found")
+
+NUMBERS = (
+    "monotonic_s",
+    "predicted_cf",
+    "trim",
+    "link_unanswered",
+    "link_damaged",
+    "link_round_trip_s",
+    "device_clock_drift",
+    "device_time_s",
+    "device_left_mm",
+    "device_right_mm",
+    "device_handle_mm",
+    "device_force_N",
+    "device_temperature_C",
+    "left_current_A",
+    "right_current_A",
+    "supply_V",
+    "reference_gap_mm",
+    "measured_cf",
+    "left_mm",
+    "right_mm",
+    "handle_mm",
+    "handle_rate_mm_s",
+    "left_duty",
+    "right_duty",
+)
+WORDS = ("operating_state", "device_mode", "device_switches", "faults")
+COLUMNS = (*NUMBERS, *WORDS)
+"Columns of the control ticks that a course is sent."
+PLACES = {name: place for place, name in enumerate(COLUMNS)}
+
+MOVING_MM_S = 5.0
+HANDLE_PATIENCE_S = 30.0
+
+
+class Asked(NamedTuple):
+    """What a course asks for: a force, N (None: no setpoint), and a command, given once ("": none)."""
+
+    force_N: float | None = None
+    command: str = ""
+
+
+class Heard(NamedTuple):
+    """What a course is sent: the time, s, and the control ticks since it was last sent some."""
+
+    now_s: float
+    rows: Sequence[Row]
+
+
+Course: TypeAlias = Generator[Asked, Heard, Found]
+
+
+class StoppedError(Exception):
+    """A course that cannot go on: a code, the cause in a sentence, what to do.
+
+    `rows` are the ticks until then, `found` the findings that they still give.
+    """
+
+    def __init__(self, code: str, cause: str, remedy: str) -> None:
+        super().__init__(cause)
+        self.code, self.cause, self.remedy = code, cause, remedy
+        self.rows: Sequence[Row] = ()
+        self.found: Sequence[Finding] = ()
+
+
+class Device(Protocol):
+    """A device that takes commands and forces: a live daemon's, or a simulated one in virtual time."""
+
+    def command(self, name: str) -> object:
+        """Give one operator's command. Raises where it is refused."""
+
+    def exchange(self, force_N: float | None) -> Heard:
+        """Ask for a force, N (None: nothing is published), and return what was heard until the next is due."""
+
+
+def drive(course: Course[Found], device: Device) -> Found:
+    """Run `course` on `device` to its end, and return what it found. However it ends early, the gap is told to open.
+
+    Raises what the course and the device raise.
+    """
+    try:
+        asked = next(course)
+        while True:
+            if asked.command:
+                device.command(asked.command)
+            asked = course.send(device.exchange(asked.force_N))
+    except StopIteration as end:
+        found: Found = end.value
+        return found
+    except BaseException:
+        device.command("disable")
+        raise
+
+
+def columns_of(rows: Iterable[Row]) -> Columns:
+    """Return the ticks as an array for each of COLUMNS: floats, NaN where a number is not known, or words."""
+    by_name = zip(*rows, strict=True)
+    table = dict(zip(COLUMNS, by_name, strict=False)) or dict.fromkeys(COLUMNS, ())
+    return {
+        name: np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+        if name in NUMBERS
+        else np.array([*values, None], dtype=object)[:-1]
+        for name, values in table.items()
+    }
+
+
+def watch(
+    lasts_s: float, force_N: Callable[[float], float] | None = None, states: Sequence[str] = ("ENABLED",)
+) -> Course[Columns]:
+    """Ask for a force over the time, s, for `lasts_s`, and return all ticks; None publishes nothing.
+
+    Raises StoppedError for a tick in another operating state than `states`.
+    """
+    rows: list[Row] = []
+    begun_s, t_s = math.nan, 0.0
+    while t_s < lasts_s:
+        now_s, fresh = yield Asked(None if force_N is None else force_N(t_s))
+        try:
+            _require_state(fresh, states)
+        except StoppedError as error:
+            error.rows = rows
+            raise
+        rows += fresh
+        begun_s = now_s if math.isnan(begun_s) else begun_s
+        t_s = now_s - begun_s
+    return columns_of(rows)
+
+
+def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: float | None = None) -> Course[Columns]:
+    """Give `command`, and return all ticks until one `is_done`. Asks for `force_N` meanwhile.
+
+    Raises StoppedError for a fault, and where it takes over `most_s`.
+    """
+    begun_s, fresh = yield Asked(force_N, command)
+    rows = list(fresh)
+    while not (rows and is_done(rows[-1])):
+        now_s, fresh = yield Asked(force_N)
+        _require_state(fresh, ("DISABLED", "ENABLED", "PAUSED"))
+        rows += fresh
+        if now_s - begun_s > most_s:
+            what = command or "what was waited for"
+            raise StoppedError("not_done", f"{what} was not done within {most_s:g} s", "tormagctl status")
+    return columns_of(rows)
+
+
+def handle_moved(force_N: float) -> Course[None]:
+    """Ask for `force_N` until the handle moves at MOVING_MM_S. Raises StoppedError after HANDLE_PATIENCE_S."""
+    begun_s, fresh = yield Asked(force_N)
+    while not any(abs(row[PLACES["handle_rate_mm_s"]] or 0.0) >= MOVING_MM_S for row in fresh):
+        now_s, fresh = yield Asked(force_N)
+        _require_state(fresh, ("ENABLED",))
+        if now_s - begun_s > HANDLE_PATIENCE_S:
+            raise StoppedError(
+                "handle_still",
+                f"the handle stood still for {HANDLE_PATIENCE_S:g} s",
+                f"turn it to and fro, at {MOVING_MM_S:g} mm/s or more at the roller, while it runs",
+            )
+
+
+def _require_state(rows: Sequence[Row], states: Sequence[str]) -> None:
+    """Raise StoppedError for a tick in another operating state than `states`, with its fault's cause and remedy."""
+    for row in rows:
+        state = row[PLACES["operating_state"]]
+        if state not in states:
+            codes = sorted(row[PLACES["faults"]] or (), key=lambda code: bool(code == "STOPPED"))
+            if not codes:
+                raise StoppedError("not_enabled", f"the device went {state}: somebody gave a command", "run it again")
+            known = FAULTS[Fault(codes[0])]
+            raise StoppedError(codes[0], f"{', '.join(codes)}: {known.cause}", known.remedy)

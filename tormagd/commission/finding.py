@@ -1,0 +1,62 @@
+"""A finding: one measured value of a device, its interval, what is allowed, and what to do where it is not."""
+
+import math
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+BLOCKS = 8
+"Parts of a record whose means say how sure a mean is."
+SURE = 2.0
+"Standard deviations on either side that make an interval."
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One row of a commissioning. `value` None: it could not be measured, and counts as failed.
+
+    The value lies within `half_width` of what was measured, 95 times of 100. It passes from `least` to `most`.
+    """
+
+    name: str
+    value: float | None
+    half_width: float
+    unit: str
+    least: float
+    most: float
+    remedy: str
+
+    @property
+    def is_fine(self) -> bool:
+        """Whether the value is known and allowed."""
+        return self.value is not None and self.least <= self.value <= self.most
+
+    @property
+    def shown(self) -> str:
+        """The value with its interval and unit, for a person."""
+        if self.value is None:
+            return "not measured"
+        width = f" ± {self.half_width:.2g}" if self.half_width else ""
+        return f"{self.value:.4g}{width} {self.unit}".rstrip()
+
+    @property
+    def allowed(self) -> str:
+        """What is allowed, for a person."""
+        return f"{self.least:.4g} to {self.most:.4g}"
+
+
+def finding(
+    name: str, values: Array | float, unit: str, allowed: tuple[float, float], remedy: str, scale: float = 1.0
+) -> Finding:
+    """Return the finding of a mean, or of one number, times `scale`; without finite values it is not measured.
+
+    The interval is of the means of BLOCKS parts of `values`, in their order. One number has none.
+    """
+    known = np.atleast_1d(np.asarray(values, dtype=np.float64)) * scale
+    known = known[np.isfinite(known)]
+    value = float(known.mean()) if known.size else None
+    width = 0.0
+    if known.size >= 2 * BLOCKS:
+        width = SURE * float(np.std([part.mean() for part in np.array_split(known, BLOCKS)])) / math.sqrt(BLOCKS - 1)
+    return Finding(name, value, width, unit, *allowed, remedy)

@@ -1,0 +1,99 @@
+"""From H(z) to the gains of the position loop: the stiffest that stay robust.
+
+For each derivative time, filter and integral time of a grid the largest proportional gain is taken whose margins hold
+at every corner. Corners are the motor's parameters up and down by a share, and several loop periods. Stiffest means the
+largest integral gain: how fast a disturbance of the carriage (drag, the magnets' pull) is taken away.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from tormagd.config import Config, Position
+from tormagd.control.move.motor import margins
+
+MIN_GAIN_MARGIN_DB = 6.0
+MIN_PHASE_MARGIN_DEG = 45.0
+LARGEST_GAIN_PER_MM = 20.0
+PARAMETERS = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
+TICK_S = 1e-3
+Grid = Iterable[tuple[float, float, float]]
+"Derivative times, derivative filters and integral times, s."
+
+
+class Corners(NamedTuple):
+    """How far the motor's parameters may be off, as a share, and the loop's periods, s, at which margins have to hold.
+
+    `parameters` are those of the motor that vary.
+    """
+
+    share: float = 0.3
+    periods_s: Sequence[float] = (0.8 * TICK_S, TICK_S, 1.2 * TICK_S)
+    parameters: Sequence[str] = PARAMETERS
+
+
+class Tuning(NamedTuple):
+    """One robust set of gains, and its smallest margins over the corners."""
+
+    proportional_per_mm: float
+    integral_time_s: float
+    derivative_time_s: float
+    derivative_filter_s: float
+    gain_margin_dB: float
+    phase_margin_deg: float
+
+
+def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, float]:  # noqa: B008  # immutable
+    """Return the smallest gain margin, dB, and phase margin, degrees, over every corner, and the number of corners.
+
+    The loop's periods are those of `corners`, whatever rate `config` has.
+    """
+    gain, phase = [], []
+    factors = (1.0 - corners.share, 1.0 + corners.share)
+    for chosen in itertools.product(factors, repeat=len(corners.parameters)):
+        named = zip(corners.parameters, chosen, strict=True)
+        motor = msgspec.structs.replace(
+            config.motor, **{name: getattr(config.motor, name) * factor for name, factor in named}
+        )
+        for period_s in corners.periods_s:
+            found = margins(motor, config.position, period_s)
+            gain.append(found.gain_margin_dB)
+            phase.append(found.phase_margin_deg)
+    return {"gain_margin_dB": min(gain), "phase_margin_deg": min(phase), "corners": float(len(gain))}
+
+
+def tunings(config: Config, grid: Grid, corners: Corners = Corners()) -> Iterator[Tuning]:  # noqa: B008  # immutable
+    """Yield the largest robust proportional gain for every point of the grid that has one, with its margins.
+
+    The gain is rounded down to a tenth. The motor is that of `config`, which stays as it is.
+    """
+    for derivative_s, filter_s, integral_s in grid:
+        position = msgspec.structs.replace(
+            config.position,
+            derivative_time_s=derivative_s,
+            derivative_filter_s=filter_s,
+            integral_time_s=integral_s,
+        )
+        low, high = 0.0, LARGEST_GAIN_PER_MM
+        while high - low > 0.02:
+            middle = (low + high) / 2.0
+            low, high = (middle, high) if _robust(config, position, middle, corners) else (low, middle)
+        gain = math.floor(low * 10) / 10
+        if gain > 0.0 and (kept := _robust(config, position, gain, corners)):
+            yield Tuning(gain, integral_s, derivative_s, filter_s, *kept)
+
+
+def stiffest(found: Iterable[Tuning]) -> Tuning | None:
+    """Return the tuning with the largest integral gain; None of none."""
+    return max(found, key=lambda tuning: tuning.proportional_per_mm / tuning.integral_time_s, default=None)
+
+
+def _robust(config: Config, position: Position, gain: float, corners: Corners) -> tuple[float, float] | None:
+    """Return the smallest margins over the corners with this gain, dB and degrees; None where they are too small."""
+    tried = msgspec.structs.replace(config, position=msgspec.structs.replace(position, proportional_per_mm=gain))
+    found = corner_margins(tried, corners)
+    gain_dB, phase_deg = found["gain_margin_dB"], found["phase_margin_deg"]
+    return (gain_dB, phase_deg) if gain_dB >= MIN_GAIN_MARGIN_DB and phase_deg >= MIN_PHASE_MARGIN_DEG else None

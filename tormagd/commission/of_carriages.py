@@ -1,0 +1,169 @@
+"""What the motion shows: how both carriages answer jumps and sines, and from that their motors and the loop's gains."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from tormagd.commission.course import Columns, Course, watch
+from tormagd.commission.finding import Array, Finding, finding
+from tormagd.commission.known import Known
+from tormagd.commission.of_force import ready
+from tormagd.commission.regression import fitted
+from tormagd.config import Motor
+from tormagd.control.move.motor import PULL_DEPTH_MM, margins
+
+JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.5)
+"Levels of the jumps, as shares of the range: small and large ones, up and down, over the whole stroke."
+JUMP_S = 0.6
+SLOW_S = 6.0
+"Time of the slow way, to and fro each."
+SMOOTH_S, SLOWEST_MM_S = 0.2, 0.5
+SINES_HZ = (1.0, 2.0, 4.0, 8.0)
+SINE_S = 3.0
+SWING_N_S = 1.6
+"Greatest slope of the sines: within the speed of the gap."
+AT_HZ = 4.0
+"The sine by which gain and lag are judged."
+SIDES = ("left", "right")
+WINDOW_S = 0.021
+MOVING_M_S = 2e-3
+"A slower carriage may stand: its friction is then whatever it has to be."
+THINNED = 20
+GAINS = "put the gains of this commissioning into the configuration"
+WEAK = "look at supply, motor, gearbox and screw; then at the gains"
+PLUG = "look at the motor's plugs, wires and brushes"
+SCALE = "compare motor, gear ratio, screw lead and the encoder's counts with [motor]: one of them is another"
+COUPLED = "look at gearbox and coupling, and compare the motor with [motor]"
+GREASE = "grease the screw; look what rubs, and at the gearbox. A device that is right: take its calibration"
+
+
+class Driven(NamedTuple):
+    """What one carriage's motor shows: ohm, V s and kg m2 as in `[motor]`, with the half widths of their intervals."""
+
+    resistance_ohm: tuple[float, float]
+    back_emf_V_s: tuple[float, float]
+    inertia_kg_m2: tuple[float, float]
+
+
+def carriages(known: Known) -> Course[list[Finding]]:
+    """Jump and swing over the range: each carriage's gain and lag, its motor, and the loop's margin with that motor."""
+    levels_N = [known.force_N(share) for share in JUMP_SHARES]
+    yield from ready(levels_N[0])
+    times_s, forces_N = (0.0, SLOW_S, 2.0 * SLOW_S), (levels_N[0], known.most_N, levels_N[0])
+    slow = yield from watch(times_s[-1], lambda t_s: float(np.interp(t_s, times_s, forces_N)))
+    jumps = yield from watch(JUMP_S * len(levels_N), lambda t_s: levels_N[min(int(t_s / JUMP_S), len(levels_N) - 1)])
+    found: list[Finding] = []
+    swings: list[Columns] = []
+    for at_Hz in SINES_HZ:
+        swing_N = min(SWING_N_S / (math.tau * at_Hz), 0.25 * (known.most_N - levels_N[0]))
+        sine = yield from watch(SINE_S, _sine(levels_N[-1], swing_N, at_Hz))
+        swings.append(sine)
+        if at_Hz == AT_HZ:
+            found = [each for side in SIDES for each in _answers(sine, side)]
+    ticks = {name: np.concatenate([each[name] for each in (jumps, *swings)]) for name in jumps}
+    driven = [_driven(known, ticks, side) for side in SIDES]
+    for side, motor in zip(SIDES, driven, strict=True):
+        found += [*_motor_findings(known, side, motor), _friction(known, slow, side, motor)]
+    margin_dB = margins(identified(known.config.motor, driven), known.config.position, known.period_s).gain_margin_dB
+    return [*found, finding("gain margin of the position loop", margin_dB, "dB", (6.0, 200.0), GAINS)]
+
+
+def _sine(middle_N: float, swing_N: float, at_Hz: float) -> Callable[[float], float]:
+    return lambda t_s: middle_N + swing_N * math.sin(math.tau * at_Hz * t_s)
+
+
+def _answers(ticks: Columns, side: str) -> list[Finding]:
+    """Return how one carriage answers the sine at AT_HZ: its gain and lag against half of the gap's reference."""
+    times_s = ticks["monotonic_s"] - ticks["monotonic_s"][0]
+    whole = (times_s >= 1.0 / AT_HZ) & (times_s < math.floor(SINE_S * AT_HZ) / AT_HZ)
+    turning = np.exp(-2j * math.pi * AT_HZ * times_s[whole])
+
+    def swing(values: Array) -> complex:
+        return complex(np.mean((values[whole] - values[whole].mean()) * turning))
+
+    ratio = swing(ticks[f"{side}_mm"]) / (swing(ticks["reference_gap_mm"]) / 2.0 or math.nan)
+    lag_s = -math.atan2(ratio.imag, ratio.real) / (math.tau * AT_HZ)
+    return [
+        finding(f"{side} carriage's gain at {AT_HZ:g} Hz", abs(ratio), "", (0.9, 1.1), WEAK),
+        finding(f"{side} carriage's lag at {AT_HZ:g} Hz", lag_s, "ms", (0.0, 12.0), WEAK, 1e3),
+    ]
+
+
+def _driven(known: Known, ticks: Columns, side: str) -> Driven:
+    """Return what a motor shows of itself, by two regressions in the units of the carriage.
+
+    Windings: V = R i + L di/dt + K v. Gearbox: i = m a + sign(v) c + p(x) + d v, where p is as the magnets' pull over
+    the gap.
+    """
+    motor, period_s = known.config.motor, known.period_s
+    window = max(round(WINDOW_S / period_s), 1) | 1
+    kernel = np.convolve(np.full(window, 1.0 / window), np.full(window, 1.0 / window))
+
+    def smooth(values: Array) -> Array:
+        return np.convolve(values, kernel, "same")
+
+    # a tick's duty acts until the next tick's measurement
+    volts, current_A = smooth(np.roll(ticks[f"{side}_duty"], 1) * ticks["supply_V"]), smooth(ticks[f"{side}_current_A"])
+    speed_m_s = np.gradient(smooth(ticks[f"{side}_mm"])) * 1e-3 / period_s
+    pull = smooth((ticks["left_mm"] + ticks["right_mm"] + PULL_DEPTH_MM) ** -4.0)
+    slope_A_s, acceleration = np.gradient(current_A) / period_s, np.gradient(speed_m_s) / period_s
+    moves = (np.abs(speed_m_s) > MOVING_M_S) & np.isfinite(volts + current_A + speed_m_s)
+    moves &= np.abs(smooth(np.sign(speed_m_s))) > 0.98
+    kept = np.flatnonzero(moves)[window:-window:THINNED]
+    blocks = np.floor(ticks["monotonic_s"][kept])
+    ones = np.ones_like(volts)
+    electric = np.column_stack([column[kept] for column in (current_A, speed_m_s, slope_A_s, ones)])
+    mechanical = np.column_stack([column[kept] for column in (acceleration, np.sign(speed_m_s), pull, speed_m_s)])
+    (ohm, emf, *_), (ohm_width, emf_width, *_) = fitted(electric, volts[kept], blocks)
+    (mass, *_), (mass_width, *_) = fitted(mechanical, current_A[kept], blocks)
+    advance_m_rad = motor.screw_lead_mm * 1e-3 / (math.tau * motor.gear_ratio)
+    inertia = emf * advance_m_rad**2
+    return Driven(
+        (float(ohm), float(ohm_width)),
+        (float(emf * advance_m_rad), float(emf_width * advance_m_rad)),
+        (float(mass * inertia), float(mass_width * inertia)),
+    )
+
+
+def _motor_findings(known: Known, side: str, driven: Driven) -> list[Finding]:
+    motor = known.config.motor
+
+    def over(
+        name: str, seen: tuple[float, float], nominal: float, allowed: tuple[float, float], remedy: str
+    ) -> Finding:
+        value = seen[0] / nominal if math.isfinite(seen[0]) else None
+        return Finding(f"{side} {name}", value, seen[1] / nominal, "", *allowed, remedy)
+
+    return [
+        over("resistance over motor.resistance_ohm", driven.resistance_ohm, motor.resistance_ohm, (0.75, 1.25), PLUG),
+        over("voltage for speed over the configured", driven.back_emf_V_s, motor.back_emf_V_s, (0.88, 1.12), SCALE),
+        over("inertia over motor.inertia_kg_m2", driven.inertia_kg_m2, motor.inertia_kg_m2, (0.6, 2.2), COUPLED),
+    ]
+
+
+def _friction(known: Known, ticks: Columns, side: str, driven: Driven) -> Finding:
+    """Return a carriage's dry friction over the configured: half of what opening takes more of force than closing.
+
+    It is of the closer half of a slow way to and fro, where the magnets press most on the screw.
+    """
+    motor, window = known.config.motor, max(round(SMOOTH_S / known.period_s), 1)
+    flat = np.full(window, 1.0 / window)
+    current_A, place_mm = (np.convolve(ticks[f"{side}_{name}"], flat, "same") for name in ("current_A", "mm"))
+    speed = np.gradient(place_mm) / known.period_s
+    speed[:window] = speed[-window:] = 0.0
+    close = place_mm < np.median(place_mm)
+    opening, closing = (current_A[close & (goes > SLOWEST_MM_S)] for goes in (speed, -speed))
+    if not opening.size or not closing.size:
+        return finding(f"{side} friction over the configured", math.nan, "", (0.7, 1.12), GREASE)
+    nominal = motor.coulomb_V / motor.resistance_ohm * motor.back_emf_V_s
+    share = (opening.mean() - closing.mean()) / 2.0 * driven.back_emf_V_s[0] / nominal
+    return finding(f"{side} friction over the configured", float(share), "", (0.7, 1.12), GREASE)
+
+
+def identified(motor: Motor, driven: Sequence[Driven]) -> Motor:
+    """Return `motor` with the means of what the carriages show, where that is known."""
+    means = {name: float(np.mean([getattr(each, name)[0] for each in driven])) for name in Driven._fields}
+    return msgspec.structs.replace(motor, **{name: value for name, value in means.items() if math.isfinite(value)})

@@ -1,0 +1,206 @@
+"""What the force shows: the sensor, the force over gap and rate, how steps are followed, and the element's memory."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.commission.course import (
+    MOVING_MM_S,
+    PLACES,
+    Asked,
+    Columns,
+    Course,
+    Row,
+    StoppedError,
+    columns_of,
+    given,
+    handle_moved,
+    watch,
+)
+from tormagd.commission.finding import Array, Finding, finding
+from tormagd.commission.known import Known
+from tormagd.commission.regression import fitted
+
+SLIDING_MM_S = 20.0
+"A handle that is at least so fast has friction at speed, whatever its Stribeck speed."
+MIN_SLIDING = 0.3
+"A handle that moves for less than this share of the time has taught little."
+HOLD_S = 10.0
+RAMPS_S = (6.0, 4.0, 4.0)
+"Time from the least to the most force; then the same time back."
+STEP_SHARES = (1.0, 0.0, 0.5, 1.0, 0.25, 0.75)
+"Levels of the steps, as shares of the range: none was held before."
+STEP_S, ARRIVED_S = 2.0, 1.0
+"How long a step is held, and what of that is left to the carriages and the daemon's learning."
+ENABLE_S = 2.0
+_STATE = PLACES["operating_state"]
+RESTED_S, RISEN_S, HELD_S = 4.0, 0.5, 6.0
+FAST_MM_S = 40.0
+WORN = "compare the insert with the scene's; replace one that is worn or swollen"
+STRENGTH = (0.65, 1.5)
+SENSOR = "tare the sensor, look at its cable, shielding and supply"
+ELEMENT = (
+    "hang up a weight (--weight-N): it tells the sensor's gain from magnets and insert. Compare both with the scene"
+)
+
+
+def enabled(force_N: float) -> Course[None]:
+    """Enable a device that is not, with `force_N` as the setpoint. Raises StoppedError as `given`."""
+    rows: Sequence[Row] = ()
+    while not rows:
+        _, rows = yield Asked(force_N)
+    if rows[-1][_STATE] != "ENABLED":
+        yield from given("enable", lambda row: bool(row[_STATE] == "ENABLED"), ENABLE_S, force_N)
+
+
+def ready(force_N: float) -> Course[None]:
+    """Enable a device that is not, at `force_N`, and wait until its handle moves. Raises StoppedError."""
+    yield from enabled(force_N)
+    yield from handle_moved(force_N)
+
+
+def sensor(known: Known) -> Course[list[Finding]]:
+    """Hold one force on a handle that moves both ways: the sensor's zero, noise and resolution, and force over rate."""
+    held_N = known.force_N(0.4)
+    yield from ready(held_N)
+    ticks = yield from watch(HOLD_S, lambda t_s: held_N)
+    later = {name: values[len(values) // 5 :] for name, values in ticks.items()}
+    require_sliding(later)
+    raw_N, speed = later["device_force_N"], np.abs(later["handle_rate_mm_s"])
+    way = _way(known, later)
+    halves = [
+        (np.mean(force[goes > 0]) + np.mean(force[goes < 0])) / 2.0
+        for force, goes, fast in _blocks(raw_N, way, speed > SLIDING_MM_S)
+        if (goes[fast] > 0).any() and (goes[fast] < 0).any()
+        for force, goes in [(force[fast], goes[fast])]
+    ]
+    jumps_N = np.abs(np.diff(raw_N))
+    over_model = later["measured_cf"] / later["predicted_cf"]
+    slow, fast = (over_model[(speed > low) & (speed <= high)] for low, high in ((MOVING_MM_S, 25.0), (40.0, np.inf)))
+    still = jumps_N[(speed[1:] > SLIDING_MM_S) & (jumps_N > 0.0)]
+    return [
+        finding("sensor's zero", np.array(halves), "mN", (-60.0, 60.0), SENSOR, 1e3),
+        finding(
+            "sensor's noise", np.sqrt(np.mean(still**2) / 2.0) if still.size else np.nan, "mN", (0.0, 40.0), SENSOR, 1e3
+        ),
+        finding("sensor's resolution", jumps_N[jumps_N > 1e-6].min(initial=np.inf), "mN", (0.0, 25.0), SENSOR, 1e3),
+        finding(
+            "force when slow over force at speed, to the model's",
+            float(np.nanmean(slow) / np.nanmean(fast)) if slow.size and fast.size else np.nan,
+            "",
+            (0.85, 1.15),
+            "clean shaft and insert; train the insert with these motions",
+        ),
+    ]
+
+
+def force_over_gap(known: Known) -> Course[list[Finding]]:
+    """Go slowly over the whole range and back: the device's force over the model's, and the screws' friction."""
+    low_N, high_N = known.force_N(0.0), known.force_N(1.0)
+    yield from ready(low_N)
+    times_s = np.cumsum([0.0, *(lasts_s for lasts_s in RAMPS_S for _ in range(2))])
+    forces_N = [low_N, *(len(RAMPS_S) * [high_N, low_N])]
+    try:
+        ticks = yield from watch(float(times_s[-1]), lambda t_s: float(np.interp(t_s, times_s, forces_N)))
+    except StoppedError as error:
+        # the daemon stops a device that no believable one is: the row says how far off it is
+        error.found = [_strength(columns_of(error.rows))]
+        raise
+    require_sliding(ticks)
+    slides = np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S
+    errors_N = (ticks["measured_cf"] - ticks["predicted_cf"])[slides]
+    means_N = np.array([np.nanmean(part) for part in np.array_split(errors_N, max(len(errors_N) // 50, 1))])
+    off_N = np.sqrt(np.mean(means_N**2))
+    return [
+        _strength(ticks),
+        finding("force over gap, off the learned curve by", off_N, "mN", (0.0, 45.0), ELEMENT, 1e3),
+    ]
+
+
+def _strength(ticks: Columns) -> Finding:
+    """Return the device's force over the model's: what magnets, insert and the sensor's gain share."""
+    slides = (np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S) & (ticks["predicted_cf"] > 0.0)
+    over_model = (ticks["trim"] * ticks["measured_cf"] / ticks["predicted_cf"])[slides]
+    return finding("force over the model's: magnets, insert, or sensor's gain", over_model, "", STRENGTH, ELEMENT)
+
+
+def steps(known: Known) -> Course[list[Finding]]:
+    """Step over the range: how exactly steps are followed, and how far carriages overshoot and stand apart."""
+    levels_N = [known.force_N(share) for share in STEP_SHARES]
+    yield from ready(levels_N[1])
+    yield from watch(ARRIVED_S, lambda t_s: levels_N[1])
+    ticks = yield from watch(STEP_S * len(levels_N), lambda t_s: levels_N[min(int(t_s / STEP_S), len(levels_N) - 1)])
+    require_sliding(ticks)
+    errors_N, overshoots = [], []
+    since_s = ticks["monotonic_s"] - ticks["monotonic_s"][0]
+    slides = np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S
+    gap_mm, reference_mm = ticks["left_mm"] + ticks["right_mm"], ticks["reference_gap_mm"]
+    for number, level_N in enumerate(levels_N):
+        is_in = (since_s >= number * STEP_S) & (since_s < (number + 1) * STEP_S)
+        settled = is_in & slides & (since_s >= number * STEP_S + ARRIVED_S)
+        errors_N.append(np.nanmean(ticks["measured_cf"][settled]) - level_N if settled.any() else np.nan)
+        gap, reference = gap_mm[is_in], reference_mm[is_in]
+        way_mm = reference[-1] - reference[0]
+        beyond_mm = np.max(np.sign(way_mm) * gap) - np.max(np.sign(way_mm) * reference)
+        overshoots.append(beyond_mm / abs(way_mm) if abs(way_mm) > 2.0 else 0.0)
+    apart_mm = np.abs(ticks["left_mm"] - ticks["right_mm"])
+    limit_mm = known.config.limits.skew_warning_mm
+    tune = "put the gains of this commissioning into the configuration"
+    return [
+        finding("steps, off the asked force in the mean", np.array(errors_N).mean(), "mN", (-60.0, 60.0), SENSOR, 1e3),
+        finding("steps, at worst", np.abs(errors_N).max(), "mN", (0.0, 100.0), SENSOR, 1e3),
+        finding("carriages overshoot", max(overshoots), "%", (0.0, 5.0), tune, 100.0),
+        finding("carriages apart, of 99 % of the time", np.percentile(apart_mm, 99), "mm", (0.0, limit_mm), tune),
+    ]
+
+
+def memory(known: Known) -> Course[list[Finding]]:
+    """Step up, hold that gap, and see how much of the force dies away between 0.5 and 5 s after the step."""
+    low_N, high_N = known.force_N(0.0), known.force_N(1.0)
+    yield from ready(low_N)
+    yield from watch(RESTED_S, lambda t_s: low_N)
+    yield from watch(RISEN_S, lambda t_s: high_N)
+    yield from given("pause", lambda row: bool(row[_STATE] == "PAUSED"), ENABLE_S, high_N)
+    ticks = yield from watch(HELD_S, lambda t_s: high_N, states=("PAUSED",))
+    yield from given("resume", lambda row: bool(row[_STATE] == "ENABLED"), ENABLE_S, high_N)
+    since_s = ticks["monotonic_s"] - ticks["monotonic_s"][0] + RISEN_S
+    slides = (np.abs(ticks["handle_rate_mm_s"]) > FAST_MM_S) & np.isfinite(ticks["measured_cf"])
+    # F = a + b ln t, and the sensor's zero, which the handle's way turns over
+    rows = np.column_stack([np.ones_like(since_s), np.log(since_s / RISEN_S), _way(known, ticks)])[slides]
+    values, widths = fitted(rows, ticks["measured_cf"][slides], np.floor(since_s[slides]))
+    share = -math.log(10.0) / values[0]
+    dies = None if math.isnan(values[1]) else float(100.0 * share * values[1])
+    width = float(100.0 * abs(share * widths[1]))
+    return [Finding("force that dies away from 0.5 to 5 s", dies, width, "%", -2.0, 6.0, WORN)]
+
+
+def require_sliding(ticks: Columns) -> None:
+    """Raise StoppedError where the handle moved for less than MIN_SLIDING of the ticks."""
+    rates = ticks["handle_rate_mm_s"]
+    share = float(np.mean(np.abs(rates) >= MOVING_MM_S)) if rates.size else 0.0
+    if share < MIN_SLIDING:
+        raise StoppedError(
+            "handle_still",
+            f"the handle moved in {share:.0%} of the time: needed are {MIN_SLIDING:.0%}, at {MOVING_MM_S:g} mm/s",
+            "turn it to and fro until the gap opens",
+        )
+
+
+def _way(known: Known, ticks: Columns) -> Array:
+    """Return which way the handle goes on its encoder, 1 or -1."""
+    return np.sign(np.gradient(_smooth(ticks["device_handle_mm"], round(0.02 / known.period_s))))
+
+
+def _smooth(values: Array, window: int) -> Array:
+    """Return the running mean over `window` values; at both ends the first and the last go on."""
+    window = max(window, 1) | 1
+    padded = np.pad(values, window // 2, mode="edge")
+    return np.convolve(padded, np.full(window, 1.0 / window), "valid")
+
+
+def _blocks(*columns: npt.NDArray[Any]) -> list[tuple[npt.NDArray[Any], ...]]:
+    """Return columns in five equal parts."""
+    return list(zip(*(np.array_split(column, 5) for column in columns), strict=True))

@@ -1,0 +1,80 @@
+"""The page of a commissioning: a row for each finding, in one HTML file."""
+
+from datetime import UTC, datetime
+from html import escape
+
+from tormagd.commission.finding import Finding
+from tormagd.commission.report import Report
+from tormagd.commission.sequence import STEPS
+from tormagd.dashboard.html import page, table
+
+HEADS = ("", "measured", "allowed", "", "what to do", "last time", "difference")
+KIT = "python -m firmware_protocol.conformance PORT --json > FILE, then --conformance FILE"
+
+
+def page_of(report: Report) -> str:
+    """Return the HTML page of `report`."""
+    parts = [
+        f"<h1>Commissioning of device {report.serial_number}</h1>",
+        f"<p>Begun {_date(report.began_ns)}{_before(report)}.</p>",
+        _verdict(report),
+        "<h2>Conformance of the firmware</h2>",
+        _conformance(report),
+    ]
+    for step in STEPS:
+        parts.append(f"<h2>{escape(step.name.capitalize())}</h2>")
+        if found := report.findings.get(step.name):
+            rows = [_row(each, report.last.get(each.name)) for each in found]
+            parts.append(table(HEADS, rows, [not each.is_fine for each in found]))
+        else:
+            parts.append(f"<p>{_absent(report, step.name)}</p>")
+    return page(f"Commissioning of device {report.serial_number}", parts)
+
+
+def _absent(report: Report, step: str) -> str:
+    is_without = step == "weight" and report.weight_N is None
+    return "No weight was given: --weight-N tells the sensor's gain." if is_without else "Not done."
+
+
+def _verdict(report: Report) -> str:
+    """Say how it ended, and what failed."""
+    said = []
+    if report.stopped is not None:
+        stopped = report.stopped
+        said.append(
+            f"Stopped in step {stopped.step}: {stopped.cause} ({stopped.code}). The gap was told to open. "
+            f"What to do: {stopped.remedy}; then the same command with --resume."
+        )
+    elif not report.is_whole:
+        said.append("It has not ended. The same command with --resume goes on.")
+    if report.failed:
+        said.append(f"Failed: {', '.join(each.name for each in report.failed)}.")
+    if said:
+        return "".join(f'<p class="bad">{escape(line)}</p>' for line in said)
+    return "<p>Every row passed.</p>"
+
+
+def _conformance(report: Report) -> str:
+    """Show what did not pass of the kit's report, or say that none was given."""
+    if report.conformance is None:
+        return f"<p>No report was given. The kit owns the device, so it runs without the daemon: {escape(KIT)}</p>"
+    if not report.conformance:
+        return "<p>All checks of the report passed.</p>"
+    return table(("check", "seen", "expected"), report.conformance, [True] * len(report.conformance))
+
+
+def _row(each: Finding, last: float | None) -> list[str]:
+    """Return a finding's cells, under HEADS."""
+    verdict, remedy = ("pass", "") if each.is_fine else ("FAIL", each.remedy)
+    since = ("", "")
+    if last is not None and each.value is not None:
+        since = (f"{last:.4g}", f"{each.value - last:+.2g}")
+    return [each.name, each.shown, each.allowed, verdict, remedy, *since]
+
+
+def _date(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns * 1e-9, UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _before(report: Report) -> str:
+    return f"; the last one began {_date(report.last_ns)}" if report.last_ns else ""

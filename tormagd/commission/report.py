@@ -1,0 +1,59 @@
+"""What a commissioning leaves: its findings step by step, kept after each step, so that it can be resumed."""
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from tormagd.commission.finding import Finding
+from tormagd.commission.sequence import STEPS, Stopped
+
+MAX_BYTES = 200_000
+VERSION = 1
+
+
+class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A commissioning of one device: when it began, CLOCK_REALTIME, the findings by step, and how it ended.
+
+    `last` has the values of the one before, by name, and `last_ns` when that began. `conformance` are the lines of the
+    kit's report that did not pass; None: no report was given. `weight_N` is the weight that was hung up, None without.
+    """
+
+    v: Annotated[int, Meta(ge=VERSION, le=VERSION)] = VERSION
+    serial_number: int
+    began_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)]
+    findings: dict[str, list[Finding]] = {}
+    stopped: Stopped | None = None
+    weight_N: float | None = None
+    conformance: list[tuple[str, str, str]] | None = None
+    last: dict[str, float] = {}
+    last_ns: int = 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all steps were done."""
+        return self.stopped is None and all(
+            step.name in self.findings for step in STEPS if step.name != "weight" or self.weight_N is not None
+        )
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether all steps were done, and every value is allowed."""
+        return self.is_whole and not self.failed
+
+    @property
+    def failed(self) -> list[Finding]:
+        """The findings that are not allowed."""
+        return [each for found in self.findings.values() for each in found if not each.is_fine]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The known values by name."""
+        every = (each for found in self.findings.values() for each in found)
+        return {each.name: each.value for each in every if each.value is not None}
+
+
+def begun(before: Report | None, serial_number: int, now_ns: int, weight_N: float | None) -> Report:
+    """Return an empty report that begins now; `before` is the device's last one, None without."""
+    last, last_ns = ({}, 0) if before is None else (before.values or before.last, before.began_ns)
+    return Report(serial_number=serial_number, began_ns=now_ns, weight_N=weight_N, last=last, last_ns=last_ns)

@@ -1,0 +1,78 @@
+"""The sequence of a commissioning: its steps in their order, and what runs them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from tormagd.commission.at_rest import homing, link, way_back, weight
+from tormagd.commission.course import Asked, Course, StoppedError
+from tormagd.commission.finding import Finding
+from tormagd.commission.known import Known
+from tormagd.commission.of_carriages import carriages
+from tormagd.commission.of_force import force_over_gap, memory, sensor, steps
+
+Findings = Sequence[Finding]
+HANDLE = "turn the handle to and fro, about 20 turns a minute"
+
+
+class Step(NamedTuple):
+    """One step: its name, about how long it takes, s, what a person does meanwhile, and its course.
+
+    One that is `always` run prepares the device for the others, and is not left out where it was done before.
+    """
+
+    name: str
+    lasts_s: float
+    says: str
+    course: Callable[[Known], Course[list[Finding]]]
+    always: bool = False
+
+
+STEPS = (
+    Step("link and host", 3.0, "let go of the handle", link),
+    Step("homing", 6.0, "let go of the handle", homing, always=True),
+    Step("weight", 15.0, "let go of the handle; in three seconds hang the weight from the sensor", weight),
+    Step("sensor", 12.0, HANDLE, sensor),
+    Step("force over gap", 30.0, HANDLE, force_over_gap),
+    Step("steps", 14.0, HANDLE, steps),
+    Step("carriages", 34.0, HANDLE, carriages),
+    Step("memory", 13.0, HANDLE, memory),
+    Step("way back", 4.0, "let go of the handle", way_back, always=True),
+)
+
+
+class Stopped(msgspec.Struct, frozen=True):
+    """Why a sequence ended early: in which step, with which code, the cause in a sentence, and what to do."""
+
+    step: str
+    code: str
+    cause: str
+    remedy: str
+
+
+def sequence(
+    steps: Sequence[Step],
+    known: Known,
+    done: Mapping[str, Findings],
+    begins: Callable[[Step], object],
+    ends: Callable[[Step, Findings], object],
+) -> Course[Stopped | None]:
+    """Run the `steps` that are not `done`, and return why it stopped early, None where all were done.
+
+    `begins` is told each step, `ends` each step's findings. A device that stops is told to open the gap.
+    """
+    for step in steps:
+        if step.name in done and not step.always:
+            continue
+        if step.name == "weight" and known.weight_N is None:
+            continue
+        begins(step)
+        try:
+            ends(step, (yield from step.course(known)))
+        except StoppedError as error:
+            if error.found:
+                ends(step, error.found)
+            yield Asked(command="disable")
+            return Stopped(step.name, error.code, error.cause, error.remedy)
+    return None

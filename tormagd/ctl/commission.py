@@ -1,0 +1,142 @@
+"""`tormagctl commission`: judge the device that is plugged in, step by step, and write one page on it."""
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tormagd.bounded_file import in_place_of, read_bounded
+from tormagd.commission.calibration import calibration
+from tormagd.commission.known import Known
+from tormagd.commission.page import page_of
+from tormagd.commission.report import MAX_BYTES, Report, begun
+from tormagd.commission.sequence import STEPS, Findings, Step, Stopped, sequence
+from tormagd.config import Config
+from tormagd.ctl.calibrate import agree
+from tormagd.ctl.calibrate_run import Run, connected, known_of
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
+from tormagd.output import write_line
+from tormagd.scenes.scene import load_scene
+from tormagd_client.blocking import Client
+from tormagd_client.endpoints import ConfigError, Endpoints
+from tormagd_client.errors import ClientError
+
+SOURCE = "commission"
+
+
+class _Conformance(msgspec.Struct):
+    """What is read of the conformance kit's report."""
+
+    checks: list["_Check"]
+
+
+class _Check(msgspec.Struct):
+    name: str
+    passed: bool
+    seen: str
+    expected: str
+
+
+def commission(
+    config: Config,
+    endpoints: Endpoints,
+    wait_s: float,
+    folder: Path,
+    is_resumed: bool,
+    weight_N: float | None,
+    conformance: Path | None,
+    is_agreed: bool,
+) -> Outcome:
+    """Run all steps on the device, and keep findings and page in `folder`, named by its serial number.
+
+    Findings and page are written after each step. `is_resumed` goes on with those that are there. `conformance` is the
+    kit's report. The outcome is REFUSED where a row failed or the device stopped. Raises CommandError (USAGE) for files
+    that cannot be read or written, and as `known_of`, `Run.follow` and `calibrate.agree`; the gap opens then, too.
+    """
+    checks = None if conformance is None else _failed_checks(conformance)
+    with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
+        scene = load_scene(config.scene)
+    with Client(endpoints, wait_s, SOURCE) as client:
+        known = known_of(config, client, scene.force.most_N, weight_N)
+        serial_number = client.status().link.serial_number
+        if serial_number is None:
+            raise CommandError(Exit.REFUSED, "no_device", "no device is connected", "tormagctl firmware says why")
+        path = folder / f"{serial_number:08x}.json"
+        before = _read(path)
+        if is_resumed and before is None:
+            raise usage_error(f"{path}: there is nothing to resume", "leave --resume out")
+        report = before if is_resumed and before else begun(before, serial_number, time.time_ns(), weight_N)
+        kept = Kept(path, msgspec.structs.replace(report, stopped=None, conformance=checks or report.conformance))
+        if not is_agreed:
+            agree()
+        with connected(endpoints, client) as run:
+            kept.follow(run, known)
+    report = kept.report
+    if report.is_whole:
+        kept.write(".toml", calibration(report, config))
+    text = [f"{path.with_suffix('.html')}: {'all rows passed' if report.is_sound else 'not all rows passed'}"]
+    text += [f"{each.name}: {each.shown}, allowed {each.allowed}\n  next: {each.remedy}" for each in report.failed]
+    if report.stopped is not None:
+        text.append(f"stopped in {report.stopped.step}: {report.stopped.cause}\n  next: {report.stopped.remedy}")
+    result = {"page": str(path.with_suffix(".html")), **msgspec.to_builtins(report)}
+    return Outcome(result, "\n".join(text), Exit.DONE if report.is_sound else Exit.REFUSED)
+
+
+class Kept:
+    """A report that is written to its file, with the page beside it, after each step."""
+
+    def __init__(self, path: Path, report: Report) -> None:
+        """Begin with `report`, and write it. Raises CommandError (USAGE) where it cannot be written."""
+        self._path, self.report, self._step = path, report, ""
+        self._write()
+
+    def follow(self, run: Run, known: Known) -> None:
+        """Run the steps that are not done. Why it stopped is written, too, also where it raises as `Run.follow`."""
+
+        def begins(step: Step) -> None:
+            self._step = step.name
+            number = STEPS.index(step) + 1
+            write_line(f"step {number} of {len(STEPS)}, {step.name}: {step.says}", sys.stderr)
+            run.progress.begin(step.name, step.lasts_s)
+
+        def ends(step: Step, found: Findings) -> None:
+            run.progress.end()
+            self._note(findings=self.report.findings | {step.name: list(found)})
+
+        try:
+            self._note(stopped=run.follow(sequence(STEPS, known, self.report.findings, begins, ends)))
+        except ClientError as error:
+            self._note(stopped=Stopped(self._step, error.code, error.message, error.hint))
+            raise
+
+    def _note(self, **changes: Any) -> None:
+        self.report = msgspec.structs.replace(self.report, **changes)
+        self._write()
+
+    def _write(self) -> None:
+        self.write(".json", msgspec.json.format(msgspec.json.encode(self.report)).decode() + "\n")
+        self.write(".html", page_of(self.report))
+
+    def write(self, suffix: str, text: str) -> None:
+        """Write the report's file with this suffix, whole or not at all. Raises CommandError (USAGE)."""
+        with as_usage_error(OSError, hint="give a folder that you may write to"):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with in_place_of(self._path.with_suffix(suffix)) as beside:
+                beside.write_text(text, encoding="utf-8")
+
+
+def _read(path: Path) -> Report | None:
+    """Read a report; None where there is none. Raises CommandError (USAGE) for a file that is no report."""
+    if not path.exists():
+        return None
+    with as_usage_error(OSError, msgspec.DecodeError, RecursionError, hint=f"{path} is no report: move it away"):
+        return msgspec.json.decode(read_bounded(path, MAX_BYTES), type=Report)
+
+
+def _failed_checks(path: Path) -> list[tuple[str, str, str]]:
+    """Return the checks of a conformance report that did not pass. Raises CommandError (USAGE) for another file."""
+    with as_usage_error(OSError, msgspec.DecodeError, RecursionError, hint="give what the kit prints with --json"):
+        report = msgspec.json.decode(read_bounded(path, MAX_BYTES), type=_Conformance)
+    return [(each.name, each.seen, each.expected) for each in report.checks if not each.passed]
