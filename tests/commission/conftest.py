@@ -20,7 +20,7 @@ from tormagd.hardware.frame_stream import FrameStream
 from tormagd.safety.operating_state import RefusedError
 from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
-from tormagd.simulation.hand import ReversingHand
+from tormagd.simulation.hand import Hand, ReversingHand
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.plant import Truth
 from tormagd_client.messages import TickRecord
@@ -64,10 +64,11 @@ class Bench:
         faults: Iterable[str] = (),
         alters: Altered = lambda now_s, message: message,
         stall_ticks: int = 0,
+        hand: Hand = ReversingHand(2.0),  # noqa: B008  # immutable
     ) -> None:
         core = build_core(CONFIG)
         self.least_N = core.portrait.min_N
-        device = VirtualDevice(plant, ReversingHand(2.0), [parse_fault(fault) for fault in faults], seed=3)
+        device = VirtualDevice(plant, hand, [parse_fault(fault) for fault in faults], seed=3)
         self.loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), AlteringLine(device, alters))
         self._stall_ticks = stall_ticks
         self.ends_s = math.inf

@@ -10,7 +10,8 @@ from firmware_protocol.codec import Sense, State
 from tormagd.commission.page import page_of
 from tormagd.commission.report import Report, begun
 from tormagd.commission.sequence import STEPS, Stopped
-from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant, with_insert
 
 SAMPLE = load_plant("sample_1")
 AT_REST = ("link and host", "homing")
@@ -38,7 +39,7 @@ def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench):
     assert "No report was given" in page
     assert page.count("<td>pass</td>") == sum(map(len, found.values())) > 30
     kept = msgspec.json.decode(msgspec.json.encode(report), type=Report)
-    assert "+0" in page_of(msgspec.structs.replace(begun(kept, 7, 1, None), findings=found))
+    assert "<td>+0</td>" in page_of(msgspec.structs.replace(begun(kept, 7, 1, None), findings=found))
 
 
 def slipping():
@@ -78,6 +79,12 @@ NOISE = random.Random(1)
         (("sensor",), {"alters": sensing(lambda force_N: force_N + 0.2)}, "sensor's zero"),
         (("sensor",), {"alters": sensing(lambda force_N: force_N + NOISE.gauss(0.0, 0.06))}, "sensor's noise"),
         (("sensor",), {"alters": sensing(lambda force_N: 0.05 * round(force_N / 0.05))}, "sensor's resolution"),
+        (("carriages",), {"plant": with_part("screw", friction_coefficient=0.7)}, "left friction over the configured"),
+        (
+            ("memory",),
+            {"plant": with_part("relaxation", fractions=(0.2, 0.16, 0.16))},
+            "force that dies away from 0.5 to 5 s",
+        ),
         (("steps", "way back"), {"alters": slipping()}, "left switch, after the forces, at"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -85,6 +92,35 @@ NOISE = random.Random(1)
 def test_the_row_of_what_a_fault_changes_turns_red(bench, steps, device, expected):
     found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
     assert (expected in red(found), stopped) == (True, None)
+
+
+WEAK_MAGNET = {"plant": with_part("field", coefficient=0.72 * SAMPLE.field.coefficient)}
+WRONG_INSERT = {"plant": with_insert(SAMPLE, "MRE-10-10")}
+LOW_GAIN = {"alters": sensing(lambda force_N: 0.55 * force_N)}
+
+
+@pytest.mark.parametrize("device", [WEAK_MAGNET, WRONG_INSERT, LOW_GAIN], ids=["magnet", "insert", "gain"])
+def test_weak_magnet_wrong_insert_and_sensor_gain_share_a_row_that_names_them(bench, device):
+    found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen("force over gap"))
+    assert stopped is None or stopped.code == "SENSOR"
+    assert red(found)[0] == "force over the model's: magnets, insert, or sensor's gain"
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.55])
+def test_a_weight_tells_the_sensors_gain(bench, gain):
+    """2 N hang from the sensor from 10 s on."""
+    hung = bench(
+        SAMPLE,
+        hand=SteadyHand(0.0),
+        alters=lambda now_s, message: (
+            message.replaced(force_N=gain * (message.force_N + 2.0 * (now_s > 10.0)))
+            if isinstance(message, Sense)
+            else message
+        ),
+    )
+    found, stopped = hung.commission(chosen("weight"), weight_N=2.0)
+    assert (found["weight"][0].value, stopped) == (pytest.approx(gain, abs=0.02), None)
+    assert red(found) == ([] if gain == 1.0 else ["sensor's gain, by the weight"])
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,16 @@ from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.commission import course
 from tormagd.commission.finding import Finding
+from tormagd.commission.sequence import Stopped
 from tormagd.config import Config
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
-from tormagd.ctl import calibrate as ctl_calibrate, calibrate_device, calibrate_motors as ctl_calibrate_motors
+from tormagd.ctl import (
+    calibrate as ctl_calibrate,
+    calibrate_device,
+    calibrate_motors as ctl_calibrate_motors,
+    commission as ctl_commission,
+)
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
 from tormagd.ctl.calibrate_run import Progress, Range
@@ -398,3 +404,24 @@ def test_a_device_is_learned_judged_and_kept(calibrated) -> None:
 )
 def test_what_taught_nothing_is_refused(calibrated, status, told) -> None:
     assert calibrated(**status).ended(1).error["code"] == told
+
+
+# -- `commission`: the files that it leaves; tests/commission has its steps -----------------------------------------
+
+
+def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon, monkeypatch, tmp_path, ctl) -> None:
+    stopped = Stopped("steps", "handle_still", "the handle stood still", "turn it")
+    monkeypatch.setattr(ctl_commission, "connected", lambda *_: contextlib.nullcontext(Played(stopped)))
+    fake_daemon.says(setpoint_age_ms=None, least_N=0.6)
+    command = [*fake_daemon.at, "--json", "commission", str(tmp_path), "--yes"]
+    assert "nothing to resume" in ctl(*command, "--resume").ended(2).error["message"]
+    kit = tmp_path / "kit.json"
+    kit.write_text('{"checks": [{"name": "reset", "passed": false, "seen": "none", "expected": "one"}]}')
+    result = ctl(*command, "--conformance", str(kit)).ended(1).result
+    page = Path(result["page"]).read_text(encoding="utf-8")
+    assert [words for words in ("Stopped in step steps", "turn it", "<td>reset</td>") if words not in page] == []
+    assert ctl(*command, "--resume").ended(1).result["conformance"] == result["conformance"]
+    kit.write_text("[]")
+    assert "kit prints" in ctl(*command, "--conformance", str(kit)).ended(2).error["hint"]
+    Path(result["page"]).with_suffix(".json").write_text("{}")
+    assert "is no report" in ctl(*command).ended(2).error["hint"]

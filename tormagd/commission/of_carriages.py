@@ -21,6 +21,8 @@ JUMP_S = 0.6
 SLOW_S = 6.0
 "Time of the slow way, to and fro each."
 SMOOTH_S, SLOWEST_MM_S = 0.2, 0.5
+FRICTION = (0.7, 1.16)
+"Most of it is the gearbox's: a screw that runs dry adds a fifth."
 SINES_HZ = (1.0, 2.0, 4.0, 8.0)
 SINE_S = 3.0
 SWING_N_S = 1.6
@@ -157,10 +159,10 @@ def _friction(known: Known, ticks: Columns, side: str, driven: Driven) -> Findin
     close = place_mm < np.median(place_mm)
     opening, closing = (current_A[close & (goes > SLOWEST_MM_S)] for goes in (speed, -speed))
     if not opening.size or not closing.size:
-        return finding(f"{side} friction over the configured", math.nan, "", (0.7, 1.12), GREASE)
+        return finding(f"{side} friction over the configured", math.nan, "", FRICTION, GREASE)
     nominal = motor.coulomb_V / motor.resistance_ohm * motor.back_emf_V_s
     share = (opening.mean() - closing.mean()) / 2.0 * driven.back_emf_V_s[0] / nominal
-    return finding(f"{side} friction over the configured", float(share), "", (0.7, 1.12), GREASE)
+    return finding(f"{side} friction over the configured", float(share), "", FRICTION, GREASE)
 
 
 def identified(motor: Motor, driven: Sequence[Driven]) -> Motor:

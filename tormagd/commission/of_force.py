@@ -174,7 +174,7 @@ def memory(known: Known) -> Course[list[Finding]]:
     share = -math.log(10.0) / values[0]
     dies = None if math.isnan(values[1]) else float(100.0 * share * values[1])
     width = float(100.0 * abs(share * widths[1]))
-    return [Finding("force that dies away from 0.5 to 5 s", dies, width, "%", -2.0, 6.0, WORN)]
+    return [Finding("force that dies away from 0.5 to 5 s", dies, width, "%", -2.0, 4.5, WORN)]
 
 
 def require_sliding(ticks: Columns) -> None:

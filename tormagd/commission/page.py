@@ -8,7 +8,8 @@ from tormagd.commission.report import Report
 from tormagd.commission.sequence import STEPS
 from tormagd.dashboard.html import page, table
 
-HEADS = ("", "measured", "allowed", "", "what to do", "last time", "difference")
+FAIL = "FAIL"
+HEADS = ("step", "", "measured", "allowed", "", "what to do", "last time", "difference")
 KIT = "python -m firmware_protocol.conformance PORT --json > FILE, then --conformance FILE"
 
 
@@ -21,19 +22,11 @@ def page_of(report: Report) -> str:
         "<h2>Conformance of the firmware</h2>",
         _conformance(report),
     ]
-    for step in STEPS:
-        parts.append(f"<h2>{escape(step.name.capitalize())}</h2>")
-        if found := report.findings.get(step.name):
-            rows = [_row(each, report.last.get(each.name)) for each in found]
-            parts.append(table(HEADS, rows, [not each.is_fine for each in found]))
-        else:
-            parts.append(f"<p>{_absent(report, step.name)}</p>")
+    rows = [
+        ("" if number else step.name, *row) for step in STEPS for number, row in enumerate(_rows(report, step.name))
+    ]
+    parts += ["<h2>The device</h2>", table(HEADS, rows, [row[4] == FAIL for row in rows])]
     return page(f"Commissioning of device {report.serial_number}", parts)
-
-
-def _absent(report: Report, step: str) -> str:
-    is_without = step == "weight" and report.weight_N is None
-    return "No weight was given: --weight-N tells the sensor's gain." if is_without else "Not done."
 
 
 def _verdict(report: Report) -> str:
@@ -63,12 +56,19 @@ def _conformance(report: Report) -> str:
     return table(("check", "seen", "expected"), report.conformance, [True] * len(report.conformance))
 
 
+def _rows(report: Report, step: str) -> list[list[str]]:
+    """Return the cells of a step's findings, under HEADS without the first."""
+    if step not in report.findings:
+        is_without = step == "weight" and report.weight_N is None
+        return [["--weight-N was not given" if is_without else "not done", *[""] * 6]]
+    return [_row(each, report.last.get(each.name)) for each in report.findings[step]]
+
+
 def _row(each: Finding, last: float | None) -> list[str]:
-    """Return a finding's cells, under HEADS."""
-    verdict, remedy = ("pass", "") if each.is_fine else ("FAIL", each.remedy)
+    verdict, remedy = ("pass", "") if each.is_fine else (FAIL, each.remedy)
     since = ("", "")
     if last is not None and each.value is not None:
-        since = (f"{last:.4g}", f"{each.value - last:+.2g}")
+        since = (f"{last:.4g}", f"{round(each.value - last, 6):+.3g}")
     return [each.name, each.shown, each.allowed, verdict, remedy, *since]
 
 

@@ -38,8 +38,16 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     @property
     def is_sound(self) -> bool:
-        """Whether all steps were done, and every value is allowed."""
-        return self.is_whole and not self.failed
+        """Whether all steps were done, every value is allowed, and no check of the kit failed."""
+        return self.is_whole and not self.failed and not self.conformance
+
+    def resumed(self, weight_N: float | None) -> "Report":
+        """Return the report to go on with: without the step in which it stopped, and with the weight at hand now."""
+        findings = dict(self.findings)
+        if self.stopped is not None:
+            findings.pop(self.stopped.step, None)
+        known_N = self.weight_N if "weight" in findings else weight_N
+        return msgspec.structs.replace(self, findings=findings, stopped=None, weight_N=known_N)
 
     @property
     def failed(self) -> list[Finding]:

@@ -36,14 +36,14 @@ HOMING_S = 30.0
 
 
 def interrupted_run() -> CommandError:
-    """Return the error (REFUSED) for a run that the person ended: no model and no log is saved.
+    """Return the error (REFUSED) for a run that the person ended: what was under way is not saved.
 
-    Nor training data; the daemon may keep what it learned of the device.
+    The daemon may keep what it learned of the device.
     """
     return CommandError(
         Exit.REFUSED,
         "interrupted",
-        "interrupted: a device that was armed is disabled and opens its gap; there is no model and no log",
+        "interrupted: a device that was armed is disabled and opens its gap; what was under way is not saved",
         "run it again when you are ready",
     )
 
@@ -141,9 +141,9 @@ class Run(Device):
             self._client.publish(force_N, VALID_FOR_MS)
         self.progress.show()
         rows: list[Row] = []
-        while (left_s := due_s - time.monotonic()) > 0.0:
-            if self._ticks.poll(max(1, round(left_s * 1e3))):
-                rows += self._rows(self._ticks.recv_multipart()[-1])
+        # what waits is read even where this program came late
+        while self._ticks.poll(max(0, round((due_s - time.monotonic()) * 1e3))):
+            rows += self._rows(self._ticks.recv_multipart()[-1])
         if time.monotonic() - self._heard_s > SILENT_S:
             raise unreachable(self._endpoints.recording, f"no control ticks for {SILENT_S:g} s")
         return Heard(time.monotonic(), rows)

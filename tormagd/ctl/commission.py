@@ -67,8 +67,11 @@ def commission(
         before = _read(path)
         if is_resumed and before is None:
             raise usage_error(f"{path}: there is nothing to resume", "leave --resume out")
-        report = before if is_resumed and before else begun(before, serial_number, time.time_ns(), weight_N)
-        kept = Kept(path, msgspec.structs.replace(report, stopped=None, conformance=checks or report.conformance))
+        if is_resumed and before:
+            report = before.resumed(weight_N)
+        else:
+            report = begun(before, serial_number, time.time_ns(), weight_N)
+        kept = Kept(path, report if checks is None else msgspec.structs.replace(report, conformance=checks))
         if not is_agreed:
             agree()
         with connected(endpoints, client) as run:
