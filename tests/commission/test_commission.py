@@ -73,7 +73,7 @@ NOISE = random.Random(1)
     [
         ((), {"faults": ["answers_half"]}, "messages lost or damaged"),
         ((), {"plant": with_part("firmware", reply_jitter_us=5000.0)}, "periods with the device's answer"),
-        ((), {"faults": ["clock=+2%"]}, "device's clock runs fast by"),
+        (("way back",), {"faults": ["clock=+2%"]}, "device's clock runs fast by"),
         ((), {"plant": with_part("electronics", supply_V=10.0)}, "supply"),
         ((), {"stall_ticks": 2}, "periods kept"),
         (("sensor",), {"alters": sensing(lambda force_N: force_N + 0.2)}, "sensor's zero"),

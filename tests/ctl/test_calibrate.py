@@ -422,6 +422,7 @@ def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon,
     assert [words for words in ("Stopped in step steps", "turn it", "<td>reset</td>") if words not in page] == []
     assert ctl(*command, "--resume").ended(1).result["conformance"] == result["conformance"]
     kit.write_text("[]")
-    assert "kit prints" in ctl(*command, "--conformance", str(kit)).ended(2).error["hint"]
-    Path(result["page"]).with_suffix(".json").write_text("{}")
-    assert "is no report" in ctl(*command).ended(2).error["hint"]
+    assert "the kit prints" in ctl(*command, "--conformance", str(kit)).ended(2).error["hint"]
+    for broken in (b"{}", b'{"v": 1, "\xff": 1}'):
+        Path(result["page"]).with_suffix(".json").write_bytes(broken)
+        assert "is no report" in ctl(*command).ended(2).error["hint"]

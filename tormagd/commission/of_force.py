@@ -152,7 +152,7 @@ def steps(known: Known) -> Course[list[Finding]]:
     return [
         finding("steps, off the asked force in the mean", np.array(errors_N).mean(), "mN", (-60.0, 60.0), SENSOR, 1e3),
         finding("steps, at worst", np.abs(errors_N).max(), "mN", (0.0, 100.0), SENSOR, 1e3),
-        finding("carriages overshoot", max(overshoots), "%", (0.0, 5.0), tune, 100.0),
+        finding("carriages overshoot", max(0.0, *overshoots), "%", (0.0, 5.0), tune, 100.0),
         finding("carriages apart, of 99 % of the time", np.percentile(apart_mm, 99), "mm", (0.0, limit_mm), tune),
     ]
 

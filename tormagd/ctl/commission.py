@@ -3,7 +3,7 @@
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -24,6 +24,7 @@ from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError
 
 SOURCE = "commission"
+Read = TypeVar("Read")
 
 
 class _Conformance(msgspec.Struct):
@@ -132,14 +133,18 @@ class Kept:
 
 def _read(path: Path) -> Report | None:
     """Read a report; None where there is none. Raises CommandError (USAGE) for a file that is no report."""
-    if not path.exists():
-        return None
-    with as_usage_error(OSError, msgspec.DecodeError, RecursionError, hint=f"{path} is no report: move it away"):
-        return msgspec.json.decode(read_bounded(path, MAX_BYTES), type=Report)
+    return _decoded(path, Report, "it is no report: move it away") if path.exists() else None
 
 
 def _failed_checks(path: Path) -> list[tuple[str, str, str]]:
     """Return the checks of a conformance report that did not pass. Raises CommandError (USAGE) for another file."""
-    with as_usage_error(OSError, msgspec.DecodeError, RecursionError, hint="give what the kit prints with --json"):
-        report = msgspec.json.decode(read_bounded(path, MAX_BYTES), type=_Conformance)
+    report = _decoded(path, _Conformance, "give what the kit prints with --json")
     return [(each.name, each.seen, each.expected) for each in report.checks if not each.passed]
+
+
+def _decoded(path: Path, kind: type[Read], hint: str) -> Read:
+    with as_usage_error(OSError, ValueError, hint=hint):
+        try:
+            return msgspec.json.decode(read_bounded(path, MAX_BYTES), type=kind)
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}: {error}") from error
