@@ -13,7 +13,19 @@ from hypothesis import event, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
 from firmware_protocol.c.build import BuildError, load_library
-from firmware_protocol.codec import FUNCTION, Clear, DeviceMode, Drive, DriveMode, Home, Retract, Sense, State, Status
+from firmware_protocol.codec import (
+    FUNCTION,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Home,
+    Retract,
+    Sense,
+    State,
+    Status,
+)
 from firmware_protocol.framing import DELIMITER, cobs_decode
 from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop
@@ -58,6 +70,8 @@ HINDERING = (
     "switch_stuck_left",
 )
 "With these nothing can open the gap; named they are nevertheless."
+HELD = DeviceFault.SUPPLY | DeviceFault.HOMING_FAILED | DeviceFault.RETRACT_FAILED
+"Latched with these the device rests where it is, until somebody has cleared and homed it."
 DEAF, RESTS = ("commands_vanish", "other_schema"), (DeviceMode.IDLE, DeviceMode.LATCHED)
 "A device that was reset and hears nobody rests where it is."
 ASKED = {DeviceMode.HOMING: DeviceRequest.HOME, (DeviceMode.LATCHED, DeviceMode.IDLE): DeviceRequest.CLEAR}
@@ -160,7 +174,7 @@ class Together(RuleBasedStateMachine):
         # periods: in which the daemon last drove, asked for each request, and the device was reset; by when what is
         self.undriven = self.reset = self.hangs_until = 0
         self.asked = dict.fromkeys(DeviceRequest, 0)
-        self.open_by = 0.0
+        self.open_by, self.was_held = 0.0, False
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
@@ -316,7 +330,10 @@ class Together(RuleBasedStateMachine):
         """Whatever is lost, the gap is open in the time that opening takes."""
         gap_mm, now = self.loop.simulated.truth.gap_mm, self.line.period
         is_deaf = self.mode in RESTS and not self.struck.isdisjoint(DEAF)
-        if self.mode is DeviceMode.RUN or gap_mm > OPENED_MM or is_deaf or not self.struck.isdisjoint(HINDERING):
+        is_over = self.mode is DeviceMode.RUN or gap_mm > OPENED_MM
+        is_held = HELD & self.firmware.faults or not self.struck.isdisjoint(HINDERING)
+        self.was_held = not is_over and (self.was_held or bool(is_held))
+        if is_over or is_deaf or self.was_held:
             self.open_by = 0.0
             return
         if not self.open_by:
