@@ -45,7 +45,7 @@ class Part(NamedTuple):
 PARTS = {
     "fuzz": Part(
         "tools/endure.py fuzz --json",
-        "{executions[codec]:,} payloads, {executions[framing]:,} streams and {executions[device]:,} lives of a device "
+        "{executions[codec]:,} payloads, {executions[framing]:,} streams and {executions[device]:,} lives "
         "under sanitizers: {lines} of the lines that bytes can reach. C and Python differ {languages_differ} times",
     ),
     "replug-serial": Part(
