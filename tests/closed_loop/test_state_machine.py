@@ -205,6 +205,12 @@ class Together(RuleBasedStateMachine):
         self.run(ms)
 
     @precondition(lambda self: self.is_armed)
+    @rule(function=st.sampled_from(sorted(SILENT_MS)))
+    def fall_silent(self, function: int) -> None:
+        self.line.spells[UP, function] = (200, 0)
+        self.run(120)
+
+    @precondition(lambda self: self.is_armed)
     @rule(name=st.sampled_from(["pause", "disable", "stop"]), ms=MS)
     def let_go(self, name: str, ms: int) -> None:
         self.give(name)
@@ -352,7 +358,7 @@ def library() -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("library")
 def test_whatever_happens_to_both_nothing_moves_unarmed_and_every_fault_has_a_way_out() -> None:
-    examples = settings().max_examples // 4
+    examples = settings().max_examples // 5
     run_state_machine_as_test(Together, settings=settings(max_examples=examples, stateful_step_count=25))
     pairs = sorted(f"{one} {other.name}" for one, other in Together.visited)
     print(f"\n{Together.examples} examples, {Together.periods:,} periods, {len(pairs)} pairs: {', '.join(pairs)}")
