@@ -85,7 +85,6 @@ NOISE = random.Random(1)
             {"plant": with_part("relaxation", fractions=(0.2, 0.16, 0.16))},
             "force that dies away from 0.5 to 5 s",
         ),
-        (("steps", "way back"), {"alters": slipping()}, "left switch, after the forces, at"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -129,8 +128,9 @@ def test_a_weight_tells_the_sensors_gain(bench, gain):
         ((), {"faults": ["motor_reversed_left"]}, "homing", "DEVICE_UNCOMMANDED_MOTION"),
         ((), {"faults": ["switch_dead_left"]}, "homing", "DEVICE_RETRACT_FAILED"),
         (("steps",), {"plant": with_part("assumed", closed_mm=34.0)}, "steps", "DEVICE_END_STOP"),
+        (("steps", "way back"), {"alters": slipping()}, "way back", "OUT_OF_STROKE"),
     ],
-    ids=["wiring", "switch dead", "switch 12 mm off"],
+    ids=["wiring", "switch dead", "switch 12 mm off", "coupling slips"],
 )
 def test_a_device_that_cannot_go_on_stops_with_its_fault_on_the_page(bench, steps, device, step, code):
     found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))

@@ -576,7 +576,7 @@ def test_what_can_be_no_scene_is_told_and_leaves_no_file(tmp_path, ctl, options,
 def test_an_insert_that_there_is_not_is_refused_and_leaves_no_file(tmp_path, ctl, checked_here):
     forces = recording(tmp_path / "f.csv", 1.0, 1.4, 0.1)
     given = ("--force", str(forces), "--insert", "MRE-70-10")
-    assert "MRE-70-10" in ctl("scene", "new", str(tmp_path / "a.toml"), *given, "--json").ended(1).error["message"]
+    assert "torque_mre_70" in ctl("scene", "new", str(tmp_path / "a.toml"), *given, "--json").ended(1).error["message"]
     assert not (tmp_path / "a.toml").exists()
 
 

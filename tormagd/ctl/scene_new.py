@@ -127,11 +127,12 @@ def _softest(
         try:
             taken[insert] = check_scene(str(out), config)
         except CommandError as error:
+            reason = error.message.removeprefix(f"scene {tables['name']}: ")
             # a machine too busy to say, or an insert or model that there is not
-            if error.code not in ("refused", "budget") or ": insert." in error.message:
+            if error.code not in ("refused", "budget") or reason.startswith("insert."):
                 out.unlink()
                 raise
-            lacks[insert] = error.message.removeprefix(f"scene {tables['name']}: ").split("; and ")
+            lacks[insert] = reason.split("; and ")
             continue
         if _has_reserve(tables, taken[insert]):
             return insert, taken[insert], []
