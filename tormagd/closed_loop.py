@@ -262,7 +262,7 @@ class ClosedLoop:
         """Run the ticks of the next `duration_s` one by one, and yield their samples.
 
         A tick runs when its sample is asked for. `setpoint` gives the newest setpoint at a time, that of the tick
-        before; None: no publisher.
+        before; None: no publisher. Raises as `tick`.
         """
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))

@@ -240,8 +240,13 @@ def test_the_commands_of_tormagctl(
     assert "Traceback" not in captured.err
 
 
-def test_what_cannot_be_run_again_is_refused_in_one_line(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_run_again_is_refused_in_one_line(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "key").write_text("short")
+    (tmp_path / "c.toml").write_text(f'[recordings]\nkey = "{tmp_path / "key"}"\n')
     for arguments in (
+        [str(path), "--config", str(tmp_path / "c.toml")],
         [str(path), "--from", "-1"],
         [str(path), "--set", "limits.skew=1"],
         [str(path), "--fault", "nonsense"],
@@ -252,3 +257,12 @@ def test_what_cannot_be_run_again_is_refused_in_one_line(path: Path, capsys: pyt
         assert run(arguments) == 2
         captured = capsys.readouterr()
         assert (captured.out, captured.err.count("\n")) == ("", 1)
+
+
+def test_a_setpoint_of_a_value_that_there_is_not_is_refused_for_a_rehearsal(box: BlackBoxFile) -> None:
+    plan = next(place for place, entry in enumerate(box.entries) if entry[0] == "plan" and entry[2] is not None)
+    name, now_s, setpoint, *rest = box.entries[plan]
+    entries = [*box.entries]
+    entries[plan] = [name, now_s, [*setpoint[:-1], {"NoWall": {}}], *rest]
+    with pytest.raises(ReplayError, match="NoWall"):
+        script(COLUMNS, entries)

@@ -51,7 +51,8 @@ def finding(
 ) -> Finding:
     """Return the finding of a mean, or of one number, times `scale`; without finite values it is not measured.
 
-    The interval is of the means of BLOCKS parts of `values`, in their order. One number has none.
+    The interval is of the means of BLOCKS parts of `values`, in their order. Fewer than 2 * BLOCKS finite ones have
+    none: its half width is 0.
     """
     known = np.atleast_1d(np.asarray(values, dtype=np.float64)) * scale
     known = known[np.isfinite(known)]

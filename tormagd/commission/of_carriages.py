@@ -95,10 +95,10 @@ def _answers(ticks: Columns, side: str) -> list[Finding]:
 
 
 def _driven(known: Known, ticks: Columns, side: str) -> Driven:
-    """Return what a motor shows of itself, by two regressions in the units of the carriage.
+    """Return what a motor shows of itself, in the units of [motor], each with its half width; NaN where it is not told.
 
-    Windings: V = R i + L di/dt + K v. Gearbox: i = m a + sign(v) c + p(x) + d v, where p is as the magnets' pull over
-    the gap.
+    Two regressions in the units of the carriage give it. Windings: V = R i + L di/dt + K v + V0. Gearbox:
+    i = m a + sign(v) c + p(x) + d v, where p is as the magnets' pull over the gap.
     """
     motor, period_s = known.config.motor, known.period_s
     window = max(round(WINDOW_S / period_s), 1) | 1

@@ -73,7 +73,8 @@ def leap_between(
     """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None.
 
     `last` was found at `seen_s`, `measured` at `now_s`. The step took the longer of two times, by the device's clock
-    and by the host's. In it a carriage goes LEAP_MM, and at LEAP_SPEEDS times `full_speed_mm_s`, one carriage's.
+    and by the host's. In it a carriage goes LEAP_MM, and at LEAP_SPEEDS times `full_speed_mm_s`, one carriage's. NaN
+    counts as a leap.
     """
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
@@ -87,7 +88,7 @@ def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
     """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`.
 
     A place more than OVERRUN_MM outside the stroke is impossible, and NaN. A `closed_mm` over CLOSED_END_MM counts as
-    that.
+    that. Whether it is homed is the caller's to know.
     """
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     return not (min_mm <= measured.left_mm <= max_mm and min_mm <= measured.right_mm <= max_mm)

@@ -76,7 +76,10 @@ class Machine:
 
     def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
         """Return, by path, id and name of each process that has it open, this one excepted; and how many cannot be
-        looked into."""
+        looked into.
+
+        A path is one without symbolic links, and has a list also where nobody has it open.
+        """
         holding: dict[str, list[tuple[int, str]]] = {path: [] for path in paths}
         hidden = 0
         for process in sorted(self.path("/proc").glob("[0-9]*")):

@@ -71,8 +71,8 @@ def use_scene(client: "Client", name: str) -> Outcome:
     """Have a disabled daemon change its scene, and wait until it has; a shipped scene goes before a file of the same
     name.
 
-    Raises as `Client.request`. Raises CommandError (REFUSED) where the daemon refuses the scene or is not ready within
-    LONGEST_S.
+    The daemon reads the file, on its machine. Raises as `Client.request`, such as RefusedError where the device is in
+    use. Raises CommandError (REFUSED) where the change was begun and failed, or is not over within LONGEST_S.
     """
     from tormagd.ctl.operate import statuses
 

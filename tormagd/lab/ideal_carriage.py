@@ -274,7 +274,7 @@ class Asked(NamedTuple):
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
         """Return the rendered force (n), N, for the gaps `gap_mm` (n) in the steps of this force.
 
-        Before the first step the gap was open.
+        Before the first step the gap was open. What has relaxed is that of the force asked, not of these gaps.
         """
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)

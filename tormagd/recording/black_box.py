@@ -62,7 +62,7 @@ class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def frames_in(entry: Any) -> list[Frame]:
-    """Return the frames in one entry of a black box; empty for an entry of another kind.
+    """Return the frames in one entry of a black box, their bytes as they were; empty for an entry of another kind.
 
     Raises ValueError or TypeError for an entry of READ or WROTE that is malformed.
     """

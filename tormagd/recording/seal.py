@@ -35,11 +35,12 @@ _BODY = struct.Struct(f"<B{DIGEST_BYTES}s")
 def read_key(file: str) -> bytes:
     """Read the sealing key from a file, without surrounding white space; empty where `file` is an empty name.
 
-    Raises OSError, and ValueError where the key is not of LEAST_KEY..MOST_KEY bytes.
+    Raises OSError, also for a file far longer than a key, and ValueError where the key is not of LEAST_KEY..MOST_KEY
+    bytes.
     """
     if not file:
         return b""
-    key = read_bounded(Path(file), MOST_KEY + 1).strip()
+    key = read_bounded(Path(file), 2 * MOST_KEY).strip()
     if not LEAST_KEY <= len(key) <= MOST_KEY:
         raise ValueError(f"{file}: a key of {len(key)} bytes: allowed are {LEAST_KEY}..{MOST_KEY}")
     return key
@@ -139,7 +140,8 @@ class Verdict(NamedTuple):
 def verified(path: Path, key: bytes = b"") -> Verdict:
     """Check the seals of the file in `path` and return the verdict; damage is a verdict, too. Raises OSError.
 
-    Keyed seals need their `key`: with an empty one the state is OTHER_KEY, even where bytes were altered.
+    Keyed seals need their `key`. With an empty one the state is OTHER_KEY as long as every record can be read, even
+    where bytes were altered.
     """
     with path.open("rb") as file:
         found = _Check(key)
@@ -248,7 +250,8 @@ class _Check:
     def verdict(self, size: int, *, ends: bool) -> Verdict:
         """Return the verdict on a file of `size` bytes; `ends` says whether its last bytes are MCAP's closing magic.
 
-        The first that holds: UNSEALED for a file without a word of seals; OTHER_KEY for keyed seals without the key.
+        The first that holds: UNSEALED for a file without a word of seals, but NO_KEY where a key is configured.
+        OTHER_KEY for keyed seals without the key.
         ALTERED for an oddity, or an end that the seals do not explain. NO_KEY for plain seals where a key is
         configured; UNFINISHED for a file cut short; else WHOLE.
         """

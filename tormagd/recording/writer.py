@@ -109,7 +109,8 @@ class RecordingWriter:
     def _rotate(self, folder: RecordingFolder) -> None:
         """End the file and go on in a new one where one is due, chained by its last seal.
 
-        Ticks that wait go into the new one. Raises FileExistsError, OSError.
+        Ticks that wait go into the new one. Where there is no room for it, the file ends in order, and says why. Raises
+        OSError then, and FileExistsError.
         """
         if not folder.is_due(self._sealing.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
             return

@@ -11,7 +11,7 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd.assembly.build import sources_hash
-from tormagd.config import load_config
+from tormagd.config import Config, load_config
 from tormagd.output import write_line
 from tormagd.recording.black_box import BlackBoxFile, read_black_box
 from tormagd.recording.reader import RecordingError
@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         configured = None if options.config is None else load_config(options.config)
         box = read_black_box(options.file)
-        seal = verified(options.file, read_key("" if configured is None else configured.recordings.key))
+        seal = verified(options.file, _key(configured))
         try:
             known = recorded(box, options.file.absolute().parent)
             result: dict[str, Any] = {
@@ -66,6 +66,14 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0 if write_line(json.dumps(result), sys.stdout) is None else 1
+
+
+def _key(configured: Config | None) -> bytes:
+    """Return the configured key of seals, empty without one. Raises ReplayError for one that is no key, OSError."""
+    try:
+        return read_key("" if configured is None else configured.recordings.key)
+    except ValueError as error:
+        raise ReplayError(str(error)) from error
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:

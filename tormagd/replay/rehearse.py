@@ -15,6 +15,7 @@ from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, checked
 from tormagd.control.records import TimedSetpoint
+from tormagd.exact import InexactError
 from tormagd.replay.rebuild import ReplayError
 from tormagd.replay.rerun import name_of, planned_for, ticks_of
 from tormagd.safety.operating_state import OperatingState, RefusedError
@@ -102,7 +103,7 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
 def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
     """Return what is to be done again: the setpoints, taken commands and handle positions of a black box's entries.
 
-    Raises ReplayError where an entry is malformed, or no tick is there.
+    Times are s from the first tick. Raises ReplayError where an entry is malformed, or no tick is there.
     """
     records = ticks_of(columns, entries)
     ticks = list(records.values())
@@ -118,7 +119,7 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
                 name, now_s, was_refused = msgspec.convert(entry[1:4], tuple[str, float, bool])
                 if not was_refused:
                     commands.append((now_s - first_s, name))
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, InexactError) as error:
         raise ReplayError(str(error)) from error
     met = next((tick for tick in ticks if tick.measurement is not None), ticks[0])
     is_driven = ticks[0].operating_state in DRIVEN

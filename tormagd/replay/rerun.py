@@ -302,8 +302,9 @@ class _Running:
         """Compare the states with a snapshot where they are known, then take the snapshot's; return the first
         difference.
 
-        Step and plan are compared, then the connection. Afterwards the states are known, and a failed plan is
-        forgotten. Raises InexactError, TypeError or LookupError for a snapshot that does not fit.
+        Step and plan are compared, then the connection; only such a snapshot is counted. Afterwards the states are
+        known, and a failed plan is forgotten. Raises InexactError, TypeError or LookupError for a snapshot that does
+        not fit.
         """
         differs, connection = None, entry[3]
         if self.is_known:

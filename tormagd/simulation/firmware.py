@@ -426,7 +426,10 @@ class Firmware:
         return max(abs(left - left_then), abs(right - right_then)) * self._mm_per_count
 
     def _positions_mm(self, sensors: Sensors) -> tuple[float, float]:
-        """Return the left and the right carriage's place, mm, from the zero of its encoder; opening is positive."""
+        """Return the left and the right carriage's place, mm, from its zero; opening is positive.
+
+        The zero is where it was at boot, and after homing where its open switch closed.
+        """
         mm_per_count = self._mm_per_count
         return (
             sensors.left_counts * mm_per_count - self._left_zero_mm,

@@ -83,7 +83,8 @@ def fit_network(
     """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` in the mask `known` (n).
 
     A tenth of these rows, chosen at random, decides when the training stops. `start` gives the first weights; None:
-    random ones. Returns and raises as `fit_model`.
+    random ones. The seeds are fixed: the same data give the same network. Returns as `fit_model`; raises DomainError as
+    that.
     """
     rows = data.subset(known)
     stop = random_split(len(rows), 0, VALIDATION_SHARE)
