@@ -142,7 +142,7 @@ def test_a_device_that_cannot_go_on_stops_with_its_fault_on_the_page(bench, step
 
 def test_an_abort_at_any_time_opens_the_gap(bench):
     times = random.Random(20)
-    for _ in range(6):
+    for _ in range(4):
         device = bench(SAMPLE)
         device.ends_s = times.uniform(3.0, 20.0)
         with pytest.raises(KeyboardInterrupt):

@@ -38,7 +38,7 @@ class Finding(msgspec.Struct, frozen=True):
         if self.value is None:
             return "not measured"
         width = f" ± {self.half_width:.2g}" if self.half_width else ""
-        return f"{self.value:.4g}{width} {self.unit}".rstrip()
+        return f"{float(f'{self.value:.4g}'):g}{width} {self.unit}".rstrip()  # 14090, not 1.409e+04
 
     @property
     def allowed(self) -> str:
