@@ -69,6 +69,12 @@ def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, ctl, file):
     assert file.read_text() == "precious"
 
 
+def test_a_folder_that_is_missing_becomes_no_file(fake_daemon, tmp_path, ctl):
+    folder = tmp_path / "recordings"
+    assert "no such folder" in ctl(*fake_daemon.at, "--json", "record", str(folder)).ended(2).error["message"]
+    assert not folder.exists()
+
+
 def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, ctl):
     made = ctl(*fake_daemon.at, "--json", "record", str(tmp_path), "--duration", "0.1").ended(0).result
     (file,) = tmp_path.iterdir()
@@ -96,7 +102,8 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     config.write_text(config.read_text() + "most_days = 1e-9\n")
     assert ctl(*command, "recordings", "prune").ended(0).result["removed"] == names[:-1]
     assert [path.name for path in folder.iterdir()] == [Path(kept).name]
-    for wrong in ("list /nowhere", "mark", f"export {kept}", f"mark {config}", "export /no --to /"):
+    gone = f"/no/{Path(kept).name}"
+    for wrong in ("list /no", "mark", f"mark {gone}", f"mark {config}", f"export {kept}", f"export {gone} --to /"):
         assert ctl(*command, "recordings", *wrong.split()).ended(2).error["hint"]
 
 

@@ -57,10 +57,12 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
     A message that cannot be read is counted, and the first one's reason told on stderr. The outcome is REFUSED where
     ticks were lost, UNREACHABLE where the daemon was gone at the end.
 
-    Raises CommandError (USAGE) where the file exists or cannot be made. UNREACHABLE is a daemon that publishes nothing
-    within `wait_s`, or does not answer: then there is no file. REFUSED is a disk that takes no more: what was written
-    stays.
+    Raises CommandError (USAGE) where the folder is missing, and where the file exists or cannot be made. UNREACHABLE is
+    a daemon that publishes nothing within `wait_s`, or does not answer: then there is no file. REFUSED is a disk that
+    takes no more: what was written stays.
     """
+    if path.suffix != ".mcap" and not path.is_dir():
+        raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
     key, keys = key_of(config), keys_of(endpoints.curve)
     context = zmq.Context()
     try:

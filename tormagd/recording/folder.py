@@ -69,6 +69,7 @@ def mark(path: Path) -> Path:
     named = _NAME.fullmatch(path.name)
     require(named is not None, "the name", path.name, "that of a segment, as tormagctl record DIR gives it")
     if named is None or named[3]:
+        path.stat()
         return path
     target = path.with_name(f"{named[1]}{named[2] or ''}{MARKED}.mcap")
     try:
