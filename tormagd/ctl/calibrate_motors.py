@@ -77,7 +77,8 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
                 Exit.REFUSED,
                 "slow_control",
                 f"the daemon controls {hz:.0f} times a second: allowed for a motor log is 1000",
-                "state control_hz = 1000 under [rates] in its configuration, and start it again",
+                "state control_hz = 1000 under [rates] in its configuration, and start it again; where it stands "
+                "there, tormagctl doctor",
             )
         with armed(endpoints, client, waveform.least_N) as run:
             run.progress.begin("motors", waveform.duration_s)
