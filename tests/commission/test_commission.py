@@ -39,7 +39,10 @@ def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench):
     assert "No report was given" in page
     assert page.count("<td>pass</td>") == sum(map(len, found.values())) > 30
     kept = msgspec.json.decode(msgspec.json.encode(report), type=Report)
-    assert "<td>+0</td>" in page_of(msgspec.structs.replace(begun(kept, 7, 1, None), findings=found))
+    after = begun(msgspec.structs.replace(kept, began_ns=5), 7, 6, None)
+    assert "<td>+0</td>" in page_of(msgspec.structs.replace(after, findings=found))
+    # one that found nothing is no last one
+    assert begun(after, 7, 8, None).last_ns == after.last_ns == 5
 
 
 def slipping():

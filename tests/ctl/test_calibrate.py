@@ -421,6 +421,8 @@ def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon,
     page = Path(result["page"]).read_text(encoding="utf-8")
     assert [words for words in ("Stopped in step steps", "turn it", "<td>reset</td>") if words not in page] == []
     assert ctl(*command, "--resume").ended(1).result["conformance"] == result["conformance"]
+    ctl(*command[:-1]).ended(2)  # nobody agreed: the last findings stay
+    assert Path(result["page"]).read_text(encoding="utf-8") == page
     kit.write_text("[]")
     assert "the kit prints" in ctl(*command, "--conformance", str(kit)).ended(2).error["hint"]
     for broken in (b"{}", b'{"v": 1, "\xff": 1}'):

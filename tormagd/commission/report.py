@@ -63,5 +63,8 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 def begun(before: Report | None, serial_number: int, now_ns: int, weight_N: float | None) -> Report:
     """Return an empty report that begins now; `before` is the device's last one, None without."""
-    last, last_ns = ({}, 0) if before is None else (before.values or before.last, before.began_ns)
+    last: dict[str, float] = {}
+    last_ns = 0
+    if before is not None:  # one that was stopped before it found anything is no last one
+        last, last_ns = (before.values, before.began_ns) if before.values else (before.last, before.last_ns)
     return Report(serial_number=serial_number, began_ns=now_ns, weight_N=weight_N, last=last, last_ns=last_ns)

@@ -72,9 +72,9 @@ def commission(
             report = before.resumed(weight_N)
         else:
             report = begun(before, serial_number, time.time_ns(), weight_N)
-        kept = Kept(path, report if checks is None else msgspec.structs.replace(report, conformance=checks))
         if not is_agreed:
             agree()
+        kept = Kept(path, report if checks is None else msgspec.structs.replace(report, conformance=checks))
         with connected(endpoints, client) as run:
             kept.follow(run, known)
     report = kept.report
