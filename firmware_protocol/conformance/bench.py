@@ -19,21 +19,21 @@ from firmware_protocol.conformance.opening import LEAST_SHARE
 from firmware_protocol.conformance.running import refuses_run
 
 PAGE: Final = "Reset"
-INSIDE_MM: Final = 10.0
+FAR_INSIDE_MM: Final = 10.0
 BOOT_S: Final = 10.0
 UNHOMED_SHARE: Final = 0.5
 TO_TURN_S: Final = 0.5
 
 
 def _is_new(host: Host, how: str) -> str:
-    """Reset a device in RUN, INSIDE_MM in, and hold it against a new one.
+    """Reset a device in RUN, FAR_INSIDE_MM in, and hold it against a new one.
 
     Raises Unmet unless it is IDLE, without zero, fault and host, opens slowly, and runs only after Home and Hello.
     Raises Untested where nobody can reset it.
     """
     if host.reset is None:
         raise Untested(f"nobody can reset the device: --reset COMMAND, which is called with {how}")
-    host.running(INSIDE_MM)
+    host.running(FAR_INSIDE_MM)
     host.reset(how)
     host.begin()
     if not host.until(lambda: host.status.command_nonce == 0, BOOT_S, Beat.NOTHING):
@@ -44,7 +44,7 @@ def _is_new(host: Host, how: str) -> str:
     host.obeyed(Retract)
     host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S)
     seen.append(f"opens in {host.now_s - start_s:.1f} s from {positions(start)}")
-    limit_s = INSIDE_MM / (LEAST_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
+    limit_s = FAR_INSIDE_MM / (LEAST_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
     is_late = host.now_s - start_s > limit_s
     host.shows(DeviceMode.IDLE, homed=False, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=is_late)
     host.obeyed(Home)
@@ -56,18 +56,18 @@ def _is_new(host: Host, how: str) -> str:
 
 
 LIKE_NEW: Final = (
-    f"nonce 0, IDLE, not HOMED, no fault, drives off; opens {INSIDE_MM:g} mm at over "
+    f"nonce 0, IDLE, not HOMED, no fault, drives off; opens {FAR_INSIDE_MM:g} mm at over "
     f"{LEAST_SHARE * UNHOMED_SHARE:g} of the device's speed and {TO_TURN_S:g} s; runs after Home and Hello, not before"
 )
 
 
-@check(Hazard.CLOSES, PAGE, f"in RUN, {INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
+@check(Hazard.CLOSES, PAGE, f"in RUN, {FAR_INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
 def warm_reset(host: Host) -> str:
     """Check that a reset by watchdog or pin leaves nothing of before: a zero that was kept may be off."""
     return _is_new(host, "warm")
 
 
-@check(Hazard.CLOSES, PAGE, f"in RUN, {INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
+@check(Hazard.CLOSES, PAGE, f"in RUN, {FAR_INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
 def cold_reset(host: Host) -> str:
     """Check that a device without a memory of before waits for Home and Hello."""
     return _is_new(host, "cold")

@@ -33,7 +33,7 @@ from tormagd.physics.errors import DomainError, require
 from tormagd.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
 from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, MIN_CONTROL_HZ, Finger, Scene, load_scene, scene_path
+from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Finger, Scene, load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
@@ -130,7 +130,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         *_too_sudden(config, scene, element.portrait),
     ]
     if unmet:
-        raise ConfigError(f"scene {scene.name}: " + "; and ".join(unmet))
+        raise ConfigError(f"scene {scene.name}: " + AND_UNMET.join(unmet))
     return Core(config, scene, element, stability, choice, model.fingerprint, beside, miss)
 
 

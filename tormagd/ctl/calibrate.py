@@ -57,7 +57,7 @@ def calibrate_insert(
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
-        known = known_of(config, client, scene.force.most_N)
+        known = known_of(config, client.status(), scene.force.most_N)
         forces = Range(known.least_N, known.most_N)
         with armed(endpoints, client, forces.least_N) as run:
             sweeps = [_sweep(run, forces, number, rates_N_s) for number in range(len(rates_N_s))]

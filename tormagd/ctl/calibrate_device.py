@@ -34,7 +34,7 @@ def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, 
         status = client.status()
         if not status.profile.folder:
             raise _not_kept(status.profile)
-        known = known_of(config, client, scene_most_N)
+        known = known_of(config, status, scene_most_N)
         with armed(endpoints, client, known.force_N(0.0)) as run:
             print("turn the handle to and fro, about 20 turns a minute, until the gap opens", file=sys.stderr)
             run.progress.begin("device", 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES))

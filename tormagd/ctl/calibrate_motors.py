@@ -70,8 +70,9 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
     after the drive.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
-        waveform = excitation(reach(client, scene_most_N))
-        hz = client.status().rates["control"].hz
+        status = client.status()
+        waveform = excitation(reach(status, scene_most_N))
+        hz = status.rates["control"].hz
         if hz < MIN_HZ:
             raise CommandError(
                 Exit.REFUSED,

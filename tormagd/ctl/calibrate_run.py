@@ -22,7 +22,7 @@ from tormagd.safety.codes import FAULTS
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
-from tormagd_client.messages import MessageError
+from tormagd_client.messages import MessageError, Status
 from tormagd_client.wire import keys_of
 
 SOURCE = "calibrate"
@@ -167,14 +167,12 @@ class Run(Device):
         return [[row[place] for place in places] for row in batch.rows]
 
 
-def reach(client: Client, scene_most_N: float) -> Range:
+def reach(status: Status, scene_most_N: float) -> Range:
     """Return the forces that can be asked for: from the daemon's least to its most, or to `scene_most_N` where that is
     less.
 
-    Raises CommandError (REFUSED) where another source holds the brake, or published within RECENT_SETPOINT_MS. Raises
-    as `Client.status`.
+    Raises CommandError (REFUSED) where another source holds the brake, or published within RECENT_SETPOINT_MS.
     """
-    status = client.status()
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
     is_held = holder is not None and holder.state == "holds"  # an old setpoint may be valid for long
@@ -188,13 +186,13 @@ def reach(client: Client, scene_most_N: float) -> Range:
     return Range(status.least_N, min(status.most_N, scene_most_N))
 
 
-def known_of(config: Config, client: Client, scene_most_N: float, weight_N: float | None = None) -> Known:
+def known_of(config: Config, status: Status, scene_most_N: float, weight_N: float | None = None) -> Known:
     """Return what courses know: the configuration, the daemon's control period, and the forces of `reach`.
 
     Raises as `reach`, and CommandError (REFUSED) where they leave no range.
     """
-    forces = reach(client, scene_most_N)
-    known = Known(config, 1.0 / client.status().rates["control"].hz, forces.least_N, forces.most_N, weight_N)
+    forces = reach(status, scene_most_N)
+    known = Known(config, 1.0 / status.rates["control"].hz, forces.least_N, forces.most_N, weight_N)
     if not known.force_N(0.0) < forces.most_N:
         raise CommandError(
             Exit.REFUSED,

@@ -60,8 +60,9 @@ def commission(
     with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
         scene = load_scene(config.scene)
     with Client(endpoints, wait_s, SOURCE) as client:
-        known = known_of(config, client, scene.force.most_N, weight_N)
-        serial_number = client.status().link.serial_number
+        status = client.status()
+        known = known_of(config, status, scene.force.most_N, weight_N)
+        serial_number = status.link.serial_number
         if serial_number is None:
             raise CommandError(Exit.REFUSED, "no_device", "no device is connected", "tormagctl firmware says why")
         path = folder / f"{serial_number:08x}.json"

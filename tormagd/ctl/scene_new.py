@@ -13,7 +13,7 @@ from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene import as_toml, check_scene
 from tormagd.force_file import ForceFileError, read_column
-from tormagd.scenes.scene import AUTO, MIN_CONTROL_HZ, Scene
+from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Scene
 from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError
 
@@ -94,10 +94,12 @@ def _forces_of(out: Path, recorded: Recorded) -> Path | None:
 
     None where nothing was recorded. Raises CommandError (USAGE) for a file or options that cannot be used.
     """
-    conversion = (recorded.column, recorded.scale, recorded.offset_N)
-    if recorded.force is None or conversion == (None, None, None):
-        if recorded.force is None and conversion != (None, None, None):
+    is_converted = (recorded.column, recorded.scale, recorded.offset_N) != (None, None, None)
+    if recorded.force is None:
+        if is_converted:
             raise usage_error("--column, --scale and --offset convert a recorded force", "add --force FORCE.csv")
+        return None
+    if not is_converted:
         return recorded.force
     column = "force_N" if recorded.column is None else recorded.column
     scale, offset_N = (1.0 if recorded.scale is None else recorded.scale), recorded.offset_N or 0.0
@@ -132,7 +134,7 @@ def _softest(
             if error.code not in ("refused", "budget") or reason.startswith("insert."):
                 out.unlink()
                 raise
-            lacks[insert] = reason.split("; and ")
+            lacks[insert] = reason.split(AND_UNMET)
             continue
         if _has_reserve(tables, taken[insert]):
             return insert, taken[insert], []

@@ -21,6 +21,8 @@ MIN_SETPOINT_HZ = 12.0
 "Setpoints a tenth of a second apart are no stream any more."
 MIN_CONTROL_HZ = 500
 "What is watched for safety is watched in every control tick: slower than this is none that a scene is run at."
+AND_UNMET = "; and "
+"Between what a device does not give of a scene, where it is refused."
 ENDING = ".toml"
 _SHIPPED = resources.files(__package__)
 
