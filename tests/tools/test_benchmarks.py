@@ -212,7 +212,7 @@ def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
 
 def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
     times = zip((0, 1, 2, 4, 5), (0.1, 0.2, 0.2, 0.3, 0.4), strict=True)
-    made = loop.as_block([[stamp_ms * 1_000_000, 0.0, 50.0, received_s] for stamp_ms, received_s in times])
+    made = loop.as_block([[stamp_ms * 1_000_000, 0.0, 50.0, received_s] for stamp_ms, received_s in times], 1_000)
     assert (made.ticks, made.merged, made.fresh) == (5, 1, 3)
     assert loop.summary([loop.Pair(made, made._replace(lateness_us=np.ones(5)))], RealTime())["fresh_share"] == 0.75
 
@@ -236,7 +236,7 @@ def test_wake_ups_are_counted_by_thread_and_a_beat_is_drawn(tmp_path: Path) -> N
     _, share, hz = loop.spent(os.getpid(), lambda: [time.sleep(1e-3) for _ in range(50)])
     assert 0.0 <= share < 1.0
     assert 50.0 < hz["control"] <= hz["all"]
-    loop.draw(tmp_path / "beat.png", {"plan": {"p50": 20.0, "p99": 60.0}, "drive": {"p50": 30.0, "p99": 50.0}})
+    loop.draw(tmp_path / "beat.png", {"plan": {"p50": 20.0, "p99": 60.0}, "drive": {"p50": 30.0, "p99": 50.0}}, 1_000)
     assert (tmp_path / "beat.png").stat().st_size > 1_000
 
 

@@ -187,8 +187,8 @@ def block(started: Started, seconds: float) -> Block:
             load.start()
             try:
                 recorder.poll(STARTS_MS)
-                collect(recorder, WARM_UP_S)
-                ticks, *busy = spent(pid, partial(collect, recorder, seconds))
+                collect(recorder, WARM_UP_S, config)
+                ticks, *busy = spent(pid, partial(collect, recorder, seconds, config))
                 told = reported(config.endpoints.control)
             finally:
                 stop.set()
@@ -225,7 +225,7 @@ def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
         host = built_host(folder)
         start = partial(begun, stack, folder / LOG, environment=environment(None, folder))
         port = first_line(start(*own_machine(0, "tormagd.simulation", "--pty")))
-        words = [port, str(1_000_000 // CONTROL_HZ), str(seconds), str(stand.realtime.fifo_priority)]
+        words = [port, str(1_000_000 // stand.rates_hz[0]), str(seconds), str(stand.realtime.fifo_priority)]
         ran = subprocess.run([str(host), *words], check=True, capture_output=True, text=True)
         found: dict[str, Any] = json.loads(ran.stdout)
         return found
@@ -246,7 +246,7 @@ def recording(endpoints: Endpoints) -> Iterator["zmq.Socket[bytes]"]:
         yield opened(socket, endpoints.recording, keys_of(endpoints.curve))
 
 
-def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Block:
+def collect(socket: "zmq.Socket[bytes]", seconds: float, config: Config) -> Block:
     """Reads tick rows for a while. Raises RuntimeError where there are none."""
     until_s = time.monotonic() + seconds
     rows: list[list[Any]] = []
@@ -257,14 +257,14 @@ def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Block:
             rows.extend([None if column is None else row[column] for column in columns] for row in batch.rows)
     if len(rows) < 2:
         raise RuntimeError(f"no ticks within {seconds:g} s")
-    return as_block(rows)
+    return as_block(rows, config.rates.control_hz)
 
 
-def as_block(rows: list[list[Any]]) -> Block:
+def as_block(rows: list[list[Any]], control_hz: int) -> Block:
     """The ticks, rows of COLUMNS; how many periods had none, and how many ticks knew of a new state."""
     lateness_us, exec_us, received_s = np.array([row[1:] for row in rows], dtype=np.float64).T
     spanned_s = (rows[-1][0] - rows[0][0]) * 1e-9
-    merged = max(0, round(spanned_s * CONTROL_HZ) + 1 - len(rows))
+    merged = max(0, round(spanned_s * control_hz) + 1 - len(rows))
     fresh = int(np.count_nonzero(np.diff(received_s) > 0.0))
     return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
 
@@ -293,14 +293,14 @@ def merge(blocks: list[Block]) -> Block:
     )
 
 
-def draw(path: Path, phases_us: dict[str, dict[str, float]]) -> None:
+def draw(path: Path, phases_us: dict[str, dict[str, float]], control_hz: int) -> None:
     """A PNG of one beat: a bar for each phase, to its p50 and on to its p99."""
     figure = Figure(figsize=(9, 0.5 * len(phases_us) + 1.5), layout="constrained")
     axes = figure.subplots()
     names = list(phases_us)[::-1]
     axes.barh(names, [phases_us[name]["p99"] for name in names], color="#d8dee9", label="p99")
     axes.barh(names, [phases_us[name]["p50"] for name in names], color="#2a6f97", label="p50")
-    axes.set(xlabel="us", title=f"What a beat does (eight clients and recording; a period is {1e6 / CONTROL_HZ:g} us)")
+    axes.set(xlabel="us", title=f"What a beat does (eight clients and recording; a period is {1e6 / control_hz:g} us)")
     axes.legend(loc="lower right")
     figure.savefig(path, dpi=110)
 
@@ -460,12 +460,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--against", type=checkout, metavar="FOLDER", help="root of another checkout, measured in turns with this one"
     )
+    parser.add_argument(
+        "--rates",
+        type=int,
+        nargs=2,
+        default=(CONTROL_HZ, CONTROL_HZ),
+        metavar=("CONTROL", "PLANS"),
+        help="Hz (1000 and 1000)",
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE", help="PNG of one beat, phase by phase")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
-    ours = Stand(realtime_settings(options))
+    ours = Stand(realtime_settings(options), rates_hz=tuple(options.rates))
     theirs = ours._replace(root=options.against)
     pairs = [
         Pair(
@@ -478,5 +486,5 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     ]
     result = summary(pairs, ours.realtime)
     if options.picture is not None and "phases_us" in result:
-        draw(options.picture, result["phases_us"])
+        draw(options.picture, result["phases_us"], ours.rates_hz[0])
     return result
