@@ -55,6 +55,14 @@ def trip() -> RoundTrip:
     return RoundTrip()
 
 
+def test_a_status_that_names_a_drive_never_sent_gives_no_round_trip(trip: RoundTrip) -> None:
+    for tick in range(3):
+        trip.drive(tick, tick * PERIOD_S)
+    trip.state(0, 3 * PERIOD_S)
+    trip.status(200)
+    assert (trip.report(), trip.since_next_s(200, 3 * PERIOD_S)) == (None, 0.0)
+
+
 @pytest.mark.parametrize("way_ticks", [1, 2, 16, 120])
 def test_a_round_trip_of_any_length_is_known_after_one_hello(way_ticks: int, trip: RoundTrip) -> None:
     """A USB adapter that keeps bytes back for 16 ms has 16 Drives under way at a time."""

@@ -56,7 +56,8 @@ class RoundTrip:
     )  # fmt: skip
 
     def __init__(self) -> None:
-        self._sent_s = [0.0] * 256
+        self._sent_s = [math.inf] * 256
+        "A Drive that never went out has no round trip."
         self._newest = 0
         self._before_hello: int | None = None
         self._state: int | None = None
@@ -73,7 +74,7 @@ class RoundTrip:
 
     def since_next_s(self, counter: int, now_s: float) -> float:
         """Return the time since the Drive after the one with this counter went out, s; 0 where none came after it."""
-        return 0.0 if counter == self._newest else now_s - self._sent_s[(counter + 1) % 256]
+        return 0.0 if counter == self._newest else max(0.0, now_s - self._sent_s[(counter + 1) % 256])
 
     def hello(self) -> None:
         """Note that a Hello goes out after the newest Drive."""
@@ -118,14 +119,14 @@ class RoundTrip:
             self._lead = drive_counter - state
             self._recent.clear()
             self._usual.clear()
-            round_trip_s = self._newest_s - self._sent_s[drive_counter]
-            if round_trip_s >= 0.0 and (self._newest - drive_counter) % 256 < 128:
-                self._take(round_trip_s)
+            if (self._newest - drive_counter) % 256 < 128:
+                self._take(self._newest_s - self._sent_s[drive_counter])
         self._unsure.clear()
 
     def _take(self, round_trip_s: float) -> None:
-        self._recent.append(round_trip_s)
-        self._usual.append(round_trip_s)
+        if round_trip_s >= 0.0:
+            self._recent.append(round_trip_s)
+            self._usual.append(round_trip_s)
 
     @property
     def usual_s(self) -> float:
