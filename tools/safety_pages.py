@@ -161,8 +161,12 @@ def _faults() -> str:
 
 
 def _limits() -> str:
-    rows = [(f"`{limit}`", LIMITS[limit].cause, LIMITS[limit].reaction, LIMITS[limit].remedy) for limit in Limit]
-    return "## Limits\n\nThey come and go by themselves.\n\n" + table(("limit", "means", "reaction", "remedy"), rows)
+    rows = [
+        (f"`{limit}`", row.cause, row.reaction, f"{row.safe_ms:,.0f}", row.remedy)
+        for limit, row in ((limit, LIMITS[limit]) for limit in Limit)
+    ]
+    headings = ("limit", "means", "reaction", "by, ms", "remedy")
+    return "## Limits\n\nThey come and go by themselves.\n\n" + table(headings, rows)
 
 
 if __name__ == "__main__":

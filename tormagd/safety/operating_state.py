@@ -239,15 +239,16 @@ def _because(present: Conditions) -> str:
     return f": {present.cause}" if present.cause else ""
 
 
+ARM: Final = "tormagctl arm"
 CONNECTED = Guard("not_connected", "the device is connected", _not_connected, "check port, cable and supply")
 NOT_BUSY = Guard("busy", "the device neither homes nor opens", _busy, "wait until is_busy is false")
-HOMABLE = Guard("device_latched", "the device has latched nothing", _latched, "tormagctl clear-fault")
+NOT_LATCHED = Guard("device_latched", "the device has latched nothing", _latched, ARM)
 READY: tuple[Guard, ...] = (
     CONNECTED,
-    Guard("device_latched", "the device has latched nothing", _latched, "tormagctl arm"),
+    NOT_LATCHED,
     NOT_BUSY,
-    Guard("not_homed", "it has homed since the last fault that took positions away", _lost, "tormagctl arm"),
-    Guard("not_homed", "the device is homed", _unhomed, "tormagctl arm"),
+    Guard("not_homed", "it has homed since the last fault that took positions away", _lost, ARM),
+    Guard("not_homed", "the device is homed", _unhomed, ARM),
     Guard("not_fresh", "State, Sense and Status are fresh", _stale, "look at the link in tormagctl status"),
     Guard(
         "sensor_doubted",
@@ -277,7 +278,6 @@ PAUSED: Final = OperatingState.PAUSED
 FAULTED: Final = OperatingState.FAULT
 RETRACT: Final = DeviceRequest.RETRACT
 NOTHING_TO_DO: Final = "nothing to do"
-CLEAR_FIRST: Final = "tormagctl clear-fault"
 
 _OPENS = "the device is asked to open the gap"
 _CLEARED = "faults are cleared; nothing moves"
@@ -286,30 +286,30 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Transition(Event.ENABLE, DISABLED, ENABLED, "the force goes to the setpoint along a ramp", READY),
     Refusal(Event.ENABLE, ENABLED, "already_enabled", NOTHING_TO_DO),
     Refusal(Event.ENABLE, PAUSED, "already_enabled", "tormagctl resume"),
-    Refusal(Event.ENABLE, FAULTED, "fault", "tormagctl arm"),
+    Refusal(Event.ENABLE, FAULTED, "fault", ARM),
     Transition(Event.DISABLE, DISABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
     Transition(Event.DISABLE, ENABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
     Transition(Event.DISABLE, PAUSED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
-    Refusal(Event.DISABLE, FAULTED, "fault", CLEAR_FIRST),
-    Refusal(Event.PAUSE, DISABLED, "not_enabled", "tormagctl arm"),
+    Refusal(Event.DISABLE, FAULTED, "fault", ARM),
+    Refusal(Event.PAUSE, DISABLED, "not_enabled", ARM),
     Transition(Event.PAUSE, ENABLED, PAUSED, "the gap is held where it is", (CONNECTED,)),
     Refusal(Event.PAUSE, PAUSED, "not_enabled", NOTHING_TO_DO),
-    Refusal(Event.PAUSE, FAULTED, "fault", CLEAR_FIRST),
-    Refusal(Event.RESUME, DISABLED, "not_paused", "tormagctl arm"),
+    Refusal(Event.PAUSE, FAULTED, "fault", ARM),
+    Refusal(Event.RESUME, DISABLED, "not_paused", ARM),
     Refusal(Event.RESUME, ENABLED, "not_paused", NOTHING_TO_DO),
     Transition(Event.RESUME, PAUSED, ENABLED, "the force goes to the setpoint along a ramp", (CONNECTED,)),
-    Refusal(Event.RESUME, FAULTED, "fault", CLEAR_FIRST),
+    Refusal(Event.RESUME, FAULTED, "fault", ARM),
     Transition(
         Event.HOME,
         DISABLED,
         DISABLED,
         "the device is asked to look for its open switches",
-        (CONNECTED, HOMABLE, NOT_BUSY),
+        (CONNECTED, NOT_LATCHED, NOT_BUSY),
         DeviceRequest.HOME,
     ),
     Refusal(Event.HOME, ENABLED, "not_disabled", "tormagctl disable"),
     Refusal(Event.HOME, PAUSED, "not_disabled", "tormagctl disable"),
-    Refusal(Event.HOME, FAULTED, "fault", CLEAR_FIRST),
+    Refusal(Event.HOME, FAULTED, "fault", ARM),
     # stop is never refused, and needs no device: a device that comes back finds a fault that somebody has to clear
     *[Transition(Event.STOP, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
     # the daemon has latched nothing here; a device may hold what it latched while nobody was there to see it
@@ -321,7 +321,7 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Transition(Event.USE_SCENE, DISABLED, DISABLED, "another scene takes the place of this one", (NOT_BUSY,)),
     Refusal(Event.USE_SCENE, ENABLED, "not_disabled", "tormagctl disable"),
     Refusal(Event.USE_SCENE, PAUSED, "not_disabled", "tormagctl disable"),
-    Refusal(Event.USE_SCENE, FAULTED, "fault", CLEAR_FIRST),
+    Refusal(Event.USE_SCENE, FAULTED, "fault", ARM),
     *[Transition(Event.FAULT, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
