@@ -41,7 +41,8 @@ class Device(Strict, frozen=True):
     "What the firmware does without us: how fast a carriage opens, stated here for scenes to be checked against."
 
     def __post_init__(self) -> None:
-        require(self.port.isprintable(), "device.port", self.port, "printable characters")
+        is_usable = self.port.isprintable() and self.port != ""
+        require(is_usable, "device.port", self.port, "at least one printable character")
 
 
 class Sources(Strict, frozen=True):

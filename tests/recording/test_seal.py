@@ -92,7 +92,7 @@ def test_a_file_that_was_cut_is_one_that_was_not_finished(sealed: Path, tmp_path
         path.write_bytes(data[:size])
         assert verified(path).state is State.UNFINISHED
     path.write_bytes(whole)
-    assert "its last 0 bytes" in verified(path).why
+    assert f"its first {len(whole)} bytes" in verified(path).why
     # cut, and changed before that: it is the change that is told
     at = len(parts[0]) + 500
     path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :] + b"abc")

@@ -1,5 +1,6 @@
 """One HTML page to keep, send and print: no script, nothing loaded from elsewhere."""
 
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 
@@ -16,11 +17,18 @@ def page(title: str, parts: Iterable[str]) -> str:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], is_bad: Sequence[bool] = ()) -> str:
-    """Return an HTML table of these texts, escaped; "None." where it has no row. Rows that are bad are red."""
-    lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+    """Return an HTML table of these texts; "None." where it has no row. Rows that are bad are red.
+
+    Texts are escaped; what stands in backticks becomes code.
+    """
+    lines = ["".join(f"<td>{_with_code(cell)}</td>" for cell in row) for row in rows]
     if not lines:
         return "<p>None.</p>"
     kinds = [' class="bad"' if number < len(is_bad) and is_bad[number] else "" for number in range(len(lines))]
     head = "".join(f"<th>{escape(each)}</th>" for each in heads)
     body = "".join(f"<tr{kind}>{line}</tr>" for kind, line in zip(kinds, lines, strict=True))
     return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _with_code(text: str) -> str:
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))

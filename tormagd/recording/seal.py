@@ -270,7 +270,7 @@ class _Check:
         if self._key and self._by == PLAIN:
             return Verdict(State.NO_KEY, "anybody could have sealed it anew", self._follows, self._last)
         if not self._is_over:
-            why = f"all but its last {unsealed} bytes is as it was written; its recorder did not end it"
+            why = f"its first {self._sealed_to} bytes are as they were written; its recorder did not end it"
             return Verdict(State.UNFINISHED, why, self._follows, self._last)
         return Verdict(State.WHOLE, f"all {size} bytes are as they were written", self._follows, self._last)
 

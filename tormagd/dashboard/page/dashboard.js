@@ -136,10 +136,19 @@ function element(name, text, ...classes) {
   return made;
 }
 
+// what stands in backticks is code
+function withCode(text) {
+  return text.split("`").map((part, i) => (i % 2 ? element("code", part) : part));
+}
+
 function code(name, label, kind) {
   const made = element("div", "", kind), why = explained[kind === "fault" ? "faults" : "limits"][name];
   made.append(element("b", name), label);
-  if (why) made.append(`: ${why.cause}`, element("em", `Next: ${why.remedy}`));
+  if (why) {
+    const next = element("em", "Next: ");
+    next.append(...withCode(why.remedy));
+    made.append(": ", ...withCode(why.cause), next);
+  }
   return made;
 }
 
