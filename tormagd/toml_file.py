@@ -164,7 +164,8 @@ def _line(text: str, message: str) -> str:
 def _key_in(message: str) -> list[str]:
     """Return the key that a refusal names, as its parts; empty where it names none.
 
-    A refusal of ours begins with the key. One of msgspec ends with a place, and may name an unknown key in it.
+    A refusal of ours begins with the key. One of msgspec ends with a place, and may name an unknown key in it. A place
+    in an array ends with the array's key; an unknown key there follows that at once.
     """
     if ours := _OURS.match(message):
         return ours[1].split(".")

@@ -148,9 +148,10 @@ def watch(
 
 
 def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: float | None = None) -> Course[Columns]:
-    """Give `command`, and return all ticks until one `is_done`. Asks for `force_N` meanwhile.
+    """Give `command`, and return all ticks until the newest `is_done`. Asks for `force_N`, N, meanwhile; None for none.
 
-    Raises StoppedError for a fault, and where it takes over `most_s`.
+    An empty `command` gives none. Raises StoppedError for a fault in any but the first ticks heard, and where it takes
+    over `most_s`.
     """
     begun_s, fresh = yield Asked(force_N, command)
     rows = list(fresh)
@@ -165,7 +166,10 @@ def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: 
 
 
 def handle_moved(force_N: float) -> Course[None]:
-    """Ask for `force_N` until the handle moves at MOVING_MM_S. Raises StoppedError after HANDLE_PATIENCE_S."""
+    """Ask for `force_N` until the handle moves at MOVING_MM_S or more, either way.
+
+    Raises StoppedError after HANDLE_PATIENCE_S, and for a later tick in another operating state than ENABLED.
+    """
     begun_s, fresh = yield Asked(force_N)
     while not any(abs(row[PLACES["handle_rate_mm_s"]] or 0.0) >= MOVING_MM_S for row in fresh):
         now_s, fresh = yield Asked(force_N)

@@ -99,7 +99,8 @@ def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm
     `open_mm`.
 
     `switches` are bits of `Switches`, of about the time of `measured`. An open switch is to be closed at the open end,
-    and only there. A closed switch is to be closed near the closed end only: no scene goes on to it.
+    and only there. A closed switch is not to be closed but near the closed end; there it may be open, as no scene goes
+    on to it. NaN contradicts nothing: `is_outside` finds it.
     """
     inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
     is_open, is_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0
@@ -112,10 +113,11 @@ def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm
 def _is_contradicted(
     at_mm: float, speed_mm_s: float, is_open: bool, is_closed: bool, inner_mm: float, home_mm: float
 ) -> bool:
-    """Tell whether a carriage at `at_mm` contradicts its open or its closed switch, closed where `is_open` or
-    `is_closed`.
+    """Tell whether a carriage's place `at_mm`, half of an even gap, contradicts its open or its closed switch.
 
-    The open end is at `home_mm`. The closed switch may be closed up to `inner_mm`.
+    Where `is_open`, the carriage may be OPEN_SWITCH_MM short of the open end, `home_mm`; else as far beyond it. Where
+    `is_closed`, it may be up to `inner_mm`; else that switch contradicts nothing. Allowed besides is what the carriage
+    goes in TOLD_S at `speed_mm_s`, either way. NaN contradicts nothing.
     """
     moved_mm = TOLD_S * abs(speed_mm_s)
     if is_closed and at_mm > inner_mm + moved_mm:

@@ -57,18 +57,21 @@ class Range(NamedTuple):
 
 
 class Progress:
-    """A line of progress on a terminal's stderr: what is done, for how long, and how long it takes. It is one line."""
+    """One line of progress on stderr: what is done, for how long, and how long it takes.
+
+    Where stderr is no terminal, it shows nothing.
+    """
 
     def __init__(self) -> None:
         self._label, self._lasts_s, self._begun_s, self._is_shown = "", 0.0, 0.0, is_terminal(sys.stderr)
 
     def begin(self, label: str, lasts_s: float) -> None:
-        """Begin to show `label`, which takes about `lasts_s`."""
+        """Begin `label`, which takes about `lasts_s`, in place of what was shown; `show` shows it."""
         self.end()
         self._label, self._lasts_s, self._begun_s = label, lasts_s, time.monotonic()
 
     def show(self) -> None:
-        """Show the time since `begin`."""
+        """Write the line anew, with the whole seconds since `begin`; before `begin` and after `end` do nothing."""
         if self._is_shown and self._label:
             since_s = time.monotonic() - self._begun_s
             print(
@@ -76,7 +79,7 @@ class Progress:
             )
 
     def end(self) -> None:
-        """Remove the line."""
+        """Remove the line, so that `show` does nothing until the next `begin`."""
         if self._is_shown and self._label:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
         self._label = ""

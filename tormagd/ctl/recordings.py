@@ -26,9 +26,13 @@ def mark(client: Client, text: str) -> Outcome:
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
     """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy to `target`.
 
-    `path` None takes the configured folder to list or prune; to mark or export it is a USAGE error. The outcome is
-    REFUSED where pruning was not enough, or an exported file was altered, or sealed without the configured key. Raises
-    CommandError (USAGE) where a path cannot be used.
+    `action` is "list", "prune", "mark" or "export". To list or prune, `path` is a folder; None takes the configured
+    one. To mark or export it is a recording, which marking renames. `target`, for export alone, is a new file, or a
+    folder for a copy of the same name.
+
+    The outcome is REFUSED where pruning was not enough. An exported file is REFUSED where it was altered, or could not
+    be checked with the configured key. Raises CommandError (USAGE) where a path that is needed is None or cannot be
+    used, and where the copy exists.
     """
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):

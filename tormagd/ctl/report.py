@@ -48,10 +48,11 @@ def report(config: Config, sources: list[Path], target: Path) -> Outcome:
 
 
 def plot(config: Config, source: Path, target: Path) -> Outcome:
-    """Draw the recording `source` into the picture file `target`, whose suffix says its format.
+    """Draw the recording `source` into the picture file `target`; a picture there is replaced, whole or not at all.
 
-    The outcome is as of `report`. Raises CommandError (USAGE) where the recording cannot be read or is empty, or the
-    picture not be written.
+    The suffix of `target` says its format: .png, .svg or .pdf. The outcome, with the recording's figures, is REFUSED
+    where it was altered, or could not be checked with the configured key. Raises CommandError (USAGE) for another
+    suffix. It also does where the recording cannot be read or is empty, or the picture cannot be written.
     """
     (recording,) = of = opened(config, [source])
     overview, following = recording.overview, recording.overview.following

@@ -109,10 +109,10 @@ class _Connections:
         return address
 
     def left_untold(self, address: str) -> bool:
-        """Tell whether a connection that broke off its handshake is counted as a refused key.
+        """Tell whether a connection that broke off its handshake is counted as a refused key, and note it then.
 
-        It is where the key of a peer at `address` was refused and libzmq has not rejected it yet. One such key is then
-        used up.
+        It is where the key of a peer at `address` was refused and libzmq has not rejected it yet. An empty `address` is
+        unknown, and stands for the oldest such peer. Each such key answers True once; False changes nothing.
         """
         if not self.untold or (taken := self.left(address)) is None:
             return False

@@ -1,4 +1,4 @@
-"""How a publisher's setpoints come: too seldom, too late, unevenly, or with losses. Judged once a second.
+"""How a publisher's setpoints come: too seldom, too late, unevenly, or with losses. Judged once a second at most.
 
 No I/O and no clock: times are arguments.
 """
@@ -63,9 +63,10 @@ class Arrival(NamedTuple):
 
 
 class SourceManner:
-    """Judges once a second how the setpoints of one publisher come. Give it each message.
+    """Judges how the setpoints of one publisher come, window by window. Give it each message.
 
-    `found` has what was wrong in the newest full window, by limit.
+    A window is full after WINDOW_S and LEAST_MESSAGES messages. `found` has what was wrong in the newest full window,
+    by limit.
     """
 
     def __init__(self) -> None:
@@ -76,9 +77,10 @@ class SourceManner:
         self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
 
     def hear(self, now_s: float, arrival: Arrival, needs: Needs) -> None:
-        """Take a message; set `found` anew when a window is full. The first message only begins the window.
+        """Take a message that came at `now_s`, and set `found` anew, by `needs`, when it fills the window.
 
-        Lateness is judged when a message is followed: after its delay or its playout, whichever is longer.
+        Until then `found` stays, also while no message comes. The very first message only begins a window. A message is
+        late by its delay or its playout, whichever is longer: only then is it followed.
         """
         if self._began_s is None:
             self._begin(now_s, arrival.lost)

@@ -112,7 +112,11 @@ class TelemetryLoop:
         self.run_scene(config, core, profiles)
 
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
-        """Publish and report on `core` from now on, with its configuration and profiles; reports are made anew."""
+        """Publish and report on `core` from now on, with its configuration and profiles. Call it between two beats.
+
+        The next `status` is made anew, and how well the force is followed counts from now. Ticks that are not published
+        yet, the newest snapshot and the newest mark stay. `config` has the same rates as before.
+        """
         self.config = config
         "Replaced by a reload, which changes only keys that are looked at each time they are used."
         self._core, self.topics.core, self._profiles = core, core, profiles

@@ -108,10 +108,10 @@ class CanBackend:
         return messages
 
     def send(self, message: Message) -> None:
-        """Hand one frame to the bus, and keep it in `stream.sent`.
+        """Hand one frame to the bus, and keep it in `stream.sent`, also where the bus does not take it.
 
         A frame that the bus does not take at once is dropped, and counted as unsent. The next tick has a newer one.
-        Raises BackendError when the bus is off or gone, or has taken none of over UNSENT_FRAMES frames in a row. Raises
+        Raises BackendError when the bus is off or gone, and for each untaken frame after UNSENT_FRAMES in a row. Raises
         EncodeError for a value that does not fit the wire.
         """
         identifier, data = self.stream.pack(message)

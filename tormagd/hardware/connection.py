@@ -215,8 +215,10 @@ class Connection:
     def report(self) -> LinkReport:
         """Return the link's report for `status`; None in it for what is not known yet or needs an open port.
 
-        Counters are those since the port was last opened, but for `losses` and `last_loss`. `repeated` has the States
-        that the link dropped, too. Half of the shortest round trip, a State's way, is taken off the clock's offset.
+        Without an open port `refused` is empty. Counters are those since the port was last opened, but for `losses` and
+        `last_loss`. `unanswered_share` and `damaged_share` are of the link's newest judgement. `repeated` has the
+        States that the link dropped, too. Half of the shortest round trip, a State's way, is taken off the clock's
+        offset.
         """
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity

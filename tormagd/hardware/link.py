@@ -222,8 +222,9 @@ class DeviceLink:
     def request(self, now_s: float, request: DeviceRequest) -> None:
         """Ask the device for a routine: `due` repeats the command until a Status acknowledges it.
 
-        Replaces an unacknowledged request; NONE only ends it. HOME and CLEAR are given up after GIVE_UP_S, RETRACT when
-        the device has latched a fault.
+        The command waits until the device runs and has sent a Status. Replaces an unacknowledged request; NONE only
+        ends it. HOME and CLEAR are given up after GIVE_UP_S, and when the device is reset or replaced. RETRACT is given
+        up when the device has latched a fault.
         """
         self._nonce = _next_nonce(self._nonce)
         self._request = request

@@ -21,8 +21,10 @@ EDGE_S = 0.5
 
 
 def measured_pulse() -> Array:
-    """Return heartpy's recording as shipped, sampled at 100 Hz. Raises ModuleNotFoundError where heartpy is not
-    installed."""
+    """Return heartpy's recording (n) as shipped, at SOURCE_HZ, in the light sensor's own unit, which is no force.
+
+    Raises ModuleNotFoundError where heartpy is not installed.
+    """
     # found, not imported: heartpy's import fails beside a current setuptools
     package = importlib.util.find_spec("heartpy")
     if package is None or package.origin is None:
@@ -31,10 +33,11 @@ def measured_pulse() -> Array:
 
 
 def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int) -> tuple[Array, Array]:
-    """Return times, s, and forces, N, of the pulse scaled to `least_N`..`most_N`: low-passed without lag, at `rate_hz`.
+    """Return times, s, and forces, N (both n), of the pulse scaled to `least_N`..`most_N`.
 
-    Times begin at 0, EDGE_S into the recording. Raises ValueError where the recording, less EDGE_S at both ends, is
-    shorter than `duration_s`, and ModuleNotFoundError as `measured_pulse`.
+    It is low-passed without lag, and lasts `duration_s` at `rate_hz`. Times begin at 0, EDGE_S into the recording.
+    Raises ValueError where the recording, less EDGE_S at both ends, is shorter than `duration_s`, and
+    ModuleNotFoundError as `measured_pulse`.
     """
     raw = measured_pulse()
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=SOURCE_HZ, output="sos"), raw)

@@ -81,37 +81,41 @@ class Drive(NamedTuple):
     pull_N: Curve = Curve([0.0, 0.0], 0.0, 1.0)
 
     def highest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Return the largest speed `dt_s` after this gap and speed, mm/s; `dt_s` is at most 1 / per_s."""
+        """Return the largest speed `dt_s` after this gap and speed, mm/s: of opening at full voltage, against the
+        magnets' pull. `dt_s` is at most 1 / per_s."""
         return self._sped_up(self.pull_mm_s2_N * self.pull_N.at(gap_mm), speed_mm_s, dt_s)
 
     def lowest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
         """Return the smallest speed `dt_s` after this gap and speed, mm/s: of closing at full voltage, with the
-        magnets' pull."""
+        magnets' pull. `dt_s` is at most 1 / per_s."""
         return -self._sped_up(-self.pull_mm_s2_N * self.pull_N.at(gap_mm), -speed_mm_s, dt_s)
 
-    def _sped_up(self, load_mm_s2: float, speed_mm_s: float, dt_s: float) -> float:
+    def _sped_up(self, pull_mm_s2: float, speed_mm_s: float, dt_s: float) -> float:
         """Return the largest speed, mm/s, `dt_s` after `speed_mm_s`, at full voltage to open against the pull
-        `load_mm_s2`.
+        `pull_mm_s2`.
 
         A gap that closes may turn round within the step, or stand where friction is more than what is left over.
         """
         if speed_mm_s < 0.0:
-            braking = self._acceleration(load_mm_s2, speed_mm_s, -1.0)
+            braking = self._acceleration(pull_mm_s2, speed_mm_s, -1.0)
             if speed_mm_s + braking * dt_s <= 0.0:
                 return speed_mm_s + braking * dt_s
             # the gap turns round within the step, and the rest of the step speeds it up
             dt_s += speed_mm_s / braking
             speed_mm_s = 0.0
         # where no force is left over to start with, friction holds the gap
-        return max(speed_mm_s + self._acceleration(load_mm_s2, speed_mm_s, 1.0) * dt_s, 0.0)
+        return max(speed_mm_s + self._acceleration(pull_mm_s2, speed_mm_s, 1.0) * dt_s, 0.0)
 
-    def _acceleration(self, load_mm_s2: float, speed_mm_s: float, direction: float) -> float:
-        """Return the gap's acceleration, mm/s^2, at the full voltage that opens, against the pull `load_mm_s2`.
+    def _acceleration(self, pull_mm_s2: float, speed_mm_s: float, direction: float) -> float:
+        """Return the gap's acceleration, mm/s^2, at `speed_mm_s` and the full voltage that opens, within the current
+        limit.
 
-        The friction acts against `direction`, 1 (opening) or -1, the way in which the gap moves or would move.
+        `pull_mm_s2` is the magnets' pull alone, below 0 where it helps. Friction and the guides' drag are added here.
+        They act against `direction`, 1 (opening) or -1, in which the gap moves or would move. At rest a result against
+        `direction` means that the gap stands.
         """
         driving = min(self.stall_mm_s2 - self.per_s * speed_mm_s, self.most_mm_s2)
-        nut = load_mm_s2 + direction * self.drag_mm_s2
+        nut = pull_mm_s2 + direction * self.drag_mm_s2
         friction = self.gear_mm_s2 + self.screw_friction * abs(nut)
         friction += self.mesh_loss * max(driving - self.gear_mm_s2, 0.0)
         return driving - nut - direction * friction

@@ -122,8 +122,9 @@ def virtual_session(seconds: float, log: WireLog) -> None:
 def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
     """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames in `log`.
 
-    `announce` is called with the pseudo-terminal's path. Frames are stamped with seconds since 1970. Bytes that the
-    device does not fetch are lost. Raises OSError when the port goes away.
+    `announce` is called once, with the pseudo-terminal's path. `stopped` is asked at least every POLL_MS. Frames are
+    stamped with seconds since 1970. Bytes that either side does not fetch are lost, but logged. Raises OSError when the
+    port goes away, where no pseudo-terminal can be made, and where the log cannot be written.
     """
     with contextlib.closing(Pty()) as line:
         announce(line.address)

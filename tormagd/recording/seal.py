@@ -140,8 +140,9 @@ class Verdict(NamedTuple):
 def verified(path: Path, key: bytes = b"") -> Verdict:
     """Check the seals of the file in `path` and return the verdict; damage is a verdict, too. Raises OSError.
 
-    Keyed seals need their `key`. With an empty one the state is OTHER_KEY as long as every record can be read, even
-    where bytes were altered.
+    Keyed seals need their `key`; with a wrong one the state is ALTERED. With an empty one it is OTHER_KEY as long as
+    every record can be read, even where bytes were altered. With a `key`, a file without seals is NO_KEY, and so is an
+    intact one whose seals have no key.
     """
     with path.open("rb") as file:
         found = _Check(key)
@@ -220,7 +221,10 @@ class _Check:
             self._hash.update(self._head)
 
     def _compare(self, record: Record) -> None:
-        """Compare a seal with the digest of the bytes before it; a mismatch is noted."""
+        """Compare a seal with the digest of the bytes before it, and keep it as the newest.
+
+        A mismatch is noted. So is a seal after the last, of a wrong size, or in a file that does not say it is sealed.
+        """
         self._seals += 1
         if self._hash is None or len(record.body) != _BODY.size:
             self._note("a seal where none can be", record.at)

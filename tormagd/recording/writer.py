@@ -128,7 +128,7 @@ class RecordingWriter:
         raise OSError(errno.ENOSPC, reason)
 
     def describe(self, metadata: dict[str, str]) -> None:
-        """Write metadata, now and into every later file of `rotate`. The later value of a name counts."""
+        """Write metadata, now and into every later file in the folder. The later value of a name counts."""
         self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 

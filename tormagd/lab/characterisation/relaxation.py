@@ -89,7 +89,11 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
 
 
 def _columns(record: RelaxationRecord, times_s: Array) -> Array:
-    """Return F0 and each branch's response to it (n x 1 + branches), by the exact update for a linear force."""
+    """Return an array (n, 1 + branches) for the n rows of `record`: the driving force, then each branch's response.
+
+    A branch has one time constant of `times_s`, s. Responses are in the driving force's unit and begin at 0, at rest.
+    Each is updated exactly for a force that is linear between rows.
+    """
     ratios = np.diff(record.time_s)[:, None] / times_s
     changes = np.diff(record.driving)[:, None] * -np.expm1(-ratios) / ratios
     decays = np.exp(-ratios)
@@ -106,7 +110,10 @@ def _columns(record: RelaxationRecord, times_s: Array) -> Array:
 
 
 def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
-    """Return the coefficients for these time constants, and the residual, N."""
+    """Return the coefficients (1 + branches) for the time constants `times_s`, s, and the residual (n), N.
+
+    A coefficient is a force, N, per unit of driving force, 0 or more; the first is that of equilibrium.
+    """
     columns = _columns(record, times_s)
     coefficients, _ = nnls(columns, record.force_N)
     return coefficients, columns @ coefficients - record.force_N

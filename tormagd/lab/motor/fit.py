@@ -63,8 +63,9 @@ class Estimate(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion of a log at its own rate: position from its mean, m; speed; acceleration; sign of the speed, 0 at rest.
+    """Motion of a log at its own rate: position from its mean, m; speed, m/s; acceleration, m/s^2; sign of the speed.
 
+    Each column has a row for each of the log's; the sign is 0 where the log rests or is slower than SLOW_M_S.
     `factor` is the number of rows for one thinned row.
     """
 
@@ -102,10 +103,11 @@ class Fit(NamedTuple):
 
 
 def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
-    """Return position, speed, acceleration and sign of the speed of a log, low-passed without lag.
+    """Return the motion of a log, low-passed at CUTOFF_HZ without lag.
 
-    `thinned_Hz` is the rate that `Motion.thin` goes to. Raises LabError where the log is too short, or does not move
-    both ways.
+    Each column has the log's n rows: position from its mean, m, speed, m/s, acceleration, m/s^2, and sign of the speed.
+    Slower than SLOW_M_S the sign is 0. `Motion.thin` goes to about `thinned_Hz`. Raises LabError where that leaves
+    under MIN_BLOCKS * BLOCK_S seconds, or the log does not move both ways.
     """
     smooth = _low_pass(log)
     position = smooth(log.position_m)
@@ -130,7 +132,7 @@ def _low_pass(log: Log) -> Callable[[Array], Array]:
 
 
 def block_numbers(seen: Motion, period_s: float) -> Array:
-    """Return the block of BLOCK_S that each thinned row is in."""
+    """Return the number, from 0, of the block of BLOCK_S that each thinned row is in; `period_s` is the log's."""
     rows = len(seen.thin(seen.v))
     return (np.arange(rows) * seen.factor * period_s / BLOCK_S).astype(np.int64)
 

@@ -143,10 +143,12 @@ def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) ->
 
 
 def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, float]:
-    """Return two shares where dF/dB <= 0: of the model's training box, and of places where the pads' own slope counts.
+    """Return two shares, 0..1, of places where the model's dF/dB <= 0.
 
-    The box spans from class to class, where there are no data. The second share is over a grid at the classes
-    themselves, of displacement, rate and field. Only places count where the pad rises by `SCORED_SLOPE_N_MT` or more.
+    `not_rising_share_of_box` is of the model's training box, as `not_rising_share`. The box spans from class to class,
+    also where there are no data. `not_rising_share_where_scored` is of a grid of displacement, rate and field at the
+    classes of `pads`. There only places count where the pad's own slope is `SCORED_SLOPE_N_MT` or more; at least one
+    place has to.
     """
     places = np.meshgrid(
         np.linspace(TOUCHING_MM, FULL_INDENTATION_MM, 18),

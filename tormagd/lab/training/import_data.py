@@ -342,9 +342,11 @@ def _outliers(path: Path, force_N: Array) -> Mask:
 
 
 def _sign(path: Path, quantities: dict[str, Array]) -> str:
-    """Turn the force so that it is positive against the motion, and return in words what was done.
+    """Turn `quantities["force_N"]` so that it is positive against the motion, and return in words what was done.
 
-    Raises LabError where its sign follows neither a constant nor the rate.
+    The motion is `rate_mm_s` with its sign, or else the change of `displacement_mm`; call it before `_motion`. A force
+    of one sign needs neither. Raises LabError, naming `path`, where under SIGN_SHARE of the rows beyond the noise
+    follow one sign, or the rate's.
     """
     force_N, rate = quantities["force_N"], quantities.get("rate_mm_s")
     if rate is None:
@@ -367,7 +369,8 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
     """Give the rate its magnitude and the displacement its meaning, travel since the turn; return in words what was
     made of what.
 
-    Raises LabError where neither a rate nor time and displacement are there.
+    Sets `rate_mm_s` and `displacement_mm` of `quantities`, and makes the one that is missing. Raises LabError where
+    neither a rate nor time and displacement are there.
     """
     made = []
     place, time_s = quantities.get("displacement_mm"), quantities.get("time_s")
