@@ -194,10 +194,11 @@ def _pad(finger: Finger, model: ForceModel) -> tuple[Contact, FieldOfGap, float]
 
 
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
-    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`, to hold the model against.
+    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`.
 
-    Raises DomainError where the law does not hold for the gaps, and for an unknown insert. Do not call it for a pad:
-    the thesis prints no law for one, and nothing is refused here.
+    `Aim` holds the fields that the search finds near this law. Raises DomainError where the law does not hold for the
+    gaps, and for an unknown insert. Do not call it for a pad: the thesis prints no law for one, and nothing is refused
+    here.
     """
     fitted, metres = scene.insert, 1e-3
     geometry = Geometry(

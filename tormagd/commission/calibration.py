@@ -20,7 +20,8 @@ DIGITS = "{:.4g}"
 def calibration(report: Report, config: Config) -> str:
     """Return the tables [motor], [position] and [trim] of the device of `report`, as TOML; `config` was in force.
 
-    A table is left out where its findings are not known, or where no gain is robust.
+    A table is left out where its findings are not known, or where no gain is robust; [position] also goes with [motor].
+    The first line is a comment, and without tables the only one.
     """
     motor, values = config.motor, report.values
 
@@ -46,7 +47,10 @@ def calibration(report: Report, config: Config) -> str:
 
 
 def _position(config: Config) -> list[str]:
-    """Return the table [position] with the stiffest gains that are robust around the motor of `config`."""
+    """Return the table [position], in lines, with the stiffest gains that are robust around the motor of `config`.
+
+    Empty where none are.
+    """
     position = config.position
     grid = itertools.product(DERIVATIVE_TIMES_S, (position.derivative_filter_s,), (position.integral_time_s,))
     period_s = 1.0 / config.rates.control_hz

@@ -42,7 +42,10 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return self.is_whole and not self.failed and not self.conformance
 
     def resumed(self, weight_N: float | None) -> "Report":
-        """Return the report to go on with: without the step in which it stopped, and with the weight at hand now."""
+        """Return the report to go on with: without the step in which it stopped, and with the weight at hand now.
+
+        `weight_N` is that weight, None without; where the step `weight` is done, that step's stays.
+        """
         findings = dict(self.findings)
         if self.stopped is not None:
             findings.pop(self.stopped.step, None)
@@ -62,7 +65,11 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def begun(before: Report | None, serial_number: int, now_ns: int, weight_N: float | None) -> Report:
-    """Return an empty report that begins now; `before` is the device's last one, None without."""
+    """Return a report without findings that begins at `now_ns`, ns of CLOCK_REALTIME.
+
+    `before` is the device's last report, None without. Its values become `last`, or its own `last` where it found
+    nothing. `weight_N` is the weight that is to be hung up, N; None: there is none.
+    """
     last: dict[str, float] = {}
     last_ns = 0
     if before is not None:  # one that was stopped before it found anything is no last one

@@ -229,9 +229,10 @@ def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
 
 @contextmanager
 def armed(endpoints: Endpoints, client: Client, force_N: float) -> Iterator[Run]:
-    """Home where needed, enable with the setpoint `force_N`, and give a `Run`.
+    """Home where needed, enable with the setpoint `force_N`, and give a `Run`, as a context.
 
-    At the end the gap opens, as in `connected`. Raises as `home` and `Run.follow`.
+    At its end and after an error the gap opens, and signals are only noted, as in `connected`. Raises as `connected`,
+    `home` and `Run.follow`.
     """
     with connected(endpoints, client) as run:
         if not client.status().is_homed:

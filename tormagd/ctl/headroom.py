@@ -80,7 +80,8 @@ class Rate(msgspec.Struct, frozen=True):
 def measured(path: Path | None, machine: Machine) -> Headroom:
     """Measure this machine in a process of its own, for the configuration in `path`; None takes the defaults.
 
-    Raises CommandError (REFUSED) where the process fails or takes over LONGEST_S.
+    `machine` is this one, whose kernel tells before and after what others took: `steal` and `waited`. Raises
+    CommandError (REFUSED) where the process fails or takes over LONGEST_S.
     """
     before, started_s = machine.taken(), time.monotonic()
     try:

@@ -79,7 +79,8 @@ class Outcome(msgspec.Struct, frozen=True):
 def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
     """Print the outcome to stdout, as text or as one JSON object `{command, ok, result, error}`; return the exit code.
 
-    REFUSED where all was done, but the answer could not be written.
+    REFUSED where all was done, but the answer could not be written, as on a full disk; stderr says why then. A stdout
+    that is closed, or whose reader has gone, is no failure.
     """
     is_done = outcome.exit_code is Exit.DONE
     text = _object(command, is_done, outcome.result, None) if as_json else outcome.text

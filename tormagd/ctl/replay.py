@@ -60,7 +60,7 @@ def replay(
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
     """Return the text on `done`, the report's `rerun`, and whether it was bit-exact: no first difference.
 
-    The text also tells gaps, damaged frames and, of a difference, its tick, field and both values.
+    The text also tells how many ticks agree, the gaps and, of a difference, its tick, frame, field and both values.
     """
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     difference = done["difference"]

@@ -325,7 +325,7 @@ class Admission:
         """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many.
 
         A refused key that was counted already is not counted again. A publisher that had got in is noted in `left`: it
-        may come back at once.
+        may come back at once. A `descriptor` that is not known counts as a connection of an unknown address.
         """
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None

@@ -50,10 +50,10 @@ def prepare(settings: RealTime) -> list[str]:
 
 
 def priority_of_threads() -> int:
-    """Return the FIFO priority that threads begun by this one may take: one below its own; 0 for none.
+    """Return the FIFO priority that threads begun by this one may take: one below its own, or its own if that is 1.
 
-    0 where this thread has no FIFO priority, or where the kernel refuses it; a refusal is logged. ZeroMQ's threads use
-    it: a setpoint passes through one, and would wait there for whatever else the machine runs.
+    0, for none, where this thread has no FIFO priority, or where the kernel refuses it; a refusal is logged. ZeroMQ's
+    threads use it: a setpoint passes through one, and would wait there for whatever else the machine runs.
     """
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0

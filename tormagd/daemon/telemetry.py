@@ -22,9 +22,9 @@ def tick_record(
 ) -> TickRecord:
     """Return the record of one control tick, number `number`, along `plan`. Call right after the step.
 
-    It is stamped with CLOCK_REALTIME now. `measurement` is None without a device: its fields are None then, switches
-    and faults empty. Carriage places are None unless homed. `governed_cf` is None and `limits` empty unless the device
-    is driven. Fields are given by position: by name it takes ten times as long.
+    It is stamped with CLOCK_REALTIME now. `measurement` is None without a device: its fields are None then,
+    `device_switches` and `device_faults` empty. `left_mm` and `right_mm` are None unless homed. `governed_cf` is None
+    and `limits` empty unless the device is driven. Fields are given by position: by name it takes ten times as long.
     """
     measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
     is_placed = measured is not None and measured.is_homed

@@ -164,8 +164,12 @@ class Recorded:
         return self._read[2:]
 
     def _glance(self) -> dict[str, Any]:
-        """Return the measured force of each stretch (else the asked one), when limits and faults were present, and the
-        marks."""
+        """Return the measured force over the whole length (else the asked one), and what came meanwhile; times in s.
+
+        Each stretch has its middle in `t_s` and its least and greatest force in `low_N` and `high_N`, None where not
+        known. All three are empty where no force is known. `limits` and `faults` are spans, from and to, without codes;
+        `marks` are times with their texts.
+        """
         overview = self._overview
         known = overview.series("measured_cf") or overview.series("setpoint_cf")
         spans: dict[str, Any] = {

@@ -294,7 +294,11 @@ class Bound(NamedTuple):
     foresight_N: Array
 
     def figures(self, start_s: float = -math.inf) -> Json:
-        """Return the asked force's standard deviation and both RMS errors, N, over the times from `start_s` on."""
+        """Return `sd_N`, the asked force's standard deviation, and the RMS errors `no_delay_rms_N` and
+        `foresight_rms_N`.
+
+        They are over the times from `start_s` on; NaN where there are none.
+        """
         inside = self.time_s >= start_s
         asked_N = self.asked_N[inside]
         return {
@@ -315,8 +319,8 @@ def bound(
     """Return the bound for forces at rising times, linear in between, or with `is_held` held until the next.
 
     Forces are clipped to the device's range and MAX_N; the handle slides at TURNED_MM_S. `step_s` is the step of the
-    result. Raises `DomainError` for under 2 or over MAX_STEPS steps and as `brake_of`, and RuntimeError as
-    `foresight_mm`.
+    result. Times that do not rise are not refused. Raises `DomainError` for under 2 or over MAX_STEPS steps. Raises as
+    `brake_of`, `asked_of` and `foresight_mm`.
     """
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MAX_STEPS:
@@ -337,7 +341,7 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
     rendered.
 
     The steps are `step_s` long, and the handle moves at `hand_mm_s`. Before the first step the insert rested at
-    `brake.rested_mm`.
+    `brake.rested_mm`. Raises `DomainError` for a force that is NaN.
     """
     offset_N = brake.sliding_N(0.0, hand_mm_s)
     scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
@@ -405,7 +409,7 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
     Each round linearises about the last round's gap: force over gap, the field's lag, a step's largest speed over the
     speed before. It then solves a quadratic programme in the gaps and lags. Convexity is not proven, so the optimum is
     tested against an exhaustive search (`tests/lab/test_bound.py`). Raises RuntimeError where the rounds do not settle,
-    or Clarabel finds no solution.
+    or Clarabel finds no solution; ModuleNotFoundError where Clarabel is not installed.
     """
     steps = len(asked.force_N)
     slope_Tm_mm = np.gradient(brake.moment_Tm, brake.gap_mm)

@@ -44,7 +44,9 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
     is_complete: bool = True
     "False for a file that was cut short: entries up to the cut are there."
     odd: str = ""
-    "The first message of `/ticks` or `/frames` that `/core` does not give; empty where there is none."
+    """The first message of `/ticks` or `/frames` that `/core` does not give, or why an entry of `/core` gives none.
+
+    Empty where there is neither."""
 
 
 class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -149,8 +151,9 @@ def is_tick(entry: Any) -> bool:
 def read_black_box(path: Path) -> BlackBoxFile:
     """Read the black box in `path`; one that was cut short is returned as far as it reads, with `is_complete` False.
 
-    Messages of `/ticks` and `/frames` that differ from `/core` are named in `odd`, and raise nothing. Raises
-    RecordingError where the file is not readable, not MCAP, damaged, or no black box.
+    The first message of `/ticks` or `/frames` that differs from `/core` is named in `odd`, and raises nothing. The seal
+    is not checked. Raises RecordingError where the file is not readable, not MCAP, damaged, beyond a bound, or no black
+    box.
     """
     found = _Reading(path)
     with opened(path) as file:

@@ -231,8 +231,8 @@ def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array)
     """Fit `rows` to the delayed voltage, and return the fit and the delay, s, which Gauss-Newton steps find.
 
     `kept` is the mask of the thinned rows that count, `blocks` their blocks. The voltage's slope is the last column of
-    the fit, so that the others' intervals include the delay's. Raises LabError for a delay over LONGEST_DELAY_S, and as
-    `linear`.
+    the fit, so that the others' intervals include the delay's. Raises LabError for a delay over LONGEST_DELAY_S of
+    either sign, and as `linear`.
     """
     delay_s = 0.0
     for _ in range(DELAY_TURNS):

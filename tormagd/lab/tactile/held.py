@@ -64,10 +64,11 @@ Moment = tuple[float, float, Plan, str]
 def hold(case: Case) -> dict[str, Any]:
     """Hold a force on the pad of `case` and return how well it was held, as plain data beside the case's own fields.
 
-    Errors are shares of the force asked for, one a second. The greatest and the mean are of magnitudes, the last has
-    its sign, positive for too much. `shares` has every tenth, with signs. `limits` has the share of the time that each
-    limit was there, `held_s` the seconds. `fault` names the fault that ended the hold; it is empty where none did.
-    Raises PlantError for a plant that cannot be loaded or has no pad, LabError for a fault in the first second.
+    Errors are shares of the force asked for, FORCE_N, one a second. `force_error` is the greatest and
+    `mean_force_error` the mean of their magnitudes. `last_force_error` has its sign, positive for too much, and so have
+    `shares`, one in each `every_s`. `last_gap_mm` is the last gap. `limits` has the share of the time that each limit
+    was there, `held_s` the seconds. `fault` names the fault that ended the hold; it is empty where none did. Raises
+    PlantError for a plant that cannot be loaded or has no pad, LabError for a fault in the first second.
     """
     shares, limits, last_mm, fault = [], Counter[str](), math.nan, ""
     for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
@@ -175,7 +176,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Hold a force on every plant of `options`, with relaxation and without, learning and frozen, and return all holds.
 
-    Raises PlantError for a plant that cannot be loaded or has no pad.
+    Raises as `hold`.
     """
     cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
     with ProcessPoolExecutor(options.workers) as pool:

@@ -75,12 +75,14 @@ def train(
 ) -> Training:
     """Fit `network`, of float64, to `training` in place, and leave it with the weights that did best on `validation`.
 
-    It stops (`stopped_by`) after `epochs` accepted steps ("epochs"), or when no damping lowers the training error any
-    more ("damping"). It also stops when `patience` steps in a row have not lowered the validation error by the share
-    `least_improvement` ("validation"). Deterministic for a given network and data.
+    These are the weights of the start, `best.epoch` 0, where no step did better. It stops (`stopped_by`) after `epochs`
+    accepted steps ("epochs"), or when no damping lowers the training error any more ("damping"). It also stops when
+    `patience` steps in a row have not lowered the validation error by the share `least_improvement` ("validation").
+    Deterministic for a given network and data.
 
-    With `rising` the force rises with the field everywhere, whatever the data. Each unit's weight of the field and its
-    output stay positive, because a step changes their logarithms. Raises `DomainError` for a count below 1.
+    With `rising` the force rises with the field everywhere, whatever the data. The start is changed first, as in
+    `_made_rising`, and its constant output is lost. Each unit's weight of the field and its output stay positive,
+    because a step changes their logarithms. Raises `DomainError` for a count below 1.
     """
     for name, count in (("epochs", epochs), ("patience", patience)):
         if count < 1:
