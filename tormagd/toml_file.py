@@ -87,14 +87,17 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def convert(path: Path, kind: type[T]) -> T:
-    """Read a TOML file as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
+    """Read a TOML file as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line.
+
+    It also raises ConfigError for a file that cannot be read, or is no TOML.
+    """
     return convert_as(path, lambda _tables: kind)
 
 
 def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
-    """Read a TOML file as the kind that `kind_of` returns for its tables. Raises as `convert` does.
+    """Read a TOML file as the kind that `kind_of` returns for its tables. Raises ConfigError, as `convert` does.
 
-    `kind_of` may raise ConfigError.
+    Where `kind_of` raises ConfigError, the file's name is put before it, and the line after it.
     """
     try:
         text = toml_text(path)

@@ -131,6 +131,10 @@ def _driven(known: Known, ticks: Columns, side: str) -> Driven:
 
 
 def _motor_findings(known: Known, side: str, driven: Driven) -> list[Finding]:
+    """Return three findings on a carriage's motor: resistance, voltage for speed and inertia over the configured.
+
+    A finding has no value where `driven` has NaN.
+    """
     motor = known.config.motor
 
     def over(

@@ -88,7 +88,7 @@ def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> 
 
 
 def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
-    """Return a waveform from the least force to the most and back, at `rate_N_s`."""
+    """Return a waveform from the least force to the most and back, at `rate_N_s`, which must be above 0."""
     half_s = (forces.most_N - forces.least_N) / rate_N_s
     return by_legs(forces.least_N, [(half_s, forces.most_N), (half_s, forces.least_N)])
 
@@ -120,8 +120,9 @@ def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
 def _ask_fitter(*arguments: str) -> dict[str, Any]:
     """Run the fitting process on `arguments`, and return the `result` that it prints; SIGINT and SIGTERM end it.
 
-    Raises CommandError (REFUSED) where it refuses, with its own code and hint; where it ends without an answer; or
-    where it was interrupted.
+    A fit has `model`, `csv`, `insert`, `created`, `rows`, `ranges` and `metrics`; without a sweep, `insert` alone,
+    where it is known. Raises CommandError (REFUSED) where it refuses, with its own code and hint; where it ends without
+    an answer; or where it was interrupted.
     """
     command = [sys.executable, "-m", FITTING, *arguments]
     with (
@@ -218,7 +219,10 @@ def calibrate(
 
 
 def agree() -> None:
-    """Wait until a person presses Enter: the carriages may move. Raises CommandError (USAGE) without a terminal."""
+    """Wait until a person presses Enter: the carriages may move. Raises CommandError (USAGE) without a terminal.
+
+    The end of input (Ctrl-D) counts as Enter; Ctrl-C raises KeyboardInterrupt.
+    """
     if not is_terminal(sys.stdin):
         raise usage_error("stdin is no terminal: nobody can agree to the carriages moving", "a script says --yes")
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)

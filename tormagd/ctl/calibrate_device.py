@@ -26,9 +26,10 @@ def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, 
     """Let the daemon learn the device, judge it by steps, and wait until its profile is kept. The gap opens in the end.
 
     It is the short form of `tormagctl commission`: two of its steps. `scene_most_N` is the greatest force to ask for.
-    The outcome holds serial number, what was learned, how far off the steps were, and the profile's folder. Raises as
-    `known_of`, `armed` and `Run.follow`. Raises CommandError (REFUSED) where no profile is kept, the handle hardly
-    moves, or the daemon doubts the force sensor.
+    The outcome holds `serial_number`, the fields of the status' `device`, and the number of `steps`. It also holds
+    their `mean_error_N`, with its sign, their `worst_error_N`, and `profile`, the folder. Raises as `known_of`, `armed`
+    and `Run.follow`. Raises CommandError (REFUSED) where no profile is kept, the handle hardly moves, or the daemon
+    doubts the force sensor.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
@@ -49,6 +50,7 @@ def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, 
 
 
 def _in_N(value_mN: float | None) -> float:
+    """Return mN as N, to 0.1 mN; 0 for None, a value that is not known."""
     return round((value_mN or 0.0) * 1e-3, 4)
 
 

@@ -50,10 +50,10 @@ LONGEST_HOLE_S = 0.02
 
 
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
-    """Return the waveform to ask for: ramps, then jumps, `rounds` times, from CLEAR_N above the least force to the
-    most.
+    """Return the waveform to ask for: ramps, then jumps, `rounds` times, between two forces.
 
-    A ramp of RAMPS_S goes up and then down. A jump takes 1 ms, and its force is held for JUMP_S.
+    They are CLEAR_N above the least force, and the most. A ramp of RAMPS_S goes up and then down. A jump takes 1 ms,
+    and its force is held for JUMP_S. A range narrower than CLEAR_N is not refused: the waveform is then upside down.
     """
     low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]
@@ -65,9 +65,9 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
     """Drive both carriages through `excitation`, and write the log of one to the new file `path`.
 
-    The gap opens in the end. Raises as `reach`, `armed` and `Run.follow`. Raises CommandError (REFUSED) for a control
-    rate under MIN_HZ, or gaps in the ticks. Raises OSError where the file exists or cannot be made: this shows only
-    after the drive.
+    The outcome has `file`, `side`, and the log's `rows` and `seconds`. The gap opens in the end. Raises as `reach`,
+    `armed` and `Run.follow`. Raises CommandError (REFUSED) for a control rate under MIN_HZ, or gaps in the ticks.
+    Raises OSError where the file exists or cannot be made: this shows only after the drive.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()

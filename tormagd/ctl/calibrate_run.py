@@ -118,11 +118,17 @@ class Run(Device):
             self.progress.end()
 
     def play(self, waveform: Waveform) -> Columns:
-        """Publish `waveform` in real time, and return its ticks. Raises as `follow`."""
+        """Publish `waveform` in real time, and return its ticks as an array for each of COLUMNS.
+
+        A number that is not known is NaN. Raises as `follow`, also where the device is not ENABLED throughout.
+        """
         return self.follow(watch(waveform.duration_s, lambda t_s: waveform.at(t_s).force_N))
 
     def command(self, name: str) -> None:
-        """Give a command. `disable` is tried whatever happens; raises ClientError where another one is refused."""
+        """Give a command. `disable` is tried whatever happens; raises ClientError where another one is refused.
+
+        `enable` is tried for SILENT_S while measurements are not fresh.
+        """
         if name == "enable":
             _enable(self._client)
         elif name == "disable":
@@ -135,7 +141,8 @@ class Run(Device):
     def exchange(self, force_N: float | None) -> Heard:
         """Publish one force, valid for VALID_FOR_MS, and return the ticks until the next is due, 1/RATE_HZ later.
 
-        None publishes nothing. Raises as `follow`.
+        A tick is a row by COLUMNS. None publishes nothing. There may be no tick: they come every 20 ms. Raises as
+        `follow`.
         """
         if self._is_interrupted():
             raise interrupted_run()
@@ -171,10 +178,11 @@ class Run(Device):
 
 
 def reach(status: Status, scene_most_N: float) -> Range:
-    """Return the forces that can be asked for: from the daemon's least to its most, or to `scene_most_N` where that is
-    less.
+    """Return the forces that can be asked for: from the daemon's least to its most, or to the scene's.
 
-    Raises CommandError (REFUSED) where another source holds the brake, or published within RECENT_SETPOINT_MS.
+    The lesser of its most and `scene_most_N` counts, N. A least force above the most is not refused here; `known_of`
+    does that. Raises CommandError (REFUSED) where another source holds the brake, or published within
+    RECENT_SETPOINT_MS.
     """
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
@@ -190,9 +198,10 @@ def reach(status: Status, scene_most_N: float) -> Range:
 
 
 def known_of(config: Config, status: Status, scene_most_N: float, weight_N: float | None = None) -> Known:
-    """Return what courses know: the configuration, the daemon's control period, and the forces of `reach`.
+    """Return what courses know: the configuration, the daemon's control period, the forces of `reach`, and the weight.
 
-    Raises as `reach`, and CommandError (REFUSED) where they leave no range.
+    `weight_N` is what is to be hung up, N; None: there is none. The daemon must have run for a moment: a rate of 0 Hz
+    raises ZeroDivisionError. Raises as `reach`, and CommandError (REFUSED) where the forces leave no range.
     """
     forces = reach(status, scene_most_N)
     known = Known(config, 1.0 / status.rates["control"].hz, forces.least_N, forces.most_N, weight_N)

@@ -62,7 +62,7 @@ class Within(NamedTuple):
 
 
 def port(text: str) -> int:
-    """Parse a TCP port; 0 takes one that is free. Raises ArgumentTypeError."""
+    """Return the TCP port in `text`, 0..65535; 0 takes one that is free. Raises ArgumentTypeError for anything else."""
     value = Within(0, 65_535)(text)
     if not value.is_integer():
         raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number, 0..65535")
@@ -70,7 +70,8 @@ def port(text: str) -> int:
 
 
 def rates(text: str) -> tuple[float, ...]:
-    """Parse 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas. Raises ArgumentTypeError."""
+    """Return 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas, as given. Raises ArgumentTypeError for
+    anything else."""
     found = tuple(Within(0.02, 10.0, " N/s")(part) for part in text.split(","))
     if not 3 <= len(found) <= 60:
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 3..60 rates")
@@ -78,7 +79,7 @@ def rates(text: str) -> tuple[float, ...]:
 
 
 def source(text: str) -> str:
-    """Check a publisher's name: 1..64 printable characters. Raises ArgumentTypeError."""
+    """Return a publisher's name as it is. Raises ArgumentTypeError unless it is 1..64 printable characters."""
     if not 0 < len(text) <= 64 or not text.isprintable():
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
     return text

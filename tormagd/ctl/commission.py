@@ -52,9 +52,12 @@ def commission(
 ) -> Outcome:
     """Run all steps on the device, and keep findings and page in `folder`, named by its serial number.
 
-    Findings and page are written after each step. `is_resumed` goes on with those that are there. `conformance` is the
-    kit's report. The outcome is REFUSED where a row failed or the device stopped. Raises CommandError (USAGE) for files
-    that cannot be read or written, and as `known_of`, `Run.follow` and `calibrate.agree`; the gap opens then, too.
+    Findings (.json) and page (.html) are written after each step; after the last one also the calibration (.toml).
+    `is_resumed` goes on with those that are there. `weight_N` is the weight to hang up, N; None: there is none.
+    `conformance` is the kit's report, None without one. The outcome has the `page` and the report's fields. It is
+    REFUSED where a row or a check of the kit failed, or the device stopped. Raises CommandError (USAGE) for files that
+    cannot be read or written, and where nothing is there to resume. Raises it (REFUSED) without a device. Raises as
+    `known_of`, `Run.follow` and `calibrate.agree`; the gap opens then, too.
     """
     checks = None if conformance is None else _failed_checks(conformance)
     with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
@@ -138,12 +141,20 @@ def _read(path: Path) -> Report | None:
 
 
 def _failed_checks(path: Path) -> list[tuple[str, str, str]]:
-    """Return the checks of a conformance report that did not pass. Raises CommandError (USAGE) for another file."""
+    """Return name, what was seen and what was expected, of each check of a conformance report that did not pass.
+
+    Empty where all passed. Raises CommandError (USAGE) for another file.
+    """
     report = _decoded(path, _Conformance, "give what the kit prints with --json")
     return [(each.name, each.seen, each.expected) for each in report.checks if not each.passed]
 
 
 def _decoded(path: Path, kind: type[Read], hint: str) -> Read:
+    """Read the JSON file `path`, of at most MAX_BYTES, as a `kind`.
+
+    Raises CommandError (USAGE) with `hint`: an OSError or ValueError, of a file that cannot be read or is no such JSON,
+    becomes one.
+    """
     with as_usage_error(OSError, ValueError, hint=hint):
         try:
             return msgspec.json.decode(read_bounded(path, MAX_BYTES), type=kind)

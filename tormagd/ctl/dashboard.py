@@ -20,6 +20,7 @@ from tormagd_client.endpoints import Endpoints
 def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
     """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording.
 
+    Port 0 takes one that is free; the address is said on stderr. The outcome has the `seconds` that it was served.
     Raises CommandError (USAGE) where the port is taken or the recording cannot be read, and as `AsyncClient.status`.
     """
     start_s = time.monotonic()
@@ -46,6 +47,7 @@ async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
 
 
 async def _recorded(config: Config, path: Path, port: int) -> None:
+    """Serve the page of a recording. Raises CommandError (USAGE) where it cannot be read or is empty."""
     (file,) = opened(config, [path])
     with as_usage_error(ValueError, hint="give a recording with data"):
         shown = Recorded(file)

@@ -10,7 +10,10 @@ FOLDERS = ("guides", "reference", ".")
 
 
 def guide(name: str | None) -> Outcome:
-    """Return the text of one page; for None, list all pages. Raises CommandError (USAGE) for an unknown name."""
+    """Return the text of one page, with its `name`, as `text`; for None, the titles of all pages by name, as `guides`.
+
+    Raises CommandError (USAGE) for an unknown name.
+    """
     folders = [files("tormagd") / "docs" / folder for folder in FOLDERS]
     pages = {
         page: (folder / f"{page}.md").read_text(encoding="utf-8")

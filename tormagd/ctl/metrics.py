@@ -35,11 +35,12 @@ UP = "Whether the daemon answers"
 
 
 def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
-    """Return the metrics as text where `port` is None; else serve them at that port of 127.0.0.1 until Ctrl-C or
-    SIGTERM.
+    """Return the metrics as text where `port` is None; else serve them at that port of 127.0.0.1 until a signal.
 
-    Port 0 takes one that is free; the address is said on stderr. Each scrape asks the daemon anew. Raises CommandError
-    (USAGE) where the port is taken, and as `Client.status` where no daemon answers at the start.
+    The signal is Ctrl-C or SIGTERM. The outcome holds the text as `metrics`, or the `address` that was served. Port 0
+    takes one that is free; the address is said on stderr. Each scrape asks the daemon anew, and waits `wait_s` at most.
+    Without an answer it gives `tormag_up` 0 alone. Raises CommandError (USAGE) where the port is taken, and as
+    `Client.status` where no daemon answers at the start.
     """
     with Client(endpoints, wait_s) as client:
         client.status()

@@ -41,9 +41,9 @@ COMES_BACK_S = 0.6
 def arm(client: Client, timeout_s: float) -> Outcome:
     """Have the daemon clear faults, home and enable, as far as needed, within `timeout_s`, and say each step on stderr.
 
-    The outcome tells the steps `given` (none: it was armed already), state and seconds. Raises CommandError (REFUSED)
-    where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables, and so
-    does the end of `timeout_s`: the gap opens.
+    The outcome has the steps `given` (none: it was armed already), `operating_state` and `seconds`. Raises CommandError
+    (REFUSED) where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables, and so does the end of
+    `timeout_s`: the gap opens.
     """
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
@@ -60,9 +60,10 @@ def arm(client: Client, timeout_s: float) -> Outcome:
 def operate(client: Client, command: str) -> Outcome:
     """Give one command of DONE, which the daemon carries out or refuses at once, and return its answer.
 
-    `stop` without a device gives an outcome of REFUSED: the gap does not open. After a fault was cleared, watches for
-    COMES_BACK_S; without a fault there is nothing to clear, and that is said. Raises CommandError: REFUSED where the
-    answer does not show the state, FAULT where the fault comes back; and as `Client.request`.
+    The outcome has `operating_state` and `is_connected`; the gap may still move. `stop` without a device gives an
+    outcome of REFUSED: the gap does not open. After a fault was cleared, watches for COMES_BACK_S; without a fault
+    there is nothing to clear, and that is said. Raises CommandError: REFUSED where the answer does not show the state,
+    FAULT where the fault comes back; and as `Client.request`.
     """
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
@@ -83,8 +84,9 @@ def operate(client: Client, command: str) -> Outcome:
 def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
     """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open.
 
-    `stop` without a device gives an outcome of REFUSED at once. Raises as `operate`. Raises CommandError: FAULT where
-    the gap cannot open, or `disable` meets any fault; REFUSED where the gap is not known to be open within `timeout_s`.
+    The outcome is that of `operate`, after waiting with the `seconds`. `stop` without a device gives an outcome of
+    REFUSED at once. Raises as `operate`. Raises CommandError: FAULT where the gap cannot open, or `disable` meets any
+    fault; REFUSED where the gap is not known to be open within `timeout_s`.
     """
     begun = operate(client, command)
     if begun.exit_code is not Exit.DONE or not is_waiting:
@@ -106,7 +108,7 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
 
 
 def take(client: Client, source: str) -> Outcome:
-    """Give the brake to `source`, whoever holds it.
+    """Give the brake to `source`, whoever holds it. The outcome has `source`, and the holder before as `instead_of`.
 
     Raises as `Client.request`, and CommandError (REFUSED) where the answer names another holder.
     """
@@ -121,8 +123,9 @@ def take(client: Client, source: str) -> Outcome:
 def confirm(client: Client, what: str) -> Outcome:
     """Settle a dispute between force sensor and believed device: which of them, `what`, is to be doubted.
 
-    "device": it has changed, and is learned anew. "sensor": it is wrong. Raises RefusedError where nothing is disputed,
-    CommandError (REFUSED) where the daemon confirms something else.
+    "device": it has changed, and is learned anew. "sensor": it is wrong. The outcome has `what` as `confirmed`. Raises
+    as `Client.request`: RefusedError where nothing is disputed. Raises CommandError (REFUSED) where the daemon confirms
+    something else.
     """
     result = client.request("confirm", what=what)
     if result.get("confirmed") != what:
@@ -138,8 +141,9 @@ def _not_done(what: str) -> CommandError:
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     """Home both carriages, and with `is_waiting` wait until they are homed.
 
-    Raises CommandError (FAULT) where the device latches a fault meanwhile. REFUSED is a homing that does not begin
-    within BEGIN_S, leaves the device not homed, or takes over `timeout_s`. Raises as `Client.request`.
+    The outcome has `operating_state` and `is_connected`, and after waiting the `seconds`. Raises CommandError (FAULT)
+    where the device latches a fault meanwhile. REFUSED is a homing that does not begin within BEGIN_S, leaves the
+    device not homed, or takes over `timeout_s`. Raises as `Client.request`.
     """
     was_homed = client.status().is_homed
     result = client.request("home")
@@ -169,9 +173,10 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
 
 
 def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tuple[float, Status]]:
-    """Yield seconds since the start and status, every POLL_S for `timeout_s`.
+    """Yield seconds since the start and status, every POLL_S for `timeout_s`; that it is over raises nothing.
 
-    On a terminal draws a line of progress that says what the device is `doing`; none where that is empty.
+    On a terminal draws a line of progress that says what the device is `doing`; none where that is empty. Raises as
+    `Client.status`.
     """
     started_s = time.monotonic()
     shows_progress = bool(doing) and is_terminal(sys.stderr)

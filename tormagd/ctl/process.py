@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 
 def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
-    """Run `python -m MODULE` and return what it prints to stdout.
+    """Run `python -m MODULE` and return what it prints to stdout. What it says on stderr is not shown.
 
     Raises TimeoutError after `longest_s`, which ends it; ChildProcessError, with stderr's last line, for a failure.
     """

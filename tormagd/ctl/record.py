@@ -33,7 +33,7 @@ SILENT_S = 1.0
 
 
 def budget_of(settings: Recordings) -> Budget:
-    """Return what the configuration allows a folder of recordings."""
+    """Return what the configuration allows a folder of recordings, in bytes and s; 1 MB is 1e6 bytes."""
     return Budget(
         segment_bytes=round(settings.segment_MB * 1e6),
         segment_s=settings.segment_minutes * 60.0,
@@ -54,12 +54,12 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
     """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder.
 
     What the daemon runs is asked and written first, and again at the end: its device may have been connected meanwhile.
-    A message that cannot be read is counted, and the first one's reason told on stderr. The outcome is REFUSED where
-    ticks were lost, UNREACHABLE where the daemon was gone at the end.
+    A message that cannot be read is counted, and the first one's reason told on stderr. The outcome is as of `_record`:
+    REFUSED where ticks were lost, UNREACHABLE where the daemon was gone at the end.
 
-    Raises CommandError (USAGE) where the folder is missing, and where the file exists or cannot be made. UNREACHABLE is
-    a daemon that publishes nothing within `wait_s`, or does not answer: then there is no file. REFUSED is a disk that
-    takes no more: what was written stays.
+    Raises CommandError (USAGE) where the folder is missing, where the file exists or cannot be made, and as `key_of`.
+    UNREACHABLE is a daemon that publishes nothing within `wait_s`, or does not answer: then there is no file. REFUSED
+    is a disk that takes no more: what was written stays.
     """
     if path.suffix != ".mcap" and not path.is_dir():
         raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
@@ -129,7 +129,13 @@ def _record(
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
-    """Write what arrives until the time or an interrupt ends it, then what still waits, and return the outcome."""
+    """Write what arrives until the time or an interrupt ends it, then what still waits, and return the outcome.
+
+    It has the last `file`, `seconds`, and how many came and were lost: `telemetry`, `telemetry_lost`, `ticks`,
+    `ticks_lost`. `silent_ms` is the time since the last ticks, and `unreadable` counts what was left out. It is
+    UNREACHABLE for a silence of over SILENT_S, else REFUSED where ticks were lost. Raises OSError where the disk takes
+    no more.
+    """
     unreadable = 0
     start_s = heard_s = time.monotonic()
     is_over = False

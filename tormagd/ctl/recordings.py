@@ -17,7 +17,7 @@ from tormagd_client.blocking import Client
 def mark(client: Client, text: str) -> Outcome:
     """Put an event into telemetry, and so into every recording; a folder's present segment is then kept from pruning.
 
-    Raises as `Client.request`.
+    The outcome has `t_ns`, since 1970, and `text`. Raises as `Client.request`.
     """
     result = client.request("mark", text=text)
     return Outcome(result, f"marked: {text}")
@@ -51,7 +51,8 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
 def _list(folder: RecordingFolder, key: str) -> Outcome:
     """Describe each segment of the folder, and say their total size; damaged ones are listed with the reason.
 
-    Seals are not checked: that takes reading all. Where no `key` is configured, those that have one say so.
+    The outcome has `folder`, `recordings`, each as `_row`, and their size, `MB`. Seals are not checked: that takes
+    reading all. Where no `key` is configured, those that have one say so.
     """
     rows = [_row(segment, bool(key)) for segment in folder.segments()]
     size_MB = sum(row["MB"] for row in rows)
@@ -65,7 +66,11 @@ def _list(folder: RecordingFolder, key: str) -> Outcome:
 
 
 def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
-    """Describe one segment by its overview; without one, `said` tells why."""
+    """Describe one segment by its overview; without one, `said` tells why.
+
+    Returns `name`, `began_s` since 1970 (None where the name does not say), `MB`, `is_marked`, `seconds` (None without
+    an overview), `faults`, `marks` and `said`. Without an overview the lists are empty.
+    """
     seconds, faults, marks = None, [], []
     try:
         known = summary_of(segment.path)
@@ -92,8 +97,10 @@ def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
 
 
 def _prune(folder: RecordingFolder) -> Outcome:
-    """Delete what is over the budget, and name it; REFUSED, with the reason, where that is not enough. Raises
-    OSError."""
+    """Delete what is over the budget; the outcome has the names `removed`, and `over`, why that is not enough.
+
+    It is REFUSED where `over` is not empty. Raises OSError.
+    """
     gone = folder.prune()
     over = folder.make_room(0)
     names = [each.path.name for each in gone]
@@ -104,8 +111,9 @@ def _prune(folder: RecordingFolder) -> Outcome:
 def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
     """Copy a recording to a new file, check the copy's seals under `key`, and say their verdict; REFUSED where unsound.
 
-    `target` is the file, or a folder in which the copy has the same name. Half a copy is deleted. Raises OSError where
-    the copy exists or cannot be made, CommandError (USAGE) for a `target` of None.
+    `target` is the file, or a folder in which the copy has the same name. The outcome has `file`, the state as `seal`,
+    and `why`. Half a copy is deleted; an unsound one stays. Raises OSError where the copy exists or cannot be made,
+    CommandError (USAGE) for a `target` of None.
     """
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")

@@ -102,6 +102,8 @@ def _instead(result: dict[str, Any]) -> str:
 
 
 def _happened(what: dict[str, Any]) -> str:
+    """Say in words what was met: `faults` with their times, s, `limits` with how long they held, s, and `refused`
+    commands."""
     faults = ", ".join(f"{name} at {at_s:.3f} s" for name, at_s in what["faults"].items()) or "no fault"
     limits = ", ".join(f"{name} {held_s:.3f} s" for name, held_s in what["limits"].items()) or "none"
     refused = f"; refused: {', '.join(what['refused'])}" if what["refused"] else ""

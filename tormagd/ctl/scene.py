@@ -68,11 +68,12 @@ def scene(
 
 
 def use_scene(client: "Client", name: str) -> Outcome:
-    """Have a disabled daemon change its scene, and wait until it has; a shipped scene goes before a file of the same
-    name.
+    """Have a disabled daemon change its scene, and wait until it has.
 
-    The daemon reads the file, on its machine. Raises as `Client.request`, such as RefusedError where the device is in
-    use. Raises CommandError (REFUSED) where the change was begun and failed, or is not over within LONGEST_S.
+    A shipped scene goes before a file of the same name. The daemon reads the file, on its machine. The outcome has the
+    `scene` that runs, its `fingerprint`, and `is_homed`. Raises as `Client.request`, such as RefusedError where the
+    device is in use. Raises CommandError (REFUSED) where the change was begun and failed, or is not over within
+    LONGEST_S.
     """
     from tormagd.ctl.operate import statuses
 
@@ -89,7 +90,7 @@ def use_scene(client: "Client", name: str) -> Outcome:
 
 
 def list_scenes() -> Outcome:
-    """List the shipped scenes with their descriptions."""
+    """List the shipped scenes; the outcome's `scenes` have `name` and `description` each."""
     scenes = [load_scene(name) for name in shipped_scenes()]
     width = max(len(scene.name) for scene in scenes)
     return Outcome(
@@ -107,7 +108,11 @@ def show_scene(name: str) -> Outcome:
 
 
 def as_toml(tables: dict[str, Any]) -> str:
-    """Return the text of a scene file with these keys and tables."""
+    """Return the text of a scene file with these keys and tables, without a line's end after the last.
+
+    Values are numbers, texts, booleans and lists of them. None, and a table within a table, are not refused, and give
+    no TOML.
+    """
     lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
     for title, table in tables.items():
         if isinstance(table, dict):
@@ -134,9 +139,10 @@ def _line(key: str, value: object) -> str:
 def check_scene(name: str, config: Path | None) -> Outcome:
     """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost.
 
-    `config` None means the defaults. The cost is known, and held against `budget.core_share`, only where that way of
-    serving was measured. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more than its
-    budget; USAGE for a faulty scene.
+    `config` None means the defaults. The outcome has `scene`, `core_share_allowed`, what `_derived` gives, and the cost
+    as `core_share`. That is known, and held against `budget.core_share`, only where that way of serving was measured;
+    else it is None. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more than its budget;
+    USAGE for a faulty scene.
     """
     scene = loaded(name)
     derived = _derived(name, config)
@@ -204,8 +210,9 @@ def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]
 def explain_scene(name: str, config: Path | None) -> Outcome:
     """Show every way to serve a scene that was measured, the chosen one, and how well that served other signals.
 
-    `config` is the configuration's file, None the defaults: the way that runs with it is marked. Raises CommandError:
-    REFUSED where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
+    `config` is the configuration's file, None the defaults: the way that runs with it is marked. The outcome has the
+    fields of a `MeasuredScene`, the `shares` of all ways, and `derived`, as `_derived`. Raises CommandError: REFUSED
+    where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
     """
     file = measured()
     found = measured_as(loaded(name), file)
@@ -268,8 +275,8 @@ def loaded(name: str) -> Scene:
 def _derived(name: str, config: Path | None) -> dict[str, Any]:
     """Run the daemon's own check of the scene in a process of its own, and return what it derives.
 
-    `config` None means the defaults. Raises CommandError (REFUSED) where the check refuses the scene, or takes over
-    LONGEST_S.
+    The keys are those of `derived` in what `tormagd --check` prints. `config` None means the defaults. Raises
+    CommandError (REFUSED) where the check refuses the scene, or takes over LONGEST_S.
     """
     arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
     try:

@@ -23,8 +23,9 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
     """Choose the most exact measured way that takes at most `share` of a processor, or the cheapest within an error.
 
     The error is `tolerance_N`, RMS; one of both is None. With `out` writes the scene, served that way, to this new
-    file. Raises CommandError: USAGE for another action than check, for both or neither limit, and for files that cannot
-    be used. REFUSED where nothing was measured, or no way is good enough.
+    file. The outcome has `scene`, `way`, its worst `rms_N`, its `daemon_share`, and `file`, None without one. Raises
+    CommandError: USAGE for another action than check, for both or neither limit, and for files that cannot be used.
+    REFUSED where nothing was measured, or no way is good enough.
     """
     if action != "check" or (share is None) == (tolerance_N is None):
         raise usage_error(

@@ -37,7 +37,8 @@ def send(
     """Publish `what`, a shape or a CSV file, at `rate_hz`, and report what became of it.
 
     It ends after `duration_s` or an interrupt; None means the file's length, or ten seconds for a shape. Each setpoint
-    carries those of the next `preview_ms`. With `is_blind` the daemon is not asked.
+    carries those of the next `preview_ms`. The outcome has `source`, the counts of `_publish`, and the fields of a
+    `Fate`. With `is_blind` the daemon is not asked, and the fate is left out.
 
     Raises CommandError (USAGE) for what cannot be sent. UNREACHABLE is a daemon that does not answer or subscribe
     within `wait_s`, or goes. FAULT comes as soon as the device is in FAULT. REFUSED are forces that the scene does not
@@ -117,12 +118,12 @@ def _publish(
     is_interrupted: Callable[[], bool],
     watch: StatusWatch | None,
 ) -> dict[str, Any]:
-    """Publish setpoints until the time or an interrupt, and return the counts; `watch` looks at the daemon in between,
-    unless None.
+    """Publish setpoints until the time or an interrupt, and return the counts.
 
-    Each deadline counts from the start, so that lateness does not add up. A setpoint whose successor is already due is
-    `skipped`. Each carries the `preview` that follow it; after the end these stay at the last force. Raises
-    CommandError (UNREACHABLE) where the daemon goes, and as `StatusWatch.look`.
+    `watch` looks at the daemon in between, unless None. Returns `sent`, `skipped`, `start_ns` since 1970, `seconds`,
+    `worst_late_ms` and `interrupted`. Each deadline counts from the start, so that lateness does not add up. A setpoint
+    whose successor is already due is `skipped`. Each carries the `preview` that follow it; after the end these stay at
+    the last force. Raises CommandError (UNREACHABLE) where the daemon goes, and as `StatusWatch.look`.
     """
     sent = skipped = index = 0
     worst_late_s = 0.0

@@ -30,7 +30,8 @@ KEPT = 1_000
 def top(client: Client) -> Outcome:
     """Draw the daemon's state until `q`, Ctrl-C or SIGTERM; the terminal is restored then.
 
-    Raises CommandError (USAGE) without a terminal to draw on, and as `Client.status` and `Watcher.look`.
+    The outcome has the `seconds`. The end of input counts as `q`. Raises CommandError (USAGE) without a terminal to
+    draw on, and as `Client.status` and `Watcher.look`.
     """
     console = Console(highlight=False)
     if not (is_terminal(sys.stdin) and console.is_terminal) or console.is_dumb_terminal:

@@ -37,7 +37,10 @@ class Waveform(NamedTuple):
 
 
 def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
-    """Return straight lines from `start_N` on: each leg is its duration, s, and the force at its end, N."""
+    """Return straight lines from `start_N` on: each leg is its duration, s, and the force at its end, N.
+
+    Needs a leg at least, and durations above 0; neither is checked.
+    """
     times_s = [0.0, *accumulate(lasts_s for lasts_s, _ in legs)]
     return _lines(times_s, [start_N, *(force_N for _, force_N in legs)])
 

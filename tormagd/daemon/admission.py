@@ -199,9 +199,10 @@ class Admission:
             known.endpoint.disable_monitor()
 
     def has_role(self, public: str, roles: frozenset[str]) -> bool:
-        """Tell whether the key `public` is now listed for at least one of `roles`.
+        """Tell whether the key `public`, in Z85, is now listed for at least one of `roles`.
 
-        Ask for each message: a peer may have been taken off the list after it was let in.
+        False for one that is not listed. Ask for each message: a peer may have been taken off the list after it was let
+        in.
         """
         return public in self.allowed and not roles.isdisjoint(self.allowed[public].roles)
 
@@ -211,15 +212,18 @@ class Admission:
         return fingerprint(public) if listed is None else f"{fingerprint(public)} ({listed.name})"
 
     def connections(self) -> dict[str, int]:
-        """Return the number of connections of each endpoint."""
+        """Return the number of connections by the endpoint's name, as far as `update` has handled their events.
+
+        A peer counts from when it is accepted, also before its key has been asked for.
+        """
         return {name: len(known.addresses) for name, known in self._endpoints.items()}
 
     def let_in(self, allowed: Allowed) -> None:
-        """Replace the list of allowed keys by `allowed`, and log it; keys that have lost a role are logged as a
-        warning.
+        """Replace the list of allowed keys by `allowed`, and log it.
 
-        Where a key has, all peers of the guarded telemetry and recording endpoints are cut off. Peers that are still
-        allowed reconnect by themselves.
+        Keys that have lost a role are logged as a warning. Where one has, all peers of the guarded telemetry and
+        recording endpoints are cut off. Peers that are still allowed reconnect by themselves. Peers of setpoint and
+        control stay: each of their messages is held against `has_role`. Call it after `guard` of all endpoints.
         """
         before, self.allowed = self.allowed, allowed
         roles = Counter(role for listed in allowed.values() for role in listed.roles)

@@ -17,7 +17,8 @@ class Allowance:
     def grants(self, peer: Peer, now_s: float) -> bool:
         """Tell whether one more message of `peer` may be read at `now_s`; if so, it is taken from the peer's bucket.
 
-        Of more than PEERS peers, the one heard longest ago is forgotten; it would begin again with a full bucket.
+        A new peer begins with a full bucket. Of more than PEERS peers, the one heard longest ago is forgotten, and
+        would begin anew. `now_s` must not fall.
         """
         if peer not in self._buckets and len(self._buckets) >= PEERS:
             del self._buckets[min(self._buckets, key=self._buckets.__getitem__)]

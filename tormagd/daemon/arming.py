@@ -91,7 +91,10 @@ class Arming:
 
 
 def _next(safety: SafetyState, present: Conditions) -> Event:
-    """Return the next command towards ENABLED; `clear-fault` first where only the device has latched a fault."""
+    """Return the next command towards ENABLED; `clear-fault` first where only the device has latched a fault.
+
+    Not to be called in ENABLED: there is none.
+    """
     if present.device_latched and safety.operating_state is OperatingState.DISABLED:
         return Event.CLEAR_FAULT
     return next_commands(safety, present.homed)[0]

@@ -36,7 +36,7 @@ class Arrivals:
         self._ready.add(socket)
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
-        """Tell whether a message waits in a watched socket.
+        """Tell whether a message waits in a watched socket; False for one that is not watched.
 
         A message that came after the last `look` is seen only where the socket counts as ready.
         """

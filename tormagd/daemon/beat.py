@@ -76,7 +76,10 @@ class Phases:
         self._tell_ns = clock_ns()
 
     def begin(self, phases: list[Part], slices: list[Part]) -> None:
-        """Set the phases and slices of every beat from now on, each name with its function."""
+        """Set the phases and slices of every beat from now on, each name with its function, and empty `spent`.
+
+        Needs a slice at least, and names that differ. Call it before the first `run`.
+        """
         self._phases, self._slices = phases, slices
         self.spent = {name: Histogram() for name, _ in (*phases, *slices)}
 

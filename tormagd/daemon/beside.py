@@ -12,7 +12,8 @@ MOST_PACKET = 65_536
 def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
     """Start `python -m module DESCRIPTOR`, with the socket `its_end` as that descriptor, and return the process.
 
-    It gets no signal of our process group: it is to end once our end of the socket is closed. Raises OSError.
+    It gets no signal of our process group: it is to end once our end of the socket is closed. Its stdin is empty, its
+    stdout and stderr are ours. The caller closes `its_end` here. Raises OSError.
     """
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
@@ -51,7 +52,7 @@ class Beside:
     def receive(self, wait_s: float = 0.0) -> bytes | None:
         """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process has ended.
 
-        The end of the process sets `is_gone`.
+        The end of the process sets `is_gone`. Of a packet over MOST_PACKET bytes the rest is lost.
         """
         try:
             if wait_s:
@@ -65,6 +66,9 @@ class Beside:
         return data or None
 
     def close(self) -> None:
-        """Close our end of the socket, which tells the process to end. Does not wait for it."""
+        """Close our end of the socket, which tells the process to end. Does not wait for it.
+
+        `send` returns False from then on.
+        """
         self.is_gone = True
         self.socket.close()

@@ -44,10 +44,11 @@ log = logging.getLogger(__name__)
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
-    """Return the header of a black box of `core`.
+    """Return the header of a black box of `core`: what a replay needs to build the same core again.
 
-    It holds what a replay needs to build the core again, and versions and hashes to check that it is the same one.
-    Reads the sources' files for their hash.
+    Keys: `format`, `version`, `build`, `sources_sha256`, `platform`, `config` and `scene` (both JSON), `config_sha256`,
+    `scene_sha256`, `scene_folder`, `model_sha256`. `columns` has the names of a tick's values, a list in JSON. Reads
+    the sources' files for their hash.
     """
     configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
@@ -100,7 +101,10 @@ class BlackBox:
         self._asked: deque[Write] = deque(maxlen=MAX_ASKED)
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
-        """Begin the journal with the states before the first tick. It also takes what passes through `connection`."""
+        """Begin the journal with the states before the first tick. It also takes what passes through `connection`.
+
+        Does nothing without a keeper.
+        """
         if self._beside is not None:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
@@ -184,7 +188,11 @@ class BlackBox:
         self._stop_if_gone()
 
     def report(self) -> BlackBoxReport:
-        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost."""
+        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost.
+
+        File and failure show once `look` has noted them. A text is empty where there is none: no folder, no file in
+        this run, nothing wrong.
+        """
         return BlackBoxReport(
             folder="" if self._folder is None else str(self._folder),
             newest=self._newest,

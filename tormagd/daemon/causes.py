@@ -58,7 +58,10 @@ class Causes:
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
-        """Return each fault with its cause, in figures of when it was latched where there are any, and its remedy."""
+        """Return each fault with its cause, in figures of when it was latched where there are any, and its remedy.
+
+        They stay in their order. Raises KeyError for a code that FAULTS does not have.
+        """
         return explanations(faults, FAULTS, self._told)
 
     def of_limits(
@@ -68,10 +71,11 @@ class Causes:
         of_sources: Mapping[Limit, Explanation],
         measurement: Measurement | None,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause, in figures where there are any, and its remedy.
+        """Return each limit with its cause, in figures where there are any, and its remedy; in their order.
 
         `replaced` names the inputs that the model was held to its range in. `of_sources` are explanations of limits
-        about publishers. `measurement` is the newest; None without a device.
+        about publishers, and go before those of LIMITS. `measurement` is the newest; None without a device. Raises
+        KeyError for a code that neither has.
         """
         told = {Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered"}
         told |= {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"}
@@ -104,5 +108,8 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
 def explanations(
     codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str] = MappingProxyType({})
 ) -> tuple[Explained, ...]:
-    """Return each code with its cause and remedy from `table`; a cause in `told` goes before the table's."""
+    """Return each code with its cause and remedy from `table`; a cause in `told` goes before the table's.
+
+    Raises KeyError for a code that `table` does not have, also where `told` has it.
+    """
     return tuple(Explained(str(code), told.get(code, table[code].cause), table[code].remedy) for code in codes)

@@ -107,7 +107,10 @@ class ControlLoop:
         self.stepper.lose_link()
 
     def new_faults(self) -> tuple[Fault, ...]:
-        """Return the faults latched since the last call."""
+        """Return the faults latched since the last call; at the first call, all that are latched.
+
+        A fault that was cleared and latched again is new only where a call came in between.
+        """
         faults, known = self.stepper.safety.faults, self._known_faults
         self._known_faults = faults
         return tuple(fault for fault in faults if fault not in known)

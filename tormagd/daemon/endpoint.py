@@ -182,13 +182,17 @@ class Endpoint:
         return most
 
     def tell(self, now_s: float) -> None:
-        """Log the newly refused and dropped messages, and update the inbox's count of oversize ones."""
+        """Log the newly refused and dropped messages, a line of each at most in 10 s, and update the inbox's count of
+        oversize ones."""
         self.inbox.oversize = self.admission.oversize
         self._drops.tell(now_s)
         self.admission.refusals.tell(now_s)
 
     def report(self) -> PeersReport:
-        """Return the connections of each endpoint, refused peers, and peers whose messages were dropped."""
+        """Return the connections of each endpoint, refused peers, and peers whose messages were dropped.
+
+        Counts are since the start. Of `refusals` the newest is last, of `drops` the most frequent first.
+        """
         return PeersReport(
             connections=self.admission.connections(),
             refused=self.admission.refusals.total,
@@ -198,7 +202,7 @@ class Endpoint:
         )
 
     def close(self) -> None:
-        """Close all sockets and remove their files, without waiting for anybody."""
+        """Close all sockets and remove their files, without waiting for anybody. Call it once."""
         self.admission.close()
         for file in self._files:
             file.close()

@@ -52,5 +52,5 @@ class Heartbeat:
         return expirations
 
     def close(self) -> None:
-        """Close the timer's descriptor."""
+        """Close the timer's descriptor. Call it once, after the event loop has stopped watching it."""
         os.close(self._fd)

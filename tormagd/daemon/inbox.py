@@ -83,6 +83,7 @@ class _Source:
         return self.is_named and not was_named
 
     def is_stale(self, now_s: float) -> bool:
+        """Tell whether the newest setpoint is no longer valid at `now_s`; True also before the first one was taken."""
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
@@ -188,9 +189,10 @@ class SetpointInbox:
         return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
 
     def begin_scene(self, scene: Scene) -> None:
-        """Judge by the needs of `scene` from now on, and forget the newest setpoint.
+        """Judge by the needs of `scene` from now on, and forget the newest setpoint and those that wait.
 
-        In a scene whose element is a pad, setpoints with `withdraw_cf` or `contact` are refused.
+        Sources, their counts and the holder stay. In a scene whose element is a pad, setpoints with `withdraw_cf` or
+        `contact` are refused.
         """
         self.playout.forget()
         self.has_way, self._needs = scene.element == "torque", needs_of(scene)
@@ -396,7 +398,11 @@ class SetpointInbox:
         )
 
     def _source_report(self, name: str, now_s: float) -> SourceReport:
-        """Return the report on one known source, with the figures of its last `refresh`."""
+        """Return the report on one known source, with the figures of its last `refresh`.
+
+        Raises KeyError for an unknown one. `state` is `stale` for a setpoint that is no longer valid, else `holds` for
+        the holder of the brake, else `refused`.
+        """
         source = self._sources[name]
         clock, sequence = source.clock, source.sequence
         state = "holds" if name == self.hold.source else "refused"
@@ -429,8 +435,9 @@ def _refuse_way(setpoint: Setpoint) -> None:
 def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
     """Raise MessageError where the source's stamps do not count ns, or where this is not known yet.
 
-    A stamp within a day of our clock counts ns at once. Others are refused until LOOKED_AT messages show what they
-    count. Notes the stamp for this judgement, and that the source was heard at `now_s`.
+    A stamp within a day of our clock, `realtime_ns`, counts ns at once. Others are refused until LOOKED_AT messages,
+    over LEAST_S or more, show what they count. Also where it raises, it notes the stamp for this judgement, and that
+    the source was heard at `now_s`.
     """
     unit = source.unit
     unit.hear(now_s, setpoint.stamp_ns, realtime_ns)

@@ -52,7 +52,10 @@ class InferenceLoop:
         self.planner.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word that the device has changed, or that its sensor is wrong; note it in the journal."""
+        """Take the operator's word that the device has changed, or that its sensor is wrong; note it in the journal.
+
+        Without a dispute the planner does nothing, but the journal has it.
+        """
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 

@@ -24,7 +24,7 @@ class Listeners:
         self._gone = dict.fromkeys(TOPICS, 0)
 
     def has(self, topic: bytes) -> bool:
-        """Tell whether a peer subscribes to `topic`."""
+        """Tell whether a peer subscribes to `topic` by its name. Raises KeyError for one that is not of TOPICS."""
         return bool(self._asked[topic])
 
     def hear(self, word: bytes, peer: Peer | None) -> None:

@@ -53,7 +53,8 @@ class Playout:
     def update(self, now_s: float, taken: Taken | None = None) -> bool:
         """Take a setpoint, if there is one, and put the newest that is due in force; return True where it is another.
 
-        Those that wait for a later time than `taken` are replaced by it. One that is due already counts as late.
+        Those that wait for the same time as `taken`, or a later one, are replaced by it. One that is held back and due
+        already counts as late.
         """
         if taken is not None:
             self._count(now_s, taken)

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 def state_folder(configured: str, name: str) -> Path | None:
     """Return the folder `configured`, or else `name` in the service's $STATE_DIRECTORY; None without either.
 
-    The folder need not exist.
+    Of several folders in $STATE_DIRECTORY the first counts. The folder need not exist.
     """
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(configured) if configured else Path(state, name) if state else None
@@ -38,7 +38,8 @@ class ProfileFolder:
         self.folder, self.insert, self.model, self._bounds = folder, insert, model, bounds
 
     def path(self, serial_number: int) -> Path:
-        """Return the path of a device's profile."""
+        """Return the path of a device's profile: serial number in eight hexadecimal digits, and insert. The file need
+        not exist."""
         return self.folder / f"{serial_number:08x}-{self.insert}.json"
 
     def read(self, serial_number: int) -> Profile | None:
@@ -140,7 +141,10 @@ class Profiles:
         self._writing.add_done_callback(self._note)
 
     def close(self) -> None:
-        """Drop a profile that is still being read."""
+        """Drop a profile that is still being read. One that is being written goes on: see `finished`.
+
+        Call no `look` after it.
+        """
         self._serial_number = None
 
     async def finished(self) -> None:
@@ -149,7 +153,10 @@ class Profiles:
             await asyncio.wait([self._writing])
 
     def report(self) -> ProfileReport:
-        """Return whether a profile is used, its age, s (None without one), its folder, and why none is used."""
+        """Return whether a profile is used, how old the one on the disk is, its folder, and why none is used or kept.
+
+        The age, s, is None where none was read or written; texts are empty without a folder or a reason.
+        """
         return ProfileReport(
             is_used=self._is_used,
             age_s=None if self._saved_ns is None else round(max(0.0, (time.time_ns() - self._saved_ns) * 1e-9), 1),

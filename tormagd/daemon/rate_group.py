@@ -38,9 +38,9 @@ class Histogram:
         self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
-        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0.
+        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0, and so does NaN.
 
-        Forgets durations from two horizons ago.
+        Forgets durations from two horizons ago. `report` stays as it is until `refresh`. Infinity is not allowed.
         """
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s

@@ -48,7 +48,8 @@ class Service:
     def news(self, now_s: float, is_alive: bool, link: LinkState, status: str) -> list[str]:
         """Return the messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives.
 
-        Before READY, a daemon that lives also asks for EXTENSION_S more to start, once in REPEAT_S.
+        Before READY, a daemon that lives also asks for EXTENSION_S more to start, once in REPEAT_S. Each counts as told
+        with this call: READY and STATUS do not come again where they are not sent.
         """
         messages = []
         if not self.is_ready and link is LinkState.RUNNING:

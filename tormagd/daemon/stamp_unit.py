@@ -35,8 +35,9 @@ class StampUnit:
     def hear(self, now_s: float, stamp_ns: int, realtime_ns: int) -> None:
         """Take a message that came at `now_s`; `realtime_ns` is our CLOCK_REALTIME then.
 
-        A stamp within FAR_NS of it counts ns. Stamps further off are judged by how fast they run, after LOOKED_AT
-        messages and LEAST_S. `is_known` and `wrong` then say what was found.
+        A stamp within FAR_NS of it counts ns, whatever was found before. Stamps further off are judged by how fast they
+        run, after LOOKED_AT messages and LEAST_S. `is_known` and `wrong` then say what was found, and stay until the
+        next judgement.
         """
         if abs(realtime_ns - stamp_ns) < FAR_NS:
             self.is_known, self.wrong, self._from = True, "", None

@@ -82,7 +82,11 @@ async def _run(
 
 
 def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
-    """Return what `--check` prints, as JSON: configuration, scene, what follows from both, installed backends."""
+    """Return what `--check` prints, as JSON: `config`, `scene`, `derived`, which follows from both, and `backends`.
+
+    `derived` has the device's forces, margins, search, rates, resolution and what the gap's speed misses, null where
+    the scene has no signal. `backends` has by name `loads`, or why one does not. `options` are the chosen backend's.
+    """
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
         "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),

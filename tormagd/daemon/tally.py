@@ -34,7 +34,11 @@ class Tally:
         self._counts: dict[tuple[str, Peer, str], int] = {}
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
-        """Count one more refusal of `peer` at `endpoint` for `reason`."""
+        """Count one more refusal of `peer` at `endpoint` for `reason`.
+
+        Beyond `most` entries, the one counted longest ago joins the OTHERS of its endpoint, under its reason's text up
+        to a colon.
+        """
         self.total += 1
         self._add((endpoint, peer, reason), 1)
         if len(self._counts) > self.most:

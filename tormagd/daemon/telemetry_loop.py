@@ -312,9 +312,10 @@ class TelemetryLoop:
         return self._describe() if request.command == "describe" else self.command(request)
 
     def _describe(self) -> Any:
-        """Return what does not change from tick to tick, as plain data.
+        """Return what does not change from tick to tick, as plain data with the keys of `Description`.
 
-        Configuration, scene, model, profile and firmware, and the device's force and force rate over the gap.
+        It has configuration, scene, model, profile and firmware. `portrait` has forces, N, from the open gap to the
+        closed one, and their rates at the gap's speed, N/s, as learned by now. It has every PORTRAIT_STEP-th point.
         """
         link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
         scaled_mm_s = device.scale * self._core.gap_speed_mm_s
@@ -338,9 +339,11 @@ class TelemetryLoop:
     def command(self, request: Request) -> dict[str, Any]:
         """Carry out a request that is no question, and return its result as plain data.
 
-        `take` gives the brake, `confirm` settles a dispute, `mark` adds a mark, `blackbox` keeps a black box, `arm`
-        arms, and `use-scene` changes the scene. Any other name goes to the operating state. Raises RefusedError for an
-        unknown name, and where the state or the arguments do not allow it. The next `status` is made anew.
+        `take` gives the brake, `confirm` settles a dispute, and `mark` adds a mark: see `_give`, `_confirm` and
+        `_add_mark`. `blackbox` asks for a black box, and returns the `file` that it will have. `arm` begins an arming,
+        `use-scene` a change of the scene; neither is over then. Any other name goes to the operating state. These
+        return the `operating_state` of now, and whether a device `is_connected`. Raises RefusedError for an unknown
+        name, and where the state or the arguments do not allow it. The next `status` is made anew.
         """
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
@@ -364,9 +367,10 @@ class TelemetryLoop:
         }
 
     def _add_mark(self, text: object) -> dict[str, Any]:
-        """Put a mark with this text into telemetry, and so into recordings; return it as plain data.
+        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns` and `text`.
 
-        Raises RefusedError for what is not 1..MAX_MARK_CHARACTERS printable characters.
+        It takes the place of the newest mark, and is logged. Raises RefusedError for what is not 1..MAX_MARK_CHARACTERS
+        printable characters.
         """
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
@@ -399,9 +403,11 @@ class TelemetryLoop:
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
-        """Give the brake to the source of this name, log it, and return its name with that of the holder before.
+        """Give the brake to the source of this name, log it, and return its name and that of the holder before.
 
-        Raises RefusedError for what is no text, an unknown source, and one whose newest setpoint is no longer valid.
+        The keys are `source` and `instead_of`. The latter is empty where none held it, and the same name where it held
+        it already. Raises RefusedError for what is no text, an unknown source, and one whose newest setpoint is no
+        longer valid.
         """
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")

@@ -51,7 +51,8 @@ def judged(
 
     `gap_mm` is the measured gap, None without a homed device. Rendered means within the scene's tolerance. Cannot: not
     ENABLED, no homed device, no valid setpoint, or a limit that keeps the force away for good. Why is the state, or the
-    limits. The time is that of the gap's way at its speed, or of the ramp, plus the lag.
+    limits; it is empty where there is no setpoint at all. The time is that of the gap's way at its speed, or of the
+    ramp, plus the lag.
     """
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:

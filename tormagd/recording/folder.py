@@ -88,7 +88,10 @@ class RecordingFolder:
         self.path, self.budget, self._clock = path, budget, clock
 
     def segments(self) -> list[Segment]:
-        """List the folder's recordings by age, the oldest first; those whose name says no time come before all."""
+        """List the folder's recordings by age, the oldest first; those whose name says no time come before all.
+
+        Every `*.mcap` in it counts, black boxes too. Empty where there is no folder.
+        """
         found = [each for path in self.path.glob("*.mcap") if (each := segment_of(path)) is not None]
         return sorted(found, key=lambda each: (each.began_s or 0.0, each.path.name))
 

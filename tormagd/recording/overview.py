@@ -144,7 +144,10 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
-        """Return, by code of this kind, the spans in which the code was present, in seconds since the start."""
+        """Return, by code of this kind, the spans in which the code was present, in seconds since the start.
+
+        `kind` is one of KINDS; empty for another. Spans of a code that came and went often may be joined.
+        """
         known = self.codes.get(kind, {})
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
@@ -243,9 +246,10 @@ class OverviewBuilder:
 
 
 def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """Return the QUANTITIES of a tick or a snapshot in their order; None where not known.
+    """Return the QUANTITIES of a tick or a snapshot in their order; None where not known. NaN stays.
 
     A missing `gap_mm` is the sum of `left_mm` and `right_mm`. A missing `gap_setpoint_mm` is `reference_gap_mm`.
+    `duty`, left and right, goes before `left_duty` and `right_duty`.
     """
     get = message.get
     gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
@@ -271,7 +275,10 @@ def _number(value: object) -> float | None:
 
 
 def codes_in(told: object) -> tuple[str, ...]:
-    """Return the codes in a field's value, empty for None; odd characters become "?", 64 at most are kept."""
+    """Return the codes in a field's value, a text or a list of texts; empty for anything else, such as None.
+
+    Odd characters become "?", and an odd code is cut to 64 characters. An empty one is "?".
+    """
     words = (told,) if isinstance(told, str) else told if isinstance(told, tuple | list) else ()
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 
@@ -308,7 +315,11 @@ class _Stretches:
         self._high = [array("f") for _ in QUANTITIES]
 
     def add(self, since_ns: int, values: Iterable[float | None]) -> None:
-        """Add values to their stretch, or to the last where time ran back; widen all where there are too many."""
+        """Add one value of each of QUANTITIES, in their order, to the stretch of `since_ns`.
+
+        None and NaN are passed over. `since_ns` counts from the recording's start. Where time ran back, they go to the
+        last stretch. At MOST_STRETCHES all become twice as wide. Raises ValueError for another number of values.
+        """
         number = since_ns // self.width_ns
         # a clock that was set back does not set the curve back
         if not self._numbers or number > self._numbers[-1]:
@@ -351,7 +362,10 @@ class _Stretches:
 
 
 def _joined(spans: list[list[int]]) -> list[list[int]]:
-    """Join the spans with the smaller gaps between them, about half of all; the last span stays alone."""
+    """Join the spans with the smaller gaps between them, about half of all; the last span stays alone.
+
+    Needs three or more. The lists in `spans` are changed.
+    """
     gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
     near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
     for span, gap_ns in zip(spans[1:-1], gaps, strict=True):

@@ -97,8 +97,11 @@ def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
 
 
 def _place(high_in: float, lines: int, longest: int) -> dict[str, float]:
-    """Return where the panels are in a figure so high: under a headline of `lines`, right of names of `longest`
-    characters."""
+    """Return where the panels are in a figure so high.
+
+    They are under a headline of `lines`, right of names of `longest` characters. `left`, `right`, `top` and `bottom`
+    are shares of the figure, and `hspace` is the distance in panels: matplotlib's names.
+    """
     left_in, top_in, bottom_in, between_in = max(0.9, 0.25 + 0.078 * longest), 0.45 + 0.24 * lines, 0.6, 0.34
     panel_in = (high_in - top_in - bottom_in - 3.0 * between_in) / 4.0
     return {
@@ -111,7 +114,8 @@ def _place(high_in: float, lines: int, longest: int) -> dict[str, float]:
 
 
 def picture(drawn: Figure, form: str) -> bytes:
-    """Return the figure as the bytes of an image file of this form, such as "png"."""
+    """Return the figure as the bytes of an image file of this form, such as "png". Raises ValueError for an unknown
+    form."""
     made = io.BytesIO()
     drawn.savefig(made, format=form, dpi=110)
     return made.getvalue()

@@ -147,7 +147,11 @@ class Contents:
             )
 
     def described(self, name: str, kind: Any) -> Any:
-        """Return the metadata value `name` decoded as the type `kind`; None where it is absent or of another type."""
+        """Return the metadata value `name`, which is JSON, decoded as the type `kind`.
+
+        None where it is absent or of another type. A plain text, as a string of the description is written, gives None
+        too: take it from `metadata`.
+        """
         try:
             return msgspec.json.decode(self.metadata[name], type=kind)
         except (KeyError, msgspec.MsgspecError, RecursionError):

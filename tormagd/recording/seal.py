@@ -47,7 +47,10 @@ def read_key(file: str) -> bytes:
 
 
 def hasher(key: bytes) -> "hashlib.blake2b":
-    """Return a new BLAKE2b hash of DIGEST_BYTES with this key; an empty key means none."""
+    """Return a new BLAKE2b hash of DIGEST_BYTES with this key; an empty key means none.
+
+    Raises ValueError for a key of over 64 bytes.
+    """
     return hashlib.blake2b(key=key, digest_size=DIGEST_BYTES)
 
 

@@ -49,7 +49,10 @@ INDEX_SHARE = 64
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
-    """Say why the disk of `path` has no room for so many bytes more, and a reserve; empty where it has."""
+    """Say why the disk of `path` has no room for so many bytes more, and a reserve; empty where it has.
+
+    The file need not exist, its folder must. Raises OSError.
+    """
     free, least = shutil.disk_usage(path.parent).free, LEAST_FREE_BYTES + needed_bytes
     if free >= least:
         return ""
@@ -128,7 +131,8 @@ class RecordingWriter:
         raise OSError(errno.ENOSPC, reason)
 
     def describe(self, metadata: dict[str, str]) -> None:
-        """Write metadata, now and into every later file in the folder. The later value of a name counts."""
+        """Write metadata, now and into every later file in the folder. The later value of a name counts. Raises
+        OSError."""
         self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 
@@ -152,7 +156,10 @@ class RecordingWriter:
             self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message, thinned, and count missing numbers; numbers may start over. Raises OSError."""
+        """Write each row as one message, thinned, and count missing numbers; numbers may start over.
+
+        Then goes on in a new file where one is due. Raises OSError, FileExistsError among it.
+        """
         number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
         for row in batch.rows:
             t_ns = row[0]
@@ -209,8 +216,10 @@ class RecordingWriter:
         return self._tick_channels[fits]
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
-        """Write a message. At a new chunk, first flush, seal the chunk before, and end the file where there is no
-        room."""
+        """Write a message. At a new chunk, first flush, seal the chunk before, and end the file where there is no room.
+
+        Raises OSError, also where the file was ended.
+        """
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             index_bytes = self._sealing.tell() // INDEX_SHARE
@@ -240,7 +249,10 @@ def sealed_mcap(
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
-    """Register `schema` and a channel of JSON messages in the file that `mcap` writes; return the channel's id."""
+    """Register `schema` and a channel of JSON messages in the file that `mcap` writes; return the channel's id.
+
+    The schema needs a `title`, which is its name in the file.
+    """
     schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=msgspec.json.encode(schema))
     return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
 

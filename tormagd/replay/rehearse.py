@@ -137,8 +137,9 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
 def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Sequence[str]) -> Happened:
     """Run the script in the closed loop against the simulated device, and return what it met.
 
-    `plant` names the simulated device. `faults` are its faults, as in encoder_jump@12.5, from the file's first tick.
-    Raises ReplayError: an unknown plant or fault, or a device that cannot be armed, or not in time.
+    That is faults, limits and refused commands. `core` is of `config`, and gives a new stepper and planner. `plant`
+    names the simulated device. `faults` are its faults, as in encoder_jump@12.5, s from the file's first tick; empty
+    for none. Raises ReplayError: an unknown plant or fault, or a device that cannot be armed, or not in time.
     """
     try:
         delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in map(parse_fault, faults)]

@@ -102,8 +102,9 @@ class Patient:
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
     """Return the fields of a setpoint that says what the tip feels, `felt`, in the way of `mode`, one of MODES.
 
-    Mode `force` gives `servo_cf`, the size of the force. The others give wall and friction together as `servo_cf`. Of
-    these `way` adds the friction as `withdraw_cf`, `law` the wall as `contact` once the tip has met it.
+    Forces are in N. Mode `force` gives `servo_cf`, the size of the force. The others give wall and friction together as
+    `servo_cf`. Of these `way` adds the friction as `withdraw_cf`. `law` adds the wall as `contact`, once the tip has
+    met it: `handle_mm`, `stiffness_N_mm` and `friction_N`.
     """
     if mode == FORCE:
         return {"servo_cf": abs(felt.force_N)}

@@ -124,7 +124,7 @@ def law_beside(
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
-    """Return the portrait that the model's `curve` predicts, at GRID gaps over `gap_range_mm`, closed and open.
+    """Return the portrait that the model's `curve` predicts, at GRID gaps over `gap_range_mm`, closed to open.
 
     Raises DomainError where the field law ends.
     """

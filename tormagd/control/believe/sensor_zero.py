@@ -126,10 +126,12 @@ class SensorZero:
     ) -> bool:
         """Take one reading, and return whether a reversal has told the zero just now.
 
-        A reversal tells the zero once the handle has slid for LEVEL_S both ways. The handle slides at `rate_mm_s` the
-        way `direction`, 1 or -1. `reading_N` is the force against this motion, the model's force `model_N`. The reading
-        stands for `dt_s` > 0. `scale` is the device's force over the model's, known to within `scale_sd`. All arguments
-        are finite.
+        Zero and variance have then changed. A reversal tells the zero once the handle has slid for LEVEL_S both ways.
+        It does not after a turn of over LONGEST_TURN_S, or where the zero found is beyond MAX_ZERO_N. Either way the
+        level before is spent. The handle slides at `rate_mm_s` the way `direction`, 1 or -1: give no reading of a
+        handle at rest. `reading_N` is the force against this motion, the model's force `model_N`. The reading stands
+        for `dt_s` > 0. `scale` is the device's force over the model's, known to within `scale_sd`. All arguments are
+        finite.
         """
         level = self.level
         if level is None or direction != self.direction:

@@ -238,11 +238,11 @@ class Watch:
         return faults
 
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
-        """Return the faults of motion and force, by the counted times.
+        """Return the faults of motion and force, by the counted times; empty for none. Changes nothing.
 
-        WRONG_DIRECTION, SKEW, FOLLOWING_ERROR, OVER_FORCE, SENSOR and NO_MOTION may show. SENSOR is one only where the
-        scene needs the sensor, OVER_FORCE only on a brake. A carriage against its duty shows sooner with SKEW or
-        NO_MOTION.
+        WRONG_DIRECTION, SKEW, FOLLOWING_ERROR, OVER_FORCE, SENSOR and NO_MOTION may show. `sensor_doubted_s` is for how
+        long of sliding the force sensor has not been believed, s. SENSOR is one only where the scene needs the sensor,
+        OVER_FORCE only on a brake. A carriage against its duty shows sooner with SKEW or NO_MOTION.
         """
         faults: list[Fault] = []
         is_skewed = abs(measured.skew_mm) > self._max_apart_mm

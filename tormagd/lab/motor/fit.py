@@ -361,10 +361,10 @@ def _current(log: Log, variant: Variant) -> Array:
 
 
 def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
-    """Return the force, N, with which the motor moves the carriage slowly in `direction`, 1 or -1, at positions `x`
-    (n).
+    """Return the force, N, with which the motor moves the carriage slowly at positions `x` (n).
 
-    `values` are those of the fit in `fit_gearbox`. `idle_N` is the force that the gears take idling.
+    `direction` is 1, opening, or -1. Positive opens. `values` are those of the fit in `fit_gearbox`, and `x` is scaled
+    as there: over its standard deviation. `idle_N` is the force that the gears take idling.
     """
     lost = float(values[2])
     idling = float(values[8]) if len(values) > 8 else 0.0

@@ -68,9 +68,10 @@ def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
 
 
 def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
-    """Return by name what only a log with a current shows: windings, gain (N/V), mass, friction and gear efficiency.
+    """Return by name what only a log with a current shows of windings and gearbox; all are referred to the carriage.
 
-    All are referred to the carriage.
+    The names end in their units: `gain_N_V`, `resistance_ohm`, `inductance_mH`, `back_emf_V_s_m`,
+    `friction_viscous_N_s_m`, `gear_efficiency`, `mass_kg`, `coulomb_N`.
     """
     return {
         "gain_N_V": _product((windings.back_emf, 1), (windings.resistance, -1)),

@@ -395,7 +395,11 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
 
 
 def _missing(data: Dataset) -> list[str]:
-    """Return in words which fields and rates the data lack, inside and at the ends of what a handle meets."""
+    """Return in words what the data lack: gaps in field and rate, and rates at the ends of what a handle meets.
+
+    Empty where nothing is lacking. Of each the widest gap is told, where it is over GAP_OF_RANGE of the data's own
+    range. The ends of the field are not judged. `data` need a row.
+    """
     fields_mT = np.unique(data.features[:, 2])
     rates = np.log10(np.unique(np.clip(data.features[:, 1], RATES_MM_S[0], None)))
     missing = []
