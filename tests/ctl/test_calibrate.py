@@ -3,9 +3,11 @@
 import contextlib
 import csv
 import datetime
+import io
 import json
 import math
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,7 @@ from tormagd.ctl import (
     calibrate_motors as ctl_calibrate_motors,
     commission as ctl_commission,
 )
-from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
+from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, agree, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
 from tormagd.ctl.calibrate_run import Progress, Range
 from tormagd.ctl.outcome import CommandError
@@ -428,3 +430,17 @@ def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon,
     for broken in (b"{}", b'{"v": 1, "\xff": 1}'):
         Path(result["page"]).with_suffix(".json").write_bytes(broken)
         assert "is no report" in ctl(*command).ended(2).error["hint"]
+
+
+class Terminal(io.StringIO):
+    """What a person has typed."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_who_ends_the_input_has_not_agreed_that_anything_moves(monkeypatch) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("\n"))
+    agree()
+    with pytest.raises(CommandError, match="nobody agreed"):
+        agree()

@@ -219,11 +219,12 @@ def calibrate(
 
 
 def agree() -> None:
-    """Wait until a person presses Enter: the carriages may move. Raises CommandError (USAGE) without a terminal.
+    """Wait until a person presses Enter: the carriages may move.
 
-    The end of input (Ctrl-D) counts as Enter; Ctrl-C raises KeyboardInterrupt.
+    Raises CommandError (USAGE) without a terminal and where input ends (Ctrl-D); Ctrl-C raises KeyboardInterrupt.
     """
     if not is_terminal(sys.stdin):
         raise usage_error("stdin is no terminal: nobody can agree to the carriages moving", "a script says --yes")
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)
-    sys.stdin.readline()
+    if not sys.stdin.readline():
+        raise usage_error("input ended: nobody agreed to the carriages moving", "press Enter to agree")
