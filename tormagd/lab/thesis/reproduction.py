@@ -224,9 +224,8 @@ def figure_2_5() -> Json:
         "shear_modulus_kPa": moduli_kPa.tolist(),
         "thesis_working_point_N": list(FIGURE_2_5_N),
         "measured_earlier_N": list(FIGURE_2_5_MEASURED_N),
-        "note": "mu_r 4, G0 277 kPa, mu_d 0.2, 95 and 45 mm. The range grows with mu_r. At a given mu_r and "
-        "friction it falls with G0: a softer elastomer is pressed harder. That stiffer inserts brake more, as "
-        "measured, is in their iron and in the friction of their matrix.",
+        "note": "mu_r 4, G0 277 kPa, mu_d 0.2, 95 and 45 mm. The range grows with mu_r, and falls with G0: a "
+        "softer elastomer is pressed harder. Stiffer inserts brake more by their iron and their friction.",
     }
 
 
