@@ -9,7 +9,7 @@ from rendering.scene_runs import ROOT
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
 from tormagd.lab.pages import stamp, subplots, table
-from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, Measurements, OperatingPoint, WorstDevice, measured
+from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, Measurements, OperatingPoint, measured
 from tormagd.scenes.scene import load_scene, scene_path, shipped_scenes
 from tormagd.scenes.signal import asked
 
@@ -44,11 +44,8 @@ def page() -> str:
         f"![error over the daemon's share](<{TRADE.as_posix()}>)",
         "A point is a scene served in one way: its error as a share of its tolerance, over what the daemon takes. The "
         "thesis's own loop searches row by row, in a process beside the daemon.",
-        "No set of terms of the model saves a fifth of the daemon's share ([what was measured]"
-        "(decisions/0009-what-a-scene-requires.md)). So every term runs, unless the scene leaves it out.",
         f"![what the scenes ask for over time](<{PICTURE.as_posix()}>)",
         _ways(file),
-        _judged(file),
     ]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
@@ -78,11 +75,11 @@ def _head() -> str:
         "| `bandwidth.control_hz`, `inference_hz` | the rates that the daemon runs at where its configuration states "
         "none, control at 500 Hz at the least; slower stated ones are refused |\n"
         "| `[solver]` | the search for the field ([which](guides/scene.md)) |\n"
-        "| `[terms]` | parts of the controller's model that do not run, `false` each (`tormagd/scenes/scene.py`) |\n\n"
+        "| `[terms]` | parts of the controller's model that do not run, `false` each (`tormagd/scenes/scene.py`; [why "
+        "all run](decisions/0009-what-a-scene-requires.md)) |\n\n"
         "Rates and search are measured and chosen. The cheapest way is taken that does in every situation what the "
-        f"usual one does: within {TOLERATED:g} of the tolerance, or at most {WORSE:.0%} of it worse. `tormagctl scene "
-        "explain NAME` shows every way. `scene check NAME --share S` names the most exact one at that price, "
-        "`--tolerance N` the cheapest within that error; `--out FILE` writes the scene served so."
+        f"usual one does: within {TOLERATED:g} of the tolerance, or at most {WORSE:.0%} of it worse. [Choose by price "
+        "or error](guides/scene.md#the-tables) yourself."
     )
 
 
@@ -113,40 +110,15 @@ def _ways(file: Measurements) -> str:
         [str(share.way), f"{100.0 * share.daemon:.1f}", f"{share.tick_us:.0f}", f"{share.plan_us:.0f}"]
         for share in file.shares
     ]
-    every = [share.way for share in file.shares]
-    errors = [[f"`{scene.name}`", *(_error(scene, way) for way in every)] for scene in file.scenes]
     return (
         "## Every way\n\nWhat a daemon takes of a processor, and a control tick and a plan in the median. Setpoints "
         "come as often as plans are made. 83 Hz is the thesis's own rate.\n\n"
         + table(["control / plans, search", "daemon, %", "tick, us", "plan, us"], rows)
-        + "\n\nRMS on the worst of samples 1 to 3, mN:\n\n"
-        + table(["scene", *map(str, every)], errors)
+        + "\n`tormagctl scene explain NAME` has each way's error. It also has what the chosen way and the usual one "
+        "leave in every situation: steps, holds, few setpoints, reversals, creeping, contact, a device not learned. "
+        f"The worst device counts, of the samples, {file.draws} drawn ones and the second plant; {2 * file.draws} "
+        "others judge. Carriages and element bound steps, contacts and creeping handles, whichever way is chosen."
     )
-
-
-def _error(scene: MeasuredScene, way: OperatingPoint) -> str:
-    tried = next((each for each in scene.tried if each.way == way), None)
-    return "" if tried is None else f"{1e3 * tried.worst_N:.1f}"
-
-
-def _judged(file: Measurements) -> str:
-    heads = list(dict.fromkeys(_situation(item) for scene in file.scenes for item in scene.judged))
-    rows = [
-        [f"`{scene.name}`", *(cells.get(head, "") for head in heads)]
-        for scene in file.scenes
-        for cells in [{_situation(item): f"{1e3 * item.rms_N:.0f}/{1e3 * item.usual_N:.0f}" for item in scene.judged}]
-    ]
-    return (
-        "## In every situation\n\nThe worst device of each group, chosen/usual, RMS in mN. Steps, contacts and "
-        "creeping handles are bound by the carriages and the element, not by a way: what counts is the difference. "
-        f"Samples, {file.draws} drawn devices and the second plant decide; {2 * file.draws} others judge.\n\n"
-        + table(["scene", *heads], rows)
-    )
-
-
-def _situation(item: WorstDevice) -> str:
-    group = "" if item.group == "deciding" else f", {item.group}"
-    return item.signal + group + ("" if item.learning else ", frozen")
 
 
 def core_of(name: str) -> Core:
