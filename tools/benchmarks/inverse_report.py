@@ -14,13 +14,11 @@ PLOT = ROOT / "docs" / "images" / "inverse_trade.png"
 USUAL_HIDDEN = 50
 COLUMNS = {
     "search": "{name}",
-    "units": "{hidden}",
     "p50 us": "{p50_us:.1f}",
     "p99 us": "{p99_us:.1f}",
     "solver MAE mT": "{solver_mae_mT:.2g}",
     "plant MAE mT": "{plant_mae_mT:.3f}",
     "force MAE N": "{force_mae_N:.4f}",
-    "memory kB": "{memory_kB:.1f}",
     "Pareto": "{pareto}",
 }
 MIN_SHOWN_MT = 1e-6
@@ -41,8 +39,7 @@ not edit. Synthetic throughout: {workload}. One process, one thread, garbage col
 
 A solve gets a state of the handle, a force and the last field, and answers with a field. The *solver error* is the
 distance to the network's own nearest root, found by bisection. The *plant error* is the distance to the field at which
-the simulated element gives the force: no search can be better than its network. *Force* is the plant's at the answer
-less the force asked.
+the simulated element gives the force. *Force* is the plant's at the answer less the force asked.
 
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
 
@@ -52,12 +49,11 @@ less the force asked.
   curve of this state of the handle.
 - `newton`: Newton's method from the last field, the whole range its bracket. It wants a force that rises with the
   field, as the brake's does. On the same network it is {speedup[thesis-linear]:.0f} times as fast as the thesis's
-  search, {speedup[linear-argmin]:.0f} times as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as
-  `vectorised-argmin`.
+  search.
 
-Times are from several rounds over all variants; p99 still holds whatever else ran. *Pareto* marks the variants that no
+Times are from several rounds over all variants; what else ran shows in p99. *Pareto* marks the variants that no
 faster one equals in plant error, to an encoder count of the gap (about 0.02 mT). Solver errors under 1e-6 mT are drawn
-there. The networks were trained for this page; [how good the shipped ones are](guides/insert.md#the-shipped-models).
+as that. The networks were trained for this page; [how good the shipped ones are](guides/insert.md#the-shipped-models).
 
 ## All searches on {usual} units, and the Pareto variants of every size
 
@@ -74,7 +70,12 @@ def write(result: dict[str, Any]) -> None:
 def page(result: dict[str, Any]) -> str:
     """docs/inverse_trade.md."""
     shown = [row for row in result["variants"] if row["pareto"] or row["hidden"] == USUAL_HIDDEN]
-    stars = [row | {"pareto": "*" if row["pareto"] else ""} for row in shown]
+    stars = [
+        row
+        | {"pareto": "*" if row["pareto"] else ""}
+        | {"name": row["name"] + (f", {row['hidden']} units" if row["hidden"] != USUAL_HIDDEN else "")}
+        for row in shown
+    ]
     texts = {
         "environment": ", ".join(f"{name} {value}" for name, value in result["environment"].items()),
         "usual": USUAL_HIDDEN,
