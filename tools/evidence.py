@@ -60,9 +60,7 @@ PARTS = {
     "faults": Part("tools/faults.py --json", "all cells: [the matrix](../fault-matrix.md)", is_kept=True),
     "numerics": Part(
         "tools/numerics.py --json",
-        "{cases:,} cases, {reference_cases:,} references. Worst relative error float64 {worst_rel_error[float64]:.1e}, "
-        "float32 {worst_rel_error[float32]:.1e}, float32_soft {worst_rel_error[float32_soft]:.1e}. {stage_cases:,} "
-        "hostile steps of the core's stages: {travelled} numbers travelled",
+        "{cases:,} cases, {stage_cases:,} hostile steps of the core's stages: [errors](../measurements.md)",
     ),
     "inverse": Part(
         "tools/benchmark.py inverse --json --write",
@@ -73,8 +71,7 @@ PARTS = {
     ),
     "envelope": Part(
         "tools/envelope.py --json --picture docs/images/envelope.png",
-        "{cases} runs on samples and {draws} draws. Over what was asked by {over_N:.3f} N at most, at most "
-        "{peak_N:.2f} N at all, {settled_N:.3f} N off after 2 s of sliding, {low_hold_faults} faults below F_min",
+        "{cases} runs on samples and {draws} draws: [bounds and worst](../control.md#the-envelope)",
     ),
     "models": Part(
         "tools/envelope.py --models --json",
