@@ -30,8 +30,9 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 def in_place_of(path: Path) -> Iterator[Path]:
     """Give a path beside `path` to write to, which replaces `path` at the end.
 
-    After an error, inside or at the end, that file is removed and `path` stays as it was. Raises
-    IsADirectoryError where `path` is a folder, before anything is written, and OSError where it cannot be replaced.
+    The caller makes that file, `path` with `.part` behind it; a file left there by another may be overwritten. After an
+    error, inside or at the end, that file is removed and `path` stays as it was. Raises IsADirectoryError where `path`
+    is a folder, before anything is written, and OSError where nothing was made or `path` cannot be replaced.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))

@@ -104,12 +104,20 @@ class VirtualPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return all valid messages that have arrived since the last call."""
+        """Return the valid messages in the bytes that wait, oldest first, and drop these bytes; empty where nothing
+        waits.
+
+        A frame that does not decode is left out and counted in `statistics`; an incomplete one is kept for the next
+        call.
+        """
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
 
     def send(self, message: Message) -> None:
-        """Hand one message to the device's line."""
+        """Hand one message to the device's line at the time of the last `advance`.
+
+        Raises EncodeError for a value that does not fit the wire.
+        """
         self.device.receive(self.now_s, self.stream.pack(message))
 
     def close(self) -> None:
@@ -149,13 +157,22 @@ class VirtualBus:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return all valid messages of the device that have arrived since the last call."""
+        """Return the device's valid messages in the frames that wait, oldest first, and drop these frames; empty where
+        none wait.
+
+        A frame that does not decode is left out and counted in `statistics`. `stream.received` is begun anew and holds
+        the frames. Raises SecondHostError as `CanStream.unpack_all`.
+        """
         arrived, self._unread = self._unread, []
         self.stream.received = []
         return self.stream.unpack_all(arrived)
 
     def send(self, message: Message) -> None:
-        """Hand one message to the bus as a frame."""
+        """Hand one message to the bus as a frame at the time of the last `advance`.
+
+        Raises EncodeError for a value that does not fit the wire. A full queue loses the frame, and the device counts
+        it.
+        """
         identifier, data = self.stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
 
@@ -259,10 +276,11 @@ class ClosedLoop:
     def run(
         self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
     ) -> Iterable[Sample]:
-        """Run the ticks of the next `duration_s` one by one, and yield their samples.
+        """Run the ticks of the next `duration_s` one by one, and yield their samples: `duration_s` over the period,
+        rounded.
 
-        A tick runs when its sample is asked for. `setpoint` gives the newest setpoint at a time, that of the tick
-        before; None: no publisher. Raises as `tick`.
+        A tick runs when its sample is asked for: who stops asking stops the loop. `setpoint` gives the newest setpoint
+        at a time, that of the tick before; None: no publisher. Raises as `tick`.
         """
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
@@ -335,7 +353,9 @@ class ClosedLoop:
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
     """Return a publisher in virtual time: a function from the time, s, to the newest setpoint, None before the first.
 
-    `forces_N` (n) are sent at the rising `times_s` (n), each valid for `valid_for_s`.
+    `forces_N` (n) are sent at the rising `times_s` (n), each valid for `valid_for_s`. Without times it always gives
+    None. Nothing is checked: times that do not rise give setpoints in another order, fewer forces than times
+    IndexError.
     """
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()

@@ -36,7 +36,7 @@ class InexactError(ValueError):
 
 
 def kinds(*types: type[Value] | type[Enum]) -> Kinds:
-    """Return these types by name."""
+    """Return these types by name; of two with one name the later counts."""
     return {each.__name__: each for each in types}
 
 
@@ -83,7 +83,8 @@ def restored(data: Any, known: Kinds) -> Any:
     """Return the value that `data` stand for, of the types in `known`; an array becomes a tuple, `{"list": [...]}` a
     list.
 
-    Raises InexactError for an unknown type, other fields than the type's, or values that it refuses.
+    Raises InexactError for an unknown type, other fields than the type's, or values that it refuses. Raises
+    RecursionError for data nested without end.
     """
     if type(data) in _AS_THEY_ARE:
         return data
@@ -136,7 +137,12 @@ def restore(thing: Any, data: Any, known: Kinds) -> None:
 
 
 def packed(data: Any) -> bytes:
-    """Return plain data as msgpack: equal bytes for equal data, and for no others."""
+    """Return plain data as msgpack: equal bytes for the same values, types and order, and for no others.
+
+    So 1 and 1.0 differ, as do 0.0 and -0.0, and two maps with their keys in another order. A tuple is taken for a list.
+    Raises TypeError for what msgpack does not hold, OverflowError for an integer beyond 64 bits, RecursionError for
+    data nested without end.
+    """
     return _ENCODER.encode(data)
 
 

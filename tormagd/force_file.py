@@ -38,8 +38,10 @@ def read_forces(path: Path) -> dict[str, "array[float]"]:
 
 
 def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"]:
-    """Read `t_s` and one other column, whose numbers may be any up to 1e9; pass over the rest. Raises as
-    `read_table`."""
+    """Read `t_s` and one other column, and return both (n each); pass over the rest.
+
+    The column's numbers have no unit, and may be any from -1e9 to 1e9. Raises as `read_table`.
+    """
     table = read_table(path, {"t_s": TIME, column: (-1e9, 1e9, "")}, has_others=True)
     return table["t_s"], table[column]
 
@@ -50,8 +52,9 @@ def read_table(
     """Read a CSV file's columns into arrays of equal length, by name; a million rows fit.
 
     `allowed` names the columns with their least, most and unit. `t_s` is one of them, and rises from row to row. A file
-    may lack the `optional` ones. Where it `has_others`, these are passed over. Raises ForceFileError also for an
-    unreadable file, over MAX_FILE_BYTES, or under MIN_ROWS.
+    may lack the `optional` ones, which the result then lacks, too. Where it `has_others`, these are passed over, and so
+    are empty lines. Raises ForceFileError for a header or row that is not so, and a cell that is no finite number
+    within its bounds. It is raised, too, for an unreadable file, over MAX_FILE_BYTES, or under MIN_ROWS.
     """
     try:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))

@@ -10,7 +10,8 @@ from types import FrameType
 def interrupted_by(*signals: signal.Signals) -> Iterator[Callable[[], bool]]:
     """Give a function that says whether one of `signals` has come; put the earlier handlers back at the end.
 
-    For the main thread alone: Python allows signal handlers nowhere else (ValueError).
+    In between these signals do nothing else: SIGINT raises no KeyboardInterrupt. For the main thread alone: Python
+    allows signal handlers nowhere else (ValueError).
     """
     arrived: list[int] = []
 

@@ -53,10 +53,11 @@ class KeyRing:
 
 
 def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
-    """Yield name and public key of every `NAME.key` in `folder`, sorted by name.
+    """Yield name and public key of every `NAME.key` in `folder`, sorted by name; nothing for a folder without any.
 
-    Raises ConfigError for an unreadable folder, more than MAX_KEYS keys, and a damaged key. It is raised, too, for a
-    folder or key that others can write: they could let themselves in.
+    Nothing is read or refused before the first is asked for, and a bad key shows at its turn. Raises ConfigError for an
+    unreadable folder, more than MAX_KEYS keys, and a damaged key. It is raised, too, for a folder or key that others
+    can write: they could let themselves in.
     """
     try:
         information = folder.stat()

@@ -9,13 +9,15 @@ from tormagd_client.printable import in_short
 
 
 def shipped(folder: Traversable, ending: str) -> tuple[str, ...]:
-    """Return the names of a package folder's files that end with `ending`, sorted and without it."""
+    """Return the names of a package folder's files that end with `ending`, sorted and without it; empty where none
+    do."""
     return tuple(sorted(each.name.removesuffix(ending) for each in folder.iterdir() if each.name.endswith(ending)))
 
 
 def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = Path()) -> Path:
     """Return the path of a shipped file by its name, or else of what exists at the path `name`, relative to `beside`.
 
+    A shipped name goes before a file of that name. What is there is not opened: it may be a folder, or unreadable.
     Raises ConfigError naming `key`, its value and the shipped names where there is neither.
     """
     names, reason = shipped(folder, ending), ""

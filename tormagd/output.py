@@ -32,7 +32,11 @@ codecs.register_error("alike", _alike)
 
 
 def write_in_any_encoding() -> None:
-    """Make stdout and stderr take any text from here on, whatever their encoding is."""
+    """Make stdout and stderr take any text from here on: what their encoding lacks becomes what is alike, or JSON's
+    escapes.
+
+    A stream that is None, or no text wrapper, stays as it is.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="alike")
@@ -42,7 +46,8 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
     """Write `text`, escaped, and a line end at once; return the error that kept this from being done, or None.
 
     Nothing is written to a `stream` of None, which Python has for a descriptor closed at its start. A stream that
-    failed is redirected to /dev/null: it takes everything from then on and drops it.
+    failed is redirected to /dev/null: it takes everything from then on and drops it. Raises UnicodeEncodeError for what
+    its encoding lacks, unless `write_in_any_encoding` was called, and ValueError for a closed stream.
     """
     if stream is None:
         return None

@@ -354,7 +354,10 @@ def clock_source(config: Config, machine: Machine) -> Finding:
 
 def swap(config: Config, machine: Machine) -> Finding:
     """Judge whether the daemon's memory can be paged out: WARN where swap is on and the configuration does not lock
-    memory."""
+    memory.
+
+    OK otherwise, also where /proc/swaps cannot be read.
+    """
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
         return Finding("swap", Severity.OK, "off")

@@ -43,10 +43,12 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
 
 
 def show_keys(path: Path) -> Outcome:
-    """Return the fingerprint of the key in a file, or of every `NAME.key` in a folder; a folder without any gives none.
+    """Return the fingerprint of the public key in a file, or of every `NAME.key` in a folder; a folder without any
+    gives none.
 
-    The outcome's `keys` have `name` and `fingerprint` each. Raises CommandError (USAGE) for a file that holds no key,
-    and a folder as `load_folder` refuses it.
+    A file may be a `.key` or a `.key_secret`. The outcome's `keys` have `name` and `fingerprint` each, in the order of
+    names. Raises CommandError (USAGE) for a missing path, a file that holds no key, and a folder as `load_folder`
+    refuses it.
     """
     with as_usage_error(ConfigError, hint="give a .key or .key_secret file, or a folder of them"):
         found = load_folder(path) if path.is_dir() else [(path.stem, load_public(path).decode())]

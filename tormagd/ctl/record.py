@@ -132,9 +132,9 @@ def _record(
     """Write what arrives until the time or an interrupt ends it, then what still waits, and return the outcome.
 
     It has the last `file`, `seconds`, and how many came and were lost: `telemetry`, `telemetry_lost`, `ticks`,
-    `ticks_lost`. `silent_ms` is the time since the last ticks, and `unreadable` counts what was left out. It is
-    UNREACHABLE for a silence of over SILENT_S, else REFUSED where ticks were lost. Raises OSError where the disk takes
-    no more.
+    `ticks_lost`. `silent_ms` is the time since the last ticks, and `unreadable` counts what was left out; stderr is
+    told of the first. Silence does not end it, and `writer` stays open. It is UNREACHABLE for a silence of over
+    SILENT_S at the end, else REFUSED where ticks were lost. Raises OSError where the disk takes no more.
     """
     unreadable = 0
     start_s = heard_s = time.monotonic()

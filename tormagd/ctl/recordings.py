@@ -112,8 +112,9 @@ def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
     """Copy a recording to a new file, check the copy's seals under `key`, and say their verdict; REFUSED where unsound.
 
     `target` is the file, or a folder in which the copy has the same name. The outcome has `file`, the state as `seal`,
-    and `why`. Half a copy is deleted; an unsound one stays. Raises OSError where the copy exists or cannot be made,
-    CommandError (USAGE) for a `target` of None.
+    and `why`. Sound is also a recording without seals where `key` is empty. Half a copy is deleted; an unsound one
+    stays. Raises OSError where the copy exists or cannot be made, or the recording cannot be read. Raises CommandError
+    (USAGE) for a `target` of None.
     """
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")

@@ -26,9 +26,11 @@ def replay(
 ) -> Outcome:
     """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulated `plant`.
 
-    `config_file` None means the defaults. The result is that process's report. The outcome is REFUSED where the replay
-    is not bit-exact, or the file was altered, or sealed without the configured key. Raises CommandError (USAGE) where
-    file or options cannot be used, or it takes over LONGEST_S.
+    `from_s` counts from the file's first tick. Settings are KEY=VALUE, as in limits.skew_fault_mm=2, and faults
+    NAME@SECONDS. With either, `from_s` plays no part. `config_file` None means the defaults. The result is that
+    process's report. The outcome is REFUSED where the replay is not bit-exact, or the file was altered, or sealed
+    without the configured key. Raises CommandError (USAGE) where file or options cannot be used, or it takes over
+    LONGEST_S.
     """
     arguments = [
         f"--from={from_s!r}",

@@ -73,7 +73,8 @@ def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s
 
     step: `to_N` from half of the time on. ramp: a straight line over the whole time. sine: begins at `from_N`, swings
     to `to_N` and back, once per 1/`frequency_hz`. pulse: a synthetic arterial pulse, one beat per 1/`frequency_hz`.
-    Raises WaveformError: an unknown name, a force outside 0..MAX_FORCE_N, or a step or ramp without end.
+    Raises WaveformError: an unknown name, a force outside 0..MAX_FORCE_N, or a step or ramp without end. Not refused
+    are a time or frequency of 0 or below: a ramp of 0 s raises ZeroDivisionError once it is asked.
     """
     for label, value in (("from-N", from_N), ("to-N", to_N)):
         if not 0.0 <= value <= MAX_FORCE_N:

@@ -44,6 +44,10 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def late_counts(lateness_us: Iterable[float]) -> list[int]:
-    """Count these latenesses, us, by bar of the histogram that LATE_US bounds."""
+    """Count these latenesses, us, by bar of the histogram that LATE_US bounds, one bar more than bounds.
+
+    The first bar is what is under the first bound, the last what is at or over the last one; NaN counts there. A
+    lateness at a bound counts in the bar above. Without any all are 0.
+    """
     counts = Counter(bisect_right(LATE_US, late_us) for late_us in lateness_us)
     return [counts[bar] for bar in range(len(LATE_US) + 1)]

@@ -11,7 +11,8 @@ th,td{padding:.25rem .8rem;text-align:left;vertical-align:top;border-bottom:1px 
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """Return the page of these parts, which are HTML; `title` is plain text."""
+    """Return the whole page of these parts, one after the other; they are HTML and not escaped, `title` is plain
+    text."""
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>\n'
 
@@ -19,7 +20,8 @@ def page(title: str, parts: Iterable[str]) -> str:
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], is_bad: Sequence[bool] = ()) -> str:
     """Return an HTML table of these texts; "None." where it has no row. Rows that are bad are red.
 
-    Texts are escaped; what stands in backticks becomes code.
+    `is_bad` may be shorter than the rows; the others are good. Texts are escaped; what stands in backticks becomes
+    code, but not in `heads`. That rows are as long as `heads` is not checked.
     """
     lines = ["".join(f"<td>{_with_code(cell)}</td>" for cell in row) for row in rows]
     if not lines:

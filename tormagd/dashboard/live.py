@@ -48,16 +48,22 @@ class Live:
         self._learn(status)
 
     async def run(self) -> None:
-        """Listen and publish without end; a daemon that is gone is waited for."""
+        """Listen and publish without end; a daemon that is gone is waited for.
+
+        It ends by being cancelled. Any other error than those which a silent or odd daemon makes ends it, too, within
+        an ExceptionGroup.
+        """
         async with asyncio.TaskGroup() as tasks:
             for each in (self._listen(), self._tell(), self._ask()):
                 tasks.create_task(each)
 
     @contextlib.contextmanager
     def browser(self) -> Iterator[asyncio.Queue[bytes]]:
-        """Add a browser for this context and give the queue of its events.
+        """Add a browser for this context, and give the queue of its events, each encoded as `event` does it.
 
-        The first events are the seconds kept so far, the status, and what the device can render.
+        The first events are the seconds kept so far, where there are any, the status, and what the device can render.
+        The queue takes WAITING events; of a browser that does not read the oldest are lost. At the end the browser is
+        removed.
         """
         events: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
         if self._kept:
@@ -152,5 +158,8 @@ class Live:
 
 
 def event(name: str, value: object) -> bytes:
-    """Encode a server-sent event with `value` as JSON."""
+    """Return a server-sent event called `name`, which is not escaped, with `value` as JSON; NaN becomes null.
+
+    Raises TypeError for what msgspec cannot encode.
+    """
     return b"event: %s\ndata: %s\n\n" % (name.encode(), msgspec.json.encode(value))

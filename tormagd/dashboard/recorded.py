@@ -58,16 +58,20 @@ class Moments:
         self._values = known if seen else np.empty((0, len(QUANTITIES)))
 
     def newest(self, times_s: Floats) -> list[int]:
-        """Return for each time the index of the newest message; -1 where it is over BREAK_S old, or none came before.
+        """Return for each time, s, the index of the newest message; -1 where it is over BREAK_S old, or none came
+        before.
 
-        Empty where there are no messages.
+        An empty list, whatever the times, where there are no messages.
         """
         at = np.searchsorted(self.t_s, times_s, side="right") - 1
         return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= BREAK_S, at, -1).tolist()
 
     def curve(self, name: str, times_s: Floats) -> list[float | None] | None:
-        """Return the newest value of the quantity `name` at each time, None where too old; None where no value is known
-        at all."""
+        """Return the newest value of the quantity `name` at each time, None where too old or not known.
+
+        None instead of a list where no value is known at all, also without messages. Raises ValueError for a name that
+        is none of QUANTITIES.
+        """
         values = self._values[:, QUANTITIES.index(name)]
         if not np.isfinite(values).any():
             return None
@@ -96,8 +100,12 @@ class Recorded:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Return what the page begins with: name, times, scene, the force over the whole length, and what each code
-        means."""
+        """Return what the page begins with, as data for JSON.
+
+        Keys: `kind`, `name` of the file, `start_s` since 1970, `duration_s`, `notes`, and `followed` in words. `scene`
+        is its name, empty where not recorded; `portrait` is None there. `overview` is as `_glance`. `explained` has for
+        `limits` and `faults` what each code means.
+        """
         file = self._file
         return {
             "kind": "recording",
@@ -120,8 +128,9 @@ class Recorded:
         """Return the frame that ends at `at_s`, which is clamped to the recording; its curves have a point every
         STEP_S.
 
-        Curves come from the ticks, or the snapshots where ticks have no value; the field is None outside DRIVEN. Raises
-        RecordingError where the recording cannot be read.
+        The last point is at `at_s` itself. Curves come from the ticks, or the snapshots where ticks have no value; the
+        field is None outside DRIVEN. The state is empty where no message is near. Keeps what was read for the next
+        call. Raises RecordingError where the recording cannot be read, ValueError for NaN.
         """
         at_s = min(max(at_s, 0.0), self.duration_s)
         from_s = max(at_s - SHOWN_S, 0.0)
@@ -185,15 +194,20 @@ class Recorded:
 
 
 def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-    """Read the ticks and the snapshots from `from_ns` to `to_ns`, ns since 1970. Raises RecordingError."""
+    """Read the ticks and the snapshots from `from_ns` to `to_ns`, ns since 1970, both included; either may be empty.
+
+    Raises RecordingError where the file is damaged, or too many messages are in this time.
+    """
     seen, start_ns = file.between(from_ns, to_ns, Moment), file.overview.start_ns
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
     return Moments(ticks, start_ns), Moments(snapshots, start_ns)
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
-    """Return the belief in the newest snapshot before `at_s`, without unknown values; empty where it is over BREAK_S
-    old."""
+    """Return the belief in the newest snapshot up to `at_s`, s since the start, by quantity, without unknown values.
+
+    Empty where that snapshot is over BREAK_S old, there is none, or it tells of no belief.
+    """
     place = (snapshots.newest(np.array([at_s])) or [-1])[0]
     told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
     return {

@@ -23,8 +23,10 @@ MAX_TOLD = 20
 
 
 def report(of: Sequence[RecordingFile]) -> str:
-    """Return one HTML page on these recordings, side by side. Raises ValueError for a recording without messages, also
-    where its end cannot be read again."""
+    """Return one HTML page on these recordings, side by side, in their order; pictures are within it.
+
+    Raises ValueError for a recording without messages, also where its end cannot be read again.
+    """
     names = [each.path.name for each in of]
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",

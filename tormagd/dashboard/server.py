@@ -73,7 +73,8 @@ def application(shown: Live | Recorded) -> web.Application:
 async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None]) -> None:
     """Serve the page on LOOPBACK until SIGINT or SIGTERM; `port` 0 takes a free one.
 
-    Calls `ready` once with the page's address. Raises OSError where the port is taken.
+    Calls `ready` once with the page's address. Takes both signals over for this event loop, which has to run in the
+    main thread. `Live.run` is not called here: it has to run beside. Raises OSError where the port is taken.
     """
     over = asyncio.Event()
     runner = web.AppRunner(application(shown), access_log=None, shutdown_timeout=0.5)

@@ -109,9 +109,10 @@ class Chosen(NamedTuple):
 
 
 def installed() -> dict[str, str]:
-    """Load every installed backend plugin; return by its name why it does not load, "" where it does.
+    """Load every installed backend plugin; return by its name, sorted, why it does not load, "" where it does.
 
-    A plugin that does not load is logged as a warning: a third party's package stops nobody else.
+    A plugin that does not load is logged as a warning: a third party's package stops nobody else. Their modules stay
+    imported. No device is opened.
     """
     found = {}
     for entry in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):

@@ -122,7 +122,11 @@ class Connection:
         return self._unfinished if self._link is None else self._link.pending
 
     def open(self, now_s: float) -> None:
-        """Open the port. Where that fails, `exchange` tries again later."""
+        """Open the port, where it is closed. Where that fails, `exchange` tries again later, and `cause` says why.
+
+        Call `close` before another `open`: a port that is open is not closed by it. Raises what a plugin's backend
+        raises besides BackendError.
+        """
         self._is_wanted = True
         self._open(now_s)
 
@@ -185,7 +189,11 @@ class Connection:
             self._give_back(now_s, link.cause, "")
 
     def close(self) -> None:
-        """Close the port; it stays closed until `open`."""
+        """Close the port; it stays closed until `open`.
+
+        `traffic` is told, if a port was open. What this conversation has pending is dropped, RETRACT too. A running
+        device hears no more Drives, and does what its own command timeout says.
+        """
         self._is_wanted = False
         self._release()
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""

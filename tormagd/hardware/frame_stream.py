@@ -26,9 +26,9 @@ class FrameStream:
         return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
-        """Return a message's frame, with the next sequence number, and keep it in `sent`.
+        """Return a message's frame, with the next sequence number, and keep it in `sent` until the next call.
 
-        Raises EncodeError for a value that does not fit the wire.
+        Raises EncodeError for a value that does not fit the wire; number and `sent` are then as before.
         """
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
@@ -36,9 +36,10 @@ class FrameStream:
         return frame
 
     def unpack(self, data: bytes) -> list[Message]:
-        """Return the valid messages that `data` completes, and keep `data` in `received`.
+        """Return the valid messages that `data` completes, and keep `data` in `received` until the next call.
 
-        A frame that does not decode is counted as corrupt; `statistics.refused` says why.
+        An incomplete frame waits for the next bytes. A frame that does not decode is counted as corrupt;
+        `statistics.refused` says why.
         """
         self.received = data
         messages: list[Message] = []

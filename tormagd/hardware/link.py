@@ -214,7 +214,10 @@ class DeviceLink:
         return messages
 
     def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
-        """Return the next Drive, with its counter. Duties are -1..1 of the supply voltage; positive opens."""
+        """Return the next Drive, with its counter. Duties are -1..1 of the supply voltage; positive opens.
+
+        Duties are not checked here, but where the Drive is encoded. Call `due` after it, which notes when it was sent.
+        """
         self._counter = (self._counter + 1) % 256
         self._drives += 1
         return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._counter)
@@ -258,7 +261,10 @@ class DeviceLink:
         return self._quality_watch.is_due(now_s)
 
     def lose(self, cause: str) -> None:
-        """End the conversation in LOST: the port failed, for `cause`."""
+        """End the conversation in LOST, from any state: the port failed, for `cause`.
+
+        The last measurement and a pending request stay readable; nothing begins this conversation again.
+        """
         self.state = LinkState.LOST
         self.cause = cause
 

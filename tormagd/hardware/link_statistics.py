@@ -68,12 +68,16 @@ class RoundTrip:
         self._usual: deque[float] = deque(maxlen=USUAL_OF)
 
     def drive(self, counter: int, now_s: float) -> None:
-        """Note that the Drive with this counter goes out at `now_s`."""
+        """Note that the Drive with this counter, 0..255, goes out at `now_s`; the time of that counter's last Drive is
+        forgotten."""
         self._newest = counter
         self._sent_s[counter] = now_s
 
     def since_next_s(self, counter: int, now_s: float) -> float:
-        """Return the time since the Drive after the one with this counter went out, s; 0 where none came after it."""
+        """Return the time since the Drive after the one with this counter, 0..255, went out, s.
+
+        0 where none came after it, or none ever had the next counter.
+        """
         return 0.0 if counter == self._newest else max(0.0, now_s - self._sent_s[(counter + 1) % 256])
 
     def hello(self) -> None:
@@ -81,7 +85,10 @@ class RoundTrip:
         self._before_hello = self._newest
 
     def identity(self) -> None:
-        """Note that the Identity for the newest Hello came: it fixes how far Drive and State counters are apart."""
+        """Note that the Identity for the newest Hello came: it fixes how far Drive and State counters are apart.
+
+        Without a Hello or a State before, nothing is fixed. A second Identity for the same Hello does nothing.
+        """
         if self._before_hello is not None and self._state is not None:
             self._lead = self._before_hello - self._state
         self._before_hello = None

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
     """Return the latency timer of a port, or of the port that a link leads to, ms.
 
-    None where the port has none or the timer cannot be read.
+    None where the port does not exist, has none, or the timer cannot be read.
     """
     try:
         return int((sysfs / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii"))

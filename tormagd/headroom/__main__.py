@@ -50,10 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
     """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer for `timer_s`.
 
-    `core_s` is the virtual time that the core's calls are taken from. Of the result, `machine_us` is a median;
-    `step_us`, `plan_us` and `lateness_us` in `bare` are as `quantiles`. `bare` also holds rate, share missed, and what
-    the kernel refused. Gives this thread the daemon's scheduling for good. Raises ConfigError where scene and
-    configuration do not fit each other, RuntimeError as `calls`.
+    `core_s` is the virtual time, s, that the core's calls are taken from. The result has `machine_us`, a median,
+    `build`, `step_us`, `plan_us` and `bare`. `bare` has `rate_hz`, `lateness_us`, `missed_share` (0..1) and
+    `not_granted`, what the kernel refused. `step_us`, `plan_us` and `lateness_us` are as `quantiles`. Gives this thread
+    the daemon's scheduling for good. Raises ConfigError where scene and configuration do not fit each other,
+    RuntimeError as `calls`.
     """
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority

@@ -11,5 +11,6 @@ Json = dict[str, Any]
 
 
 def rms(values: Array) -> float:
-    """Return the root of the mean square of `values`."""
+    """Return the root of the mean square of `values`, of any shape; NaN, with NumPy's RuntimeWarning, where there are
+    none."""
     return float(np.sqrt(np.mean(np.square(values))))

@@ -13,9 +13,10 @@ class LabError(ValueError):
 
 
 def not_installed(module: str) -> str:
-    """Return one sentence that `module` is missing, with the pip command that installs it.
+    """Return one sentence that pip's package of the module `module` is missing, with the command that installs it.
 
-    That is the extra `lab`; for a packaged tormagd the one distribution, into the folder where tormagd is installed.
+    PACKAGE_OF names packages that are not called like their module. The command takes the extra `lab`. For a packaged
+    tormagd it takes that package alone, in the versions that tormagd needs, into the folder where tormagd is installed.
     """
     package = PACKAGE_OF.get(module, module)
     library = Path(__file__).resolve().parents[2]

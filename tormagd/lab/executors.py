@@ -56,7 +56,8 @@ def finished(
     """Run `function` on every item; yield each item with its done future, in order of completion, beside a progress
     bar.
 
-    A caller that stops iterating cancels the runs that have not begun.
+    All items are handed to `executor` at the first step. A run's error stays in its future, and stops no other. A
+    caller that stops iterating cancels the runs that have not begun.
     """
     pending = {executor.submit(function, item): item for item in items}
     try:

@@ -23,7 +23,7 @@ EDGE_S = 0.5
 def measured_pulse() -> Array:
     """Return heartpy's recording (n) as shipped, at SOURCE_HZ, in the light sensor's own unit, which is no force.
 
-    Raises ModuleNotFoundError where heartpy is not installed.
+    Raises ModuleNotFoundError where heartpy is not installed, OSError where its file is missing.
     """
     # found, not imported: heartpy's import fails beside a current setuptools
     package = importlib.util.find_spec("heartpy")
@@ -33,11 +33,12 @@ def measured_pulse() -> Array:
 
 
 def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int) -> tuple[Array, Array]:
-    """Return times, s, and forces, N (both n), of the pulse scaled to `least_N`..`most_N`.
+    """Return times, s, and forces, N (both n), of the pulse scaled to `least_N`..`most_N`, which this part just
+    reaches.
 
     It is low-passed without lag, and lasts `duration_s` at `rate_hz`. Times begin at 0, EDGE_S into the recording.
-    Raises ValueError where the recording, less EDGE_S at both ends, is shorter than `duration_s`, and
-    ModuleNotFoundError as `measured_pulse`.
+    Raises ValueError where the recording, less EDGE_S at both ends, is shorter than `duration_s`, and for no sample at
+    all. Raises ModuleNotFoundError and OSError as `measured_pulse`.
     """
     raw = measured_pulse()
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=SOURCE_HZ, output="sos"), raw)
@@ -52,13 +53,20 @@ def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int
 
 
 def scaled(values: Array, least: float, most: float) -> Array:
-    """Return `values` mapped linearly so that they range from `least` to `most`; they must not all be equal."""
+    """Return `values` (n) mapped linearly so that they range from `least` to `most`; with `most` the smaller they are
+    mirrored.
+
+    Values that are all equal are not refused, and give NaN. Raises ValueError where there are none.
+    """
     found: Array = least + (values - values.min()) / np.ptp(values) * (most - least)
     return found
 
 
 def recorded(folder: str) -> list[Path]:
     """Return the CSV files in `folder` of the measured data, sorted; none unless the variable TORMAG_DATA names its
-    place."""
+    place.
+
+    None also where there is no such folder in it.
+    """
     data = os.environ.get("TORMAG_DATA")
     return sorted((Path(data) / folder).glob("*.csv")) if data else []

@@ -18,7 +18,10 @@ from tormagd.simulation.plant import Plant
 
 
 def put_gap(plant: Plant, gap_mm: float) -> None:
-    """Move both carriages of `plant` at once, each by half the way, to the gap `gap_mm`; screws and encoders follow."""
+    """Move both carriages of `plant` at once, each by half the way, to the gap `gap_mm`; screws and encoders follow.
+
+    No stop holds them, and speeds and currents stay as they are.
+    """
     before_mm, lead_mm_rad = plant.gap_mm, plant.parameters.screw.lead_mm / math.tau
     for axis in (plant.left, plant.right):
         # the screw turns with the carriage, so the encoder sees it

@@ -145,7 +145,8 @@ class Brake(NamedTuple):
     sliding_N: Callable[[float, float], float]
 
     def fresh_at_N(self, moment_Tm: float, lag_Tm: float = 0.0) -> float:
-        """Return the force of the fresh insert at a moment with its lag."""
+        """Return the force, N, of the fresh insert at a moment with its lag, T m; beyond `strength_Tm` that of its
+        nearer end."""
         return float(np.interp(moment_Tm + lag_Tm, self.strength_Tm, self.fresh_N))
 
     def open_N(self, hand_mm_s: float) -> float:
@@ -278,7 +279,8 @@ class Asked(NamedTuple):
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
         """Return the rendered force (n), N, for the gaps `gap_mm` (n) in the steps of this force.
 
-        Before the first step the gap was open. What has relaxed is that of the force asked, not of these gaps.
+        Before the first step the gap was open. What has relaxed is that of the force asked, not of these gaps. A gap
+        beyond the brake's counts as its nearer end.
         """
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)

@@ -24,7 +24,8 @@ def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
     """Yield the lines of a table: one with the names of all columns, then one for each of `rows`.
 
     Columns are aligned to the right, two spaces apart. Their names are those of all rows together; a row without one
-    has an empty cell. A figure of a nested record is named by both names, as `outer inner`. Lists are left out.
+    has an empty cell. A figure of a nested record is named by both names, as `outer inner`. Lists are left out. Without
+    rows there is one empty line.
     """
     flat = [dict(_figures(row)) for row in rows]
     names = list(dict.fromkeys(name for row in flat for name in row))

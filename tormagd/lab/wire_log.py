@@ -87,11 +87,16 @@ class WireLog:
             self.frames += 1
 
     def read(self, now_s: float, raw: Any) -> None:
-        """Log what a connection read from the device."""
+        """Log what a connection read from the device: bytes of a serial line. Raises AttributeError for a bus's frames,
+        and as `add`."""
         self.add(now_s, raw, is_rx=True)
 
     def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
-        """Log what a connection wrote to the device."""
+        """Log what a connection wrote to the device: frames of a serial line; none logs nothing, and `unsent` is not
+        used.
+
+        Raises TypeError for a bus's frames, and as `add`.
+        """
         self.add(now_s, b"".join(raw), is_rx=False)
 
     def connected(self, memory: Any) -> None:

@@ -25,7 +25,7 @@ class Turn(Value):
         """Return the state after the handle moved to `position_mm`.
 
         Going on, the handle has a new furthest place. Back by more than TURN_MM, it has turned where it had been
-        furthest, and goes the other way. Otherwise nothing changes, and this very state is returned.
+        furthest, and goes the other way. Otherwise, and for NaN, nothing changes, and this very state is returned.
         """
         beyond_mm = position_mm - self.furthest_mm
         if beyond_mm * self.direction >= 0.0:
@@ -35,5 +35,5 @@ class Turn(Value):
         return self
 
     def displacement_mm(self, position_mm: float) -> float:
-        """Return the distance from the turn to `position_mm`, at most MOBILISED_MM."""
+        """Return the distance from the turn to `position_mm`, 0 to MOBILISED_MM, whichever way; NaN for NaN."""
         return min(abs(position_mm - self.turned_mm), MOBILISED_MM)

@@ -38,7 +38,11 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     output_gain: float
 
     def scaled(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map `features` (n x 4) to -1..1."""
+        """Map `features` (n x 4) to the network's scale (n x 4): -1..1 within the ranges of training, beyond it
+        outside.
+
+        Nothing is clamped or checked.
+        """
         scaled: NDArray[np.float64] = (features - np.array(self.input_offset)) * np.array(self.input_gain)
         return scaled
 
@@ -51,7 +55,10 @@ def require_number(name: str, value: float) -> None:
 
 
 def require_features(features: NDArray[np.float64]) -> None:
-    """Raise `DomainError` unless `features` is n x 4, finite and within +-`LARGEST`."""
+    """Raise `DomainError` unless `features` is n x 4, finite and within +-`LARGEST`; it names row and feature.
+
+    No rows at all (0 x 4) pass.
+    """
     if features.ndim != 2 or features.shape[1] != len(FEATURES):
         raise DomainError(
             "features", f"an array of shape {features.shape}", f"n x 4 in the order {', '.join(FEATURES)}"

@@ -72,7 +72,10 @@ def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, ci
 
 
 def within(value: float, ends: tuple[float, float]) -> float:
-    """Return `value`, held within the two `ends`: so a model is asked only where it was trained."""
+    """Return `value`, held within the two `ends`, the least first: so a model is asked only where it was trained.
+
+    NaN stays NaN.
+    """
     return min(max(value, ends[0]), ends[1])
 
 
@@ -88,7 +91,8 @@ class Known:
         self.span_N: Final = span_N
 
     def excess(self, place: int, value: float) -> float:
-        """Return how far feature number `place` of `FEATURES` lies outside its range, as a share of it; 0 inside.
+        """Return how far feature number `place` of `FEATURES` lies outside its range, as a share of it; 0 inside, and
+        for NaN.
 
         For a feature that never varied, as a share of its magnitude, of 1 unit at least.
         """
@@ -162,7 +166,10 @@ class NetworkCurve:
         return self._network.magnitude_N
 
     def force_N(self, field_mT: float) -> float:
-        """Return the force, N, at one field, mT."""
+        """Return the force, N, at one field, mT.
+
+        NaN is not refused, and does not give NaN but the network's constant: check the field before.
+        """
         network, total_N = self._network, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -171,7 +178,10 @@ class NetworkCurve:
         return total_N + network.constant_N
 
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """Return the force, N, and its slope dF/dB, N/mT, at one field."""
+        """Return the force, N, and its slope dF/dB, N/mT, at one field, mT.
+
+        As with `force_N`, NaN is not refused: it gives the network's constant, and a slope of 0.
+        """
         network, total_N, slope = self._network, 0.0, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -184,7 +194,8 @@ class NetworkCurve:
         return total_N + network.constant_N, slope
 
     def forces_N(self, fields_mT: Floats) -> Floats:
-        """Return the force, N, at each field (n), mT, in the precision of the fields."""
+        """Return the force, N, at each field (n), mT, in the precision of the fields, float32 or float64; NaN gives
+        NaN."""
         network, kind = self._network, fields_mT.dtype
         hidden = np.multiply.outer(fields_mT, network.field_half.astype(kind, copy=False))
         hidden -= np.array(self._shift, dtype=kind) / 2
@@ -195,8 +206,9 @@ class NetworkCurve:
     def confidence(self, field_mT: float, error_N: float) -> float:
         """Return the trust exp(-4 e - 20 r), 0..1, in a field whose force misses the force asked by `error_N`.
 
-        e sums over the features how far each lies outside its training range, as a share of that range. r is the
-        error as a share of the force span seen in training.
+        e sums over the features how far each lies outside its training range, as a share of that range. r is the error
+        as a share of the force span seen in training; its sign does not matter. A field of NaN counts as inside, an
+        error of NaN gives NaN.
         """
         known = self._network.known
         excess = (

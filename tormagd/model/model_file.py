@@ -190,7 +190,8 @@ class ForceModel:
         """Return the model of one of its several inserts: ranges of that insert alone, the field's lag to their scale.
 
         Scaled by the insert's greatest field over that of all inserts. Returns this model itself where it holds no
-        ranges for `insert`.
+        ranges for `insert`. Raises DomainError where the scaled lag makes no `Memory`, ZeroDivisionError where the
+        greatest field of all is 0 mT.
         """
         whole, memory = self.metadata, self.metadata.memory
         ranges = (whole.boxes or {}).get(insert)
@@ -209,9 +210,10 @@ class ForceModel:
         return self.network.curve(displacement_mm, rate_mm_s, cip_percent)
 
     def predict(self, features: ArrayLike) -> Array:
-        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`).
+        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`); a single point is 1 x 4.
 
-        Raises `DomainError` for another shape, and for a number that is not finite, or beyond `LARGEST`.
+        No rows give no forces. Raises `DomainError` for another shape, and for a number that is not finite, or beyond
+        `LARGEST`. Raises ValueError or TypeError for what is no array of numbers.
         """
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
@@ -244,7 +246,7 @@ class ForceModel:
 def save_model(path: Path | str, model: ForceModel) -> None:
     """Write `model` to `path`; equal models give equal bytes. Readers see the old file or the whole new one.
 
-    Raises OSError.
+    Raises OSError, also where the folder is missing or `path` is one; an earlier file is then as it was.
     """
     tensors = _tensors(model)
     header = _header(model.metadata)

@@ -45,7 +45,8 @@ class ForceNetwork(nn.Module):
         self.output_bias = nn.Parameter(torch.zeros((), dtype=torch.float64))
 
     def scale_inputs(self, features: Tensor) -> Tensor:
-        """Map features to the network's -1..1."""
+        """Map features (n x 4) to the network's -1..1, or beyond where they are outside the range of training; not
+        checked."""
         return (features - self.input_offset) * self.input_gain
 
     def scale_output(self, force_N: Tensor) -> Tensor:
@@ -58,7 +59,10 @@ class ForceNetwork(nn.Module):
         return hidden @ self.output_weight + self.output_bias
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return force in N (n) for features (n x 4)."""
+        """Return force in N (n) for features (n x 4), which are not checked: NaN gives NaN.
+
+        Raises RuntimeError where torch cannot take their shape or precision.
+        """
         return self.forward_scaled(self.scale_inputs(features)) / self.output_gain + self.output_offset
 
 
@@ -77,7 +81,10 @@ def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
 
 
 def to_network(model: ForceModel) -> ForceNetwork:
-    """Return a float64 network with the weights of `model`, for further training or as a reference."""
+    """Return a float64 network with the weights of `model`, for further training or as a reference.
+
+    The model's metadata are not in it but for the scaling, its weights are copied.
+    """
     network = ForceNetwork(model.metadata.scaling, model.metadata.hidden)
     with torch.no_grad():
         network.hidden_weight.copy_(torch.tensor(model.hidden_weight))

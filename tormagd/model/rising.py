@@ -12,7 +12,8 @@ def falling_at(
     """Return the least rate of the handle, mm/s, at which the model's force somewhere does not rise with the field.
 
     Looks at `points` rates over those seen in training, and as many fields between the two `fields_mT`. Displacement
-    and the share of iron, the least, are fixed. None where the force rises at all of them.
+    and the share of iron, the least, are fixed. None where the force rises at all of these; between them nothing is
+    looked at. Raises DomainError for a displacement or field that is not finite.
     """
     _, (slowest, fastest), _, (cip_percent, _) = model.feature_ranges
     fields = np.linspace(*fields_mT, points)

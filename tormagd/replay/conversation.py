@@ -40,8 +40,10 @@ class Found(NamedTuple):
 
 
 def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
-    """Return the first difference between two plain values, its field under `where`; None where they agree to the
-    bit."""
+    """Return the first difference between two plain values, its field under `where`; None where they agree to the bit.
+
+    `frame` is handed on. Raises as `exact.packed`.
+    """
     found = first_difference(recorded, replayed)
     return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
 
@@ -96,7 +98,12 @@ class Conversation:
         return None if own is None else differing("measurement", plain(recorded), plain(own.measurement), self.frame)
 
     def read(self, entry: Any) -> None:
-        """Feed the connection a READ entry, and count its frames."""
+        """Feed the connection a READ entry, and count its frames.
+
+        `entry` is the name, the time, s, and what was read: bytes, or a list of a bus's frames. Without a connection
+        nothing happens, and the entry is not looked at. Raises ValueError, TypeError or msgspec.ValidationError for a
+        malformed entry.
+        """
         if self._connection is not None:
             _, now_s, raw = entry
             self._unread = pieces = raw if isinstance(raw, list) else [raw]
@@ -106,7 +113,9 @@ class Conversation:
     def wrote(self, entry: Any, output: Duty) -> Found | None:
         """Send a step's `output` again, and return the first frame that differs from the WROTE entry.
 
-        None where none differs, which adds to the count of frames, or where no port was open.
+        `entry` is the name, the time, s, the list of frames, and the messages not taken so far. None where none
+        differs, which adds to the count of frames, or where no port was open. Raises ValueError or TypeError for an
+        entry of another form, EncodeError for an output that does not fit the wire.
         """
         if self._connection is None:
             return None
@@ -127,7 +136,11 @@ class Conversation:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Decode what is to be read next. Raises BackendError where another host drives the CAN node."""
+        """Decode what is to be read next, and return the messages; empty where all was read.
+
+        Raises BackendError where another host drives the CAN node, and msgspec.ValidationError or TypeError for what is
+        no frame.
+        """
         pieces, self._unread = self._unread, ()
         return [message for piece in pieces for message in self._unpack(piece)]
 

@@ -94,7 +94,8 @@ def rebuilt(known: Recorded, config: Config | None = None) -> Core:
 def differences(known: Recorded, configured: Config | None) -> list[str]:
     """List in plain words what differs from when the file was written: sources, platform, scene, configuration.
 
-    `configured` is this machine's configuration. With None it is not compared, and the recorded one names the scene.
+    Empty where nothing does. `configured` is this machine's configuration. With None it is not compared, and the
+    recorded one names the scene. The scene is read again; one that cannot be is told as a difference.
     """
     found = []
     here, there = sources_hash(), known.header["sources_sha256"]

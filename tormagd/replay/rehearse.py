@@ -46,7 +46,10 @@ class Happened(msgspec.Struct, frozen=True):
     refused: list[str]
 
     def note(self, at_s: float, faults: Iterable[str], held: Iterable[str], for_s: float) -> None:
-        """Add one tick at `at_s`: its faults, and the limits in `held` for another `for_s` seconds."""
+        """Add one tick at `at_s`: its faults, and the limits in `held` for another `for_s` seconds.
+
+        Changes the two dicts in place. A fault keeps its first time; a limit that stands twice in `held` counts once.
+        """
         for fault in faults:
             self.faults.setdefault(str(fault), round(at_s, 3))
         for limit in dict.fromkeys(map(str, held)):
@@ -77,7 +80,9 @@ class Script(NamedTuple):
 def changed(config: Config, settings: Sequence[str]) -> Config:
     """Return the configuration with `KEY=VALUE` settings, as in limits.skew_fault_mm=2; a value is TOML, or else text.
 
-    Raises ReplayError for an unknown key, or a value that the configuration refuses.
+    Of two settings of one key the later counts; without settings it is checked all the same. Raises ReplayError for an
+    unknown key, or a value that the configuration refuses. ValueError for an integer of over 4300 digits and
+    RecursionError for arrays nested without end are raised as they come.
     """
     tables: dict[str, Any] = msgspec.to_builtins(config)
     for setting in settings:

@@ -61,7 +61,8 @@ QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s"
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
     """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a plan without one.
 
-    Raises InexactError or msgspec.ValidationError for a malformed entry.
+    `entry` is the name, the time, and the setpoint's fields or None. Raises InexactError or msgspec.ValidationError for
+    a malformed entry.
     """
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
     return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
@@ -99,9 +100,11 @@ class Rerun(msgspec.Struct, frozen=True):
 
 
 def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
-    """Return the tick records of a black box by the index of their entry.
+    """Return the tick records of a black box by the index of their entry, in the file's order; other entries are passed
+    over.
 
-    Raises ReplayError where a tick does not fit `columns` or its types, or no tick is there.
+    Raises ReplayError where a tick does not fit `columns` or its types, or no tick is there. Raises ValueError where
+    `columns` lacks a field of TickRecord, which `rebuild.recorded` refuses before.
     """
     own = TickRecord.__struct_fields__
     order = None if columns == own else [columns.index(name) for name in own]
@@ -342,7 +345,7 @@ def measurement_of(record: TickRecord) -> Measurement | None:
 
 
 def name_of(entry: Any) -> str:
-    """Return a black box entry's name; empty for a tick."""
+    """Return a black box entry's name; empty for a tick, and for anything else that begins with no text."""
     if isinstance(entry, str):
         return entry
     if isinstance(entry, list) and entry and isinstance(entry[0], str):

@@ -92,7 +92,8 @@ class MeasuredScene(Struct, frozen=True):
         return self.usual.worst_N <= self.tolerance_N
 
     def of(self, way: OperatingPoint) -> Tried:
-        """Return what was found of `way`. Raises StopIteration where it was not tried."""
+        """Return what was found of `way`: the same rates and the same search. Raises StopIteration where it was not
+        tried."""
         return next(each for each in self.tried if each.way == way)
 
 
@@ -126,10 +127,13 @@ WORSE = 0.2
 
 
 def measured() -> Measurements:
-    """Read the file of measurements that comes with the package, and return it."""
+    """Read the file of measurements that comes with the package, anew at each call, and return it."""
     return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measurements)
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
-    """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`."""
+    """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`.
+
+    It is TOLERATED of `tolerance_N`, N, or WORSE of it more than `usual_N`, whichever is greater.
+    """
     return max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)

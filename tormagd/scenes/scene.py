@@ -152,7 +152,10 @@ class Terms(Strict, frozen=True):
         return tuple(name for name in TERMS if not getattr(self, name))
 
     def without(self, *names: str) -> "Terms":
-        """Return these terms with `names` left out, too. Raises ValueError for a name that is no term."""
+        """Return these terms with `names` left out, too; without names the same.
+
+        Raises ValueError for a name that is no term, and so for `learning`.
+        """
         for name in names:
             if name not in TERMS:
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
@@ -293,9 +296,10 @@ def shipped_scenes() -> tuple[str, ...]:
 
 
 def scene_path(name_or_path: str) -> Path:
-    """Return the path of the shipped scene with this name, or of the file at this path.
+    """Return the path of the shipped scene with this name, or of the file at this path, from the working directory on.
 
-    Raises ConfigError naming the shipped scenes where there is neither.
+    A shipped name goes first; the file is not opened. Raises ConfigError naming the shipped scenes where there is
+    neither.
     """
     return named("scene", name_or_path, _SHIPPED, ENDING)
 
@@ -303,6 +307,7 @@ def scene_path(name_or_path: str) -> Path:
 def load_scene(name_or_path: str) -> Scene:
     """Read and check a shipped scene, by its name, or the scene in a file.
 
-    Raises ConfigError naming file, key, value and what is allowed.
+    Model, insert and signal that it names are neither looked for nor read. Raises ConfigError naming file, key, value
+    and what is allowed.
     """
     return convert(scene_path(name_or_path), Scene)

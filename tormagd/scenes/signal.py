@@ -15,9 +15,9 @@ Array = npt.NDArray[np.float64]
 
 
 def recorded(path: Path) -> tuple[Array, Array]:
-    """Read a file of forces, and return its times from the first row on, s, and forces, N (n each).
+    """Read a file of forces, and return its times from the first row on, s, and forces, N (n each, 2 at least).
 
-    Raises ConfigError naming `signal.file`.
+    Displacement and rate in it are passed over. Raises ConfigError naming `signal.file`.
     """
     try:
         table = read_forces(path)
@@ -34,8 +34,9 @@ def asked(
 
     There are `rate_hz` of them a second, and at least two. A recording, `signal.file` in the folder `beside`, is
     interpolated by a smooth curve to its end, and held within `range_N`, least and greatest. Without a file the force
-    goes through the range up and down once, in steps of `step_N`. Each step is half a cosine, and is held for `hold_s`.
-    Both end after `longest_s` at the latest. Raises ConfigError for a file that is not as allowed.
+    goes through the range up and down once, in steps of `step_N` at most. Each step is half a cosine, and is held for
+    `hold_s`. Both end after `longest_s` at the latest; infinite: at their own end. Raises ConfigError for a file that
+    is not as allowed.
     """
     low_N, high_N = range_N
     if signal.file:

@@ -63,9 +63,10 @@ class SimulatorBus(can.BusABC):
         return self._socket.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame, waiting up to `timeout` seconds for room (None: for ever).
+        """Send a classical data frame, waiting up to `timeout` seconds for room; None waits for ever, 0 not at all.
 
-        Raises can.CanOperationError: no classical data frame of 11 bits, no room, or the simulator has gone.
+        Raises can.CanOperationError for any other frame, for no room, and where the simulator has gone. An identifier
+        over 11 bits is not refused, but cut to its lowest 11.
         """
         if msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd or len(msg.data) > MAX_DATA:
             raise can.CanOperationError(f"{msg}: allowed are classical data frames of 11-bit identifiers")

@@ -27,7 +27,11 @@ class CanFrame(NamedTuple):
 
 
 def frame_bits(frame: CanFrame) -> int:
-    """Return how many bit times the frame takes, with its stuff bits and the pause behind it (ISO 11898-1)."""
+    """Return how many bit times the frame takes, with its stuff bits and the pause behind it (ISO 11898-1).
+
+    Identifier and data have to be those of a classical frame: larger ones are not refused, and the result means
+    nothing. An error frame raises OverflowError.
+    """
     # start of frame, identifier, then RTR, IDE and r0, which are 0 in a classical data frame, and the length
     head = (frame.identifier << 7 | len(frame.data)).to_bytes(3, "big")
     crc = 0
@@ -44,12 +48,18 @@ def frame_bits(frame: CanFrame) -> int:
 
 
 def to_socket(frame: CanFrame) -> bytes:
-    """Return the frame as one packet of the simulator's socket."""
+    """Return the frame as one packet of the simulator's socket.
+
+    Data of more than MAX_DATA bytes are cut, not refused; `from_socket` then takes the packet for none.
+    """
     return SOCKET_FRAME.pack(frame.identifier, len(frame.data), frame.data)
 
 
 def from_socket(packet: bytes) -> CanFrame | None:
-    """Return the frame in a packet of the simulator's socket, None where the packet holds no valid one."""
+    """Return the frame in a packet of the simulator's socket, None where the packet holds no valid one.
+
+    An error frame is valid, and has ERROR_FLAG in its identifier. An empty packet, the socket's end, gives None.
+    """
     if len(packet) != SOCKET_FRAME.size:
         return None
     identifier, length, data = SOCKET_FRAME.unpack(packet)

@@ -198,7 +198,11 @@ class CompiledFirmware:
 
 
 def parameters_of(plant: PlantParameters) -> CParameters:
-    """Return what the firmware of a plant's device is given at its boot."""
+    """Return what the firmware of a plant's device is given at its boot, as the C structure.
+
+    Ways of encoder counts come from screw lead and roller radius, the stall current from `assumed.overcurrent_A`. The
+    serial number is SERIAL_NUMBER for every plant. Nothing is checked here.
+    """
     return CParameters(
         lead_mm=plant.screw.lead_mm,
         stall_A=plant.assumed.overcurrent_A,
@@ -211,7 +215,7 @@ def parameters_of(plant: PlantParameters) -> CParameters:
 
 
 def seen(sensors: Sensors) -> CSensors:
-    """Return `sensors` as the firmware's structure."""
+    """Return `sensors` as the firmware's structure. Counts beyond 32 bits run over, as the firmware's own do."""
     return CSensors(
         sensors.left_counts,
         sensors.right_counts,

@@ -15,7 +15,10 @@ class Curve:
         self._values = values
 
     def at(self, x: float) -> float:
-        """Return the value at `x`; the outermost pieces continue beyond both ends."""
+        """Return the value at `x`; the outermost pieces continue beyond both ends.
+
+        Raises ValueError for NaN, OverflowError for an infinite `x`.
+        """
         place = (x - self._start) * self._per_unit
         index = int(place)
         if index < 0:

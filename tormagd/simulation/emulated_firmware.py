@@ -95,13 +95,22 @@ class EmulatedFirmware:
         self._pins = self._told(bytes(parameters_of(plant)))
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Let a message of the host arrive, in a frame of its own, and return what was answered to it."""
+        """Let a message of the host arrive, in a frame of its own with the next sequence number, and return what was
+        answered.
+
+        Raises EncodeError for a value that does not fit the wire, EmulationError as `hear`.
+        """
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         return self.hear(time_s, frame, sensors)
 
     def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
-        """Let bytes of the link arrive, one whole frame at most, and return what was answered to them."""
+        """Let bytes of the link arrive at `time_s` of its clock, one whole frame at most, and return what was answered
+        to them.
+
+        Without bytes it does nothing and returns NONE. A State and Sense that it answers wait for `measurement`. Raises
+        EmulationError.
+        """
         answer = Answer.NONE
         for start in range(0, len(data), MAX_BYTES):
             messages = self._wake(time_s, sensors, data[start : start + MAX_BYTES])
@@ -116,7 +125,11 @@ class EmulatedFirmware:
         return status
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return the oldest State and Sense that it has sent and nobody has taken; their moment is that of `hear`."""
+        """Return the oldest State and Sense that it has sent and nobody has taken; time and sensors given here do not
+        count.
+
+        Their moment is that of `hear` or `receive`, which answered MEASUREMENT. Raises IndexError where none waits.
+        """
         return self._measured.popleft()
 
     def identity(self) -> Identity:

@@ -447,7 +447,7 @@ class Firmware:
     # -- reports -------------------------------------------------------------------------------------------------
 
     def identity(self) -> Identity:
-        """Return the schema hash, firmware version and serial number."""
+        """Return the schema hash, firmware version and serial number; they are the same for every device and plant."""
         return Identity(SCHEMA_HASH, VERSION[0], VERSION[1], SERIAL_NUMBER)
 
     def status(self, sensors: Sensors) -> Status:
@@ -465,7 +465,11 @@ class Firmware:
         )
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return State and Sense of that moment; each call counts State's counter up."""
+        """Return State and Sense of that moment; each call counts State's counter up, from 1 on and modulo 256.
+
+        Carriages are mm from their zeros, the handle mm of the roller's surface. The wire's ranges are not checked
+        here.
+        """
         left_mm, right_mm = self._positions_mm(sensors)
         self._state_counter = (self._state_counter + 1) % 256
         return (

@@ -31,7 +31,11 @@ class GapField:
         return self._moment.at(gap_mm)
 
     def advance(self, gap_mm: float) -> float:
-        """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m."""
+        """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m.
+
+        A gap beyond the device's stops is not refused: the table's last piece goes on there. An unchanged gap changes
+        nothing.
+        """
         moment_Tm = self._moment.at(gap_mm)
         change_Tm = moment_Tm - self._moment_Tm
         if change_Tm != 0.0:

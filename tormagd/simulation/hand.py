@@ -59,7 +59,10 @@ class ReversingHand(Value):
         self.period_s: Final = period_s
 
     def position_mm(self, time_s: float) -> float:
-        """Return the place of the roller's surface at `time_s`, 0 to REVERSING_TRAVEL_MM, mm."""
+        """Return the place of the roller's surface at `time_s`, 0 to REVERSING_TRAVEL_MM, mm.
+
+        `time_s` is not below 0; this is not checked, and other times give places outside.
+        """
         phase = math.fmod(time_s, self.period_s) / self.period_s
         half, back = (phase, False) if phase < 0.5 else (phase - 0.5, True)
         share = min(half / 0.35, 1.0)
@@ -91,7 +94,10 @@ class RecordedHand(Value):
         self.positions_mm: Final = positions_mm
 
     def position_mm(self, time_s: float) -> float:
-        """Return the recorded place at `time_s`, mm, linear between the points; the first or the last beyond them."""
+        """Return the recorded place at `time_s`, mm, linear between the points; the first or the last beyond them.
+
+        NaN gives the last. Raises IndexError where there is no point.
+        """
         after = bisect.bisect_right(self.times_s, time_s)
         if after == 0:
             return self.positions_mm[0]

@@ -299,7 +299,7 @@ def _kind(tables: dict[str, Any]) -> type[PlantParameters | _Between]:
 
 
 def plant_names() -> tuple[str, ...]:
-    """Names of the plants that come with the package."""
+    """Return the names of the plants that come with the package, sorted."""
     return shipped(_PLANTS, ".toml")
 
 
@@ -319,10 +319,11 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
-    """Return the plant with the insert called `name` in the place of its own.
+    """Return the plant with the insert called `name` in the place of its own; the plant itself for PLANTS_INSERT.
 
     The elastomer deviates from the registry's `name` by the factors by which the plant's own deviates from
-    PLANTS_INSERT. Relative permeability stays at 1 or above. Raises `DomainError` for an unknown insert.
+    PLANTS_INSERT. Relative permeability stays at 1 or above. The bounds of a plant file are not checked again. Raises
+    `DomainError` for an unknown insert.
     """
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
     own = plant.elastomer

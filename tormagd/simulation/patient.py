@@ -79,7 +79,8 @@ class Patient:
     def update(self, time_s: float, handle_mm: float) -> Felt:
         """Advance to `time_s`, with the handle at `handle_mm` since the last update, and return what the tip feels.
 
-        Times never fall. The first update puts tip and robot at the handle's place.
+        The first update puts tip and robot at the handle's place. Times must not fall and no number be NaN: neither is
+        checked, and the patient's state is of no use afterwards.
         """
         if math.isnan(self._time_s):
             self._time_s, self._start_mm, self._robot_mm, self._tip_mm = time_s, handle_mm, handle_mm, handle_mm
@@ -102,9 +103,9 @@ class Patient:
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
     """Return the fields of a setpoint that says what the tip feels, `felt`, in the way of `mode`, one of MODES.
 
-    Forces are in N. Mode `force` gives `servo_cf`, the size of the force. The others give wall and friction together as
-    `servo_cf`. Of these `way` adds the friction as `withdraw_cf`. `law` adds the wall as `contact`, once the tip has
-    met it: `handle_mm`, `stiffness_N_mm` and `friction_N`.
+    Forces are in N, and never negative. Mode `force` gives `servo_cf`, the size of the force. The others give wall and
+    friction together as `servo_cf`. Of these `way` adds the friction as `withdraw_cf`. `law` adds the wall as
+    `contact`, once the tip has met it: `handle_mm`, `stiffness_N_mm` and `friction_N`. Any other mode counts as `law`.
     """
     if mode == FORCE:
         return {"servo_cf": abs(felt.force_N)}
@@ -178,10 +179,10 @@ def run(
 ) -> int:
     """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints in `mode` `back`.
 
-    Before a first motion has arrived no setpoint is sent, from then on one every period, for the motion sent last.
-    Returns the number of setpoints that `client` published. A setpoint that arrives after a later one is dropped; its
-    stamp is the time when it was sent. `is_over` is asked with seconds of `clock_s`; `wait` sleeps for seconds. Raises
-    what `client` raises.
+    `mode` is one of MODES; another is not refused, and counts as `setpoint_of` says. Before a first motion has arrived
+    no setpoint is sent, from then on one every period, for the motion sent last. Returns the number of setpoints that
+    `client` published. A setpoint that arrives after a later one is dropped; its stamp is the time when it was sent.
+    `is_over` is asked with seconds of `clock_s`; `wait` sleeps for seconds. Raises what `client` raises.
     """
     began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
     newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0

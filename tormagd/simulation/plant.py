@@ -160,7 +160,10 @@ class Plant:
         )
 
     def drive(self, left_V: float | None, right_V: float | None) -> None:
-        """Put `left_V` and `right_V` at the motors from now on; None opens that motor's bridge."""
+        """Put `left_V` and `right_V` at the motors from now on; None opens that motor's bridge.
+
+        They hold until the next call. The supply's voltage is no bound here.
+        """
         share = self._target_s / self._substep_s - self._substeps
         self._left_early_V += _early_V(self.left, share, self._left_V, left_V)
         self._right_early_V += _early_V(self.right, share, self._right_V, right_V)
@@ -169,7 +172,9 @@ class Plant:
     def advance(self, dt_s: float) -> None:
         """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each millisecond.
 
-        What is left of a substep waits for the next call.
+        What is left of a substep waits for the next call. `dt_s` is not below 0; this is not checked, and would turn
+        the plant's clock back. Raises what the element raises, and ValueError or OverflowError for a time that is not
+        finite.
         """
         self._target_s = target_s = self._target_s + dt_s
         due = int(target_s / self._substep_s + _ROUNDING)
@@ -211,7 +216,10 @@ class Plant:
         self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:
-        """Divide the friction of both gearboxes and screws by `divisor`."""
+        """Divide the friction of both gearboxes and screws by `divisor`, each time it is called.
+
+        1 / `divisor` undoes it. Raises ZeroDivisionError for 0.
+        """
         for axis in (self.left, self.right):
             axis.gear_friction_Nm /= divisor
             axis.screw_friction_m /= divisor

@@ -29,7 +29,7 @@ class Pty:
         self.address = os.ttyname(self._theirs)
 
     def close(self) -> None:
-        """Close both ends of the line."""
+        """Close both ends of the line, once: a second call raises OSError."""
         os.close(self._ours)
         os.close(self._theirs)
 
@@ -38,7 +38,8 @@ class Pty:
         return (self._ours,)
 
     def read(self) -> bytes:
-        """Return what the host has written. Raises BlockingIOError where there is nothing."""
+        """Return what the host has written, READ_BYTES at most; the rest waits. Raises BlockingIOError where there is
+        nothing."""
         return os.read(self._ours, READ_BYTES)
 
     def write(self, data: bytes) -> None:
@@ -64,7 +65,12 @@ class PtyDoor(Pty):
         self._device = device
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device the host's bytes if there are any, and the host what the device has sent by `now_s`."""
+        """Hand the device the host's bytes where `readable` is not empty, and the host what the device has sent by
+        `now_s`.
+
+        READ_BYTES of the host's are taken at most. Raises BlockingIOError where `readable` is not true, ValueError for
+        a time before the last.
+        """
         if readable:
             self._device.receive(now_s, self.read())
         if out := self._device.transmit(now_s):

@@ -26,9 +26,11 @@ RESTED_S: Final = 1000.0
 
 
 def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) -> float:
-    """Return the flux density at the shaft: a block's on its axis, half a gap away, times 2 and times `concentration`.
+    """Return the flux density at the shaft, mT: a block's on its axis, half a gap away, times 2 and times
+    `concentration`.
 
-    Two equal blocks make the 2; `concentration` is what the iron shaft draws in (Furlani 2001).
+    Two equal blocks make the 2; `concentration` is what the iron shaft draws in (Furlani 2001). The gap is above 0 mm:
+    0 raises ZeroDivisionError, and less is not refused.
     """
     width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
 
@@ -41,15 +43,20 @@ def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) 
 
 
 def fresh_N(field_mT: float, second: SecondParameters) -> float:
-    """Return the kinetic friction of the fresh, cool element in the field `field_mT`, sliding at the reference
-    speed."""
+    """Return the kinetic friction, N, of the fresh, cool element in the field `field_mT`, sliding at the reference
+    speed.
+
+    The field's sign does not matter.
+    """
     saturation = math.tanh(field_mT / second.saturating_mT)
     return second.without_field_N + second.saturated_N * saturation * saturation
 
 
 def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> float:
-    """Return the friction at `speed_mm_s` and contact age `age_s` over that of steady sliding at the reference
-    speed."""
+    """Return the friction at `speed_mm_s` and contact age `age_s` over that of steady sliding at the reference speed.
+
+    The sign of the speed does not matter. The age, s, is not below 0; this is not checked.
+    """
     reference_mm_s, slow_mm_s = second.reference_mm_s, second.slow_mm_s
     reference_age = second.renewed_mm / reference_mm_s / second.ageing_s
     faster = math.log((slow_mm_s + abs(speed_mm_s)) / (slow_mm_s + reference_mm_s))

@@ -54,7 +54,11 @@ class SlcanAdapter:
         return answers, frames
 
     def line(self, frame: CanFrame) -> bytes:
-        """Return a received frame as characters for the host."""
+        """Return a received frame as characters for the host, whether the channel is open or not.
+
+        The frame has an 11-bit identifier and at most 8 bytes; another is not refused, and the host cannot read the
+        line.
+        """
         return b"t%03X%d%s\r" % (frame.identifier, len(frame.data), frame.data.hex().upper().encode())
 
     def _answer(self, command: bytes) -> bytes:

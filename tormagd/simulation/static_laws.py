@@ -43,18 +43,25 @@ def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
 
 def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
     """Return the attraction between the magnets at a gap, N: the closed form in air times the factor for the iron
-    shaft."""
+    shaft.
+
+    A float gives a float, an array one of its shape. Raises DomainError for a gap, mm, as `attraction_N` does.
+    """
     return plant.assumed.attraction_factor * attraction_N(gap_mm, _magnet(plant))
 
 
 def moment_over_gap(plant: PlantParameters) -> Curve:
-    """Return `radial_moment_Tm` as a table over every gap that the device can reach, mm to T m."""
+    """Return `radial_moment_Tm` as a table over every gap that the device can reach, mm to T m. Raises DomainError as
+    that."""
     ends_mm = _reached_mm(plant)
     return Curve(radial_moment_Tm(_gaps_mm(*ends_mm), plant).tolist(), *ends_mm)
 
 
 def pull_over_gap(plant: PlantParameters) -> Curve:
-    """Return `pull_of_magnets_N` as a table over every gap that the device can reach, mm to N."""
+    """Return `pull_of_magnets_N` as a table over every gap that the device can reach, mm to N.
+
+    Raises DomainError as that, for a gap that is too large beside the magnets.
+    """
     ends_mm = _reached_mm(plant)
     return Curve((plant.assumed.attraction_factor * _attraction_N(_magnet(plant), *ends_mm)).tolist(), *ends_mm)
 

@@ -54,7 +54,8 @@ class TactilePad:
         self._field_memory: PronyState = self._field_series.relaxed(0.0)
 
     def rest(self) -> None:
-        """Take the load off until all stress has relaxed; conditioning stays."""
+        """Take the load off until all stress has relaxed: depth is 0 mm then; conditioning stays, and no time is
+        counted."""
         self._displacement_mm = 0.0
         self._memory, self._field_memory = self._series.relaxed(0.0), self._field_series.relaxed(0.0)
 
@@ -107,7 +108,9 @@ class TactilePad:
         """Advance through a program of n samples and return the force at each, N (n).
 
         A program from time 0 has its first sample at once; of any other the first step is as long as the second. Raises
-        `DomainError` as `elastic_parts_N` does.
+        `DomainError` as `elastic_parts_N` does, and for times that fall. Raises IndexError without samples, or with a
+        single one that is not at time 0. Raises ValueError for columns of different lengths. The pad's past has changed
+        up to there.
         """
         steps = np.round(np.diff(time_s, prepend=0.0 if time_s[0] == 0.0 else 2 * time_s[0] - time_s[1]), 9)
         columns = zip(steps.tolist(), displacement_mm.tolist(), rate_mm_s.tolist(), field_mT.tolist(), strict=True)
@@ -118,7 +121,8 @@ def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, 
     """Return time, displacement, rate and cycle number of one pass of the test rig, each (4 rates * 3 cycles *
     samples).
 
-    A cycle goes from 0.2 to 4.5 mm and back. Units are s, mm and mm/s.
+    A cycle goes from 0.2 to 4.5 mm and back; on the way back its rate is negative. Units are s, mm and mm/s. Times rise
+    from above 0, and cycles are numbered from 0 through all rates, in the order of RATES_MM_S.
     """
     times, displacements, rates, cycles, start_s = [], [], [], [], 0.0
     stroke_mm = FULL_INDENTATION_MM - TOUCHING_MM

@@ -30,7 +30,10 @@ class MooneyRivlin(NamedTuple):
 
 
 def stretches(radial: float, circumferential: float) -> Array:
-    """Return the principal stretches (3) with these two; incompressibility gives the axial one (Eq. 14)."""
+    """Return the principal stretches (3) with these two; incompressibility gives the axial one (Eq. 14).
+
+    Both are above 0: 0 raises ZeroDivisionError, and less is not refused.
+    """
     return np.array([radial, circumferential, 1.0 / (radial * circumferential)])
 
 

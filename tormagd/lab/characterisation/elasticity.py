@@ -50,8 +50,10 @@ def ogden_shape(stretch: FloatArray, exponent: float) -> FloatArray:
 def stress_Pa(
     shape: Shape, stretch: FloatArray, moduli_Pa: tuple[float, ...], exponents: tuple[float, ...]
 ) -> FloatArray:
-    """Return the stress of a law at these stretches, Pa, as the type of `stretch`. Moduli and exponents come in
-    pairs."""
+    """Return the stress of a law at these stretches, Pa, as the type of `stretch`; 0 without terms.
+
+    Moduli and exponents come in pairs: different counts raise ValueError. Stretches are above 0, which is not checked.
+    """
     terms = zip(moduli_Pa, exponents, strict=True)
     return sum((modulus_Pa * shape(stretch, exponent) for modulus_Pa, exponent in terms), 0.0 * stretch)
 

@@ -37,7 +37,11 @@ class Brake:
 
     @classmethod
     def as_built(cls, elastomer: Elastomer, field: FieldLaw | None = None) -> "Brake":
-        """Return the thesis's device with this elastomer, and the power law of the field unless `field` is given."""
+        """Return the thesis's device with this elastomer, and the power law of the field unless `field` is given.
+
+        Raises `DomainError` where the elastomer does not bear the field of the closed gap, or `field` does not reach to
+        both end positions.
+        """
         return cls(field or PowerFieldLaw(), elastomer, TORMAG, CLOSED_MM, OPEN_MM)
 
     @property
@@ -61,7 +65,8 @@ class Brake:
         return brake_force_N(self.field.radial_moment_Tm(gap_mm), self.elastomer, self.geometry)
 
     def slope_N_mm(self, gap_mm: Real) -> Real:
-        """Return |dF/dgap|, N per mm of gap (the bracket of Eq. 36)."""
+        """Return |dF/dgap|, N per mm of gap (the bracket of Eq. 36). Raises `DomainError` outside the field law's
+        range."""
         return abs(d_force_d_gap(gap_mm, self.field, self.elastomer, self.geometry))
 
     def gap_mm(self, force_N: Real) -> Real:

@@ -83,13 +83,16 @@ class Problem(msgspec.Struct, frozen=True):
         return PhasePortrait(brake, self.gap_speed_mm_s)
 
     def load_margin(self, design: Design) -> float:
-        """Return 1 - field of the closed gap over the largest that the elastomer bears; admissible where not
-        negative."""
+        """Return 1 - field of the closed gap over the largest that the elastomer bears; admissible where not negative.
+
+        Raises `DomainError` for lengths that no brake can have; the open gap does not count.
+        """
         moment_Tm = PowerFieldLaw().radial_moment_Tm(self.closed_mm)
         return 1.0 - moment_Tm / max_radial_moment_Tm(self.elastomer, self.geometry(design))
 
     def volume_mm3(self, design: Design) -> float:
-        """Return the volume of elastomer in a design."""
+        """Return the volume of elastomer in a design; lengths are not checked, and it is below 0 where the radii are
+        exchanged."""
         return math.pi * (design.outer_radius_mm**2 - self.inner_radius_mm**2) * design.thickness_mm
 
 

@@ -50,7 +50,10 @@ class Region(msgspec.Struct, frozen=True):
         return 0.5 * (self.least_rate_N_s + self.most_rate_N_s) * (self.most_N - self.least_N)
 
     def rate_N_s(self, force_N: FloatArray) -> FloatArray:
-        """Return the rate that is required at a force inside the region."""
+        """Return the rate that is required at each force (n), N/s, inside the region.
+
+        Outside, the straight line goes on, and may fall below 0.
+        """
         share = (force_N - self.least_N) / (self.most_N - self.least_N)
         return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
 
@@ -66,7 +69,7 @@ class CloudCoverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Covered points over all points."""
+        """Return covered points over all points; NaN where there are none."""
         return float(np.mean(self.covered))
 
 
@@ -84,7 +87,10 @@ class PhasePortrait:
         require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
 
     def outline(self, points: int = 201) -> tuple[FloatArray, FloatArray]:
-        """Return the true boundary's upper half: (force_N, rate_N_s), both of `points` elements, force falling."""
+        """Return the true boundary's upper half: (force_N, rate_N_s), both of `points` elements, force falling.
+
+        It goes from the closed gap to the open one, in equal shares of the gap. The lower half is its mirror image.
+        """
         gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, points)
         # a geometric series may end a rounding beyond its ends
         gap_mm = np.clip(gap_mm, self.brake.closed_mm, self.brake.open_mm)
@@ -139,14 +145,20 @@ class PhasePortrait:
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge points of a task, force and force rate (n), by the true boundary."""
+        """Judge points of a task, force and force rate (n), by the true boundary.
+
+        NaN is not refused: a point with a rate of NaN and a possible force counts as covered.
+        """
         inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
         limit = np.zeros_like(force_N)
         limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
         return self._judge(force_N, rate_N_s, limit)
 
     def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge points of a task, force and force rate (n), by the thesis's trapezoid."""
+        """Judge points of a task, force and force rate (n), by the thesis's trapezoid.
+
+        NaN is not refused: a point with a force of NaN, or a rate of NaN and a possible force, counts as covered.
+        """
         return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
 
     def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:

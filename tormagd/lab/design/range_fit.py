@@ -33,7 +33,10 @@ class RangeFit(NamedTuple):
         return self.friction[insert.shore_hardness] * frictionless_range_N(insert, self.field, self.exponent)
 
     def relative_error(self, insert: Insert) -> float:
-        """Return |range / measured range - 1| of an insert."""
+        """Return |range / measured range - 1| of an insert.
+
+        Raises KeyError as `range_N`, DomainError for an insert whose range has not been measured.
+        """
         return abs(self.range_N(insert) / insert.force_range.measured_N - 1.0)
 
 
@@ -82,7 +85,7 @@ def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
 
 
 def mean_relative_error(fit: RangeFit, inserts: Sequence[Insert]) -> float:
-    """Return the mean over the inserts of `RangeFit.relative_error`."""
+    """Return the mean over the inserts of `RangeFit.relative_error`; NaN without inserts. Raises as that."""
     return float(np.mean([fit.relative_error(item) for item in inserts]))
 
 

@@ -34,7 +34,10 @@ class Verdict:
     served_share: float
     """Share of the task's force range between the insert's least and most force."""
     sufficient_gap_mm: float
-    """Gap at which the force is as low as the task's least; NaN beyond the field law's range."""
+    """Gap at which the force is as low as the task tolerates, its least and resolution: at least the open gap.
+
+    NaN beyond the field law's range.
+    """
     reasons: tuple[str, ...]
 
 
@@ -45,7 +48,7 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
     open enough for the task, and the reasons why it does not serve. The step is the largest within that part of the
     task. Where the insert reaches none, or the task is one force, it is the open gap's. A passive brake never reaches 0
     N. A least force that is missed by no more than the task's resolution counts as reached: the task could not tell the
-    difference.
+    difference. Raises DomainError where the task tolerates only forces under 0 N.
     """
     least, most = brake.least_N, brake.most_N
     low, high = max(least, task.least_N), min(most, task.most_N)
@@ -68,8 +71,10 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
 
 
 def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
-    """Judge all inserts and return them best first: those that serve by resolution, the others by the share they
-    serve."""
+    """Judge all inserts and return them best first: those that serve by resolution, the others by the share they serve.
+
+    `inserts` are brakes by name. Empty without any. Raises as `judge`.
+    """
     verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
     return sorted(verdicts, key=lambda v: (bool(v.reasons), -v.served_share if v.reasons else 0.0, v.resolution_N))
 

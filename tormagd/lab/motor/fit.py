@@ -76,7 +76,11 @@ class Motion(NamedTuple):
     factor: int
 
     def thin(self, column: Array) -> Array:
-        """Return a column as the equations use it: low-passed, thinned, without the ends."""
+        """Return a column (n) as the equations use it: low-passed, thinned by `factor`, without EDGE rows at either
+        end.
+
+        Empty where no more than these are left.
+        """
         thinned = decimate(column, self.factor, ftype="fir", zero_phase=True) if self.factor > 1 else column
         return np.asarray(thinned[EDGE:-EDGE])
 
@@ -95,7 +99,10 @@ class Fit(NamedTuple):
         return np.asarray(self.deviations * np.sqrt(np.diag(self.covariance)))
 
     def half_widths_of(self, function: Callable[[Array], Array]) -> Array:
-        """Return the half widths of the 95% intervals of functions of the values, linearised."""
+        """Return the half widths (m) of the 95% intervals of m functions of the values, linearised about these.
+
+        `function` takes values (k) and returns an array (m); it is called twice for each value.
+        """
         steps = np.maximum(1e-3 * np.sqrt(np.diag(self.covariance)), np.finfo(np.float64).tiny)
         rises = [function(self.values + shift) - function(self.values - shift) for shift in np.diag(steps)]
         slopes = np.array(rises) / (2.0 * steps[:, None])

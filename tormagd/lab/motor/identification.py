@@ -17,10 +17,12 @@ BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
     """Identify a motor and return parameters, ratios to the gain, the time constant, residuals and notes as plain data.
 
-    An estimate is its value and the half width of its 95% interval. With `gain_N_V` the parameters are scaled from
-    volts. With None they come from the log's current, which also gives `motor` and the gain; without one they are None.
-    `holdout_voltage_nrmse` is of the second half, by a fit of the first. Raises LabError for a gain that is not
-    allowed, or a log that does not move enough to show anything.
+    Keys: `parameters` has PARAMETERS, `delay_s`, and `backlash_um`, which is always None. `ratios_to_gain` has RATIOS,
+    `motor` the names of `motor_parameters`. Besides `time_constant_s`, `gain_N_V`, `relative_residual`,
+    `holdout_voltage_nrmse` and `notes`. An estimate is a dict of `value` and `ci95`, the half width of its 95%
+    interval. With `gain_N_V` the parameters are scaled from volts. With None they come from the log's current, which
+    also gives `motor` and the gain; without one they are None. `holdout_voltage_nrmse` is of the second half, by a fit
+    of the first. Raises LabError for a gain that is not allowed, or a log that does not move enough to show anything.
     """
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
@@ -61,7 +63,8 @@ def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
 
 
 def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
-    """Return mass, viscous friction, Coulomb friction and offset; viscous includes the back-EMF's drag, K^2 / R."""
+    """Return mass, kg, viscous friction, N s/m, Coulomb friction and offset, N; viscous includes the back-EMF's drag,
+    K^2 / R."""
     braking = _product((windings.back_emf, 2), (windings.resistance, -1))
     viscous = Estimate(braking.value + gearbox.viscous.value, braking.ci95 + gearbox.viscous.ci95)
     return gearbox.mass, viscous, gearbox.coulomb, gearbox.offset

@@ -33,7 +33,10 @@ class Log(NamedTuple):
         return float(np.median(np.diff(self.t_s)))
 
     def part(self, rows: slice) -> "Log":
-        """Return the log of some rows."""
+        """Return the log of some rows, with the same gain; its columns are views of these.
+
+        A slice with a step has a longer period. Of under two rows the period is NaN.
+        """
         current = None if self.current_A is None else self.current_A[rows]
         return Log(self.t_s[rows], self.input_V[rows], self.position_m[rows], self.gain_N_V, current)
 

@@ -52,7 +52,9 @@ def followed(
 ) -> dict[str, Any]:
     """Let `search` follow the fields `path_mT` at every contact in `at`, each answer from the last; return how it went.
 
-    The figures are the share of jumps, the travel over the path's own, the worst force error, N, and all answers, mT.
+    Keys: `jump_share` of the answers; `travel`, the answers' way over the path's own; `worst_force_error_N`; `answers`,
+    mT, contact after contact. The first field is where it begins, and is not answered. One contact at least is needed,
+    and a path that moves.
     """
     cip_percent = model.feature_ranges[3][0]
     travels_mT, worst_N, answers = [], 0.0, []
@@ -75,16 +77,21 @@ def followed(
 
 
 def measured() -> dict[str, Any]:
-    """Return what every number of neighbours decides on two shipped models."""
+    """Return what every number of neighbours decides on two shipped models: by the names of MODELS, as `measured_on`.
+
+    Besides `synthetic`, True, and `jump_mT`. Raises as `measured_on`.
+    """
     return {"synthetic": True, "jump_mT": JUMP_MT} | {name: measured_on(*MODELS[name]) for name in MODELS}
 
 
 def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) -> dict[str, Any]:
-    """Return what every number of NEIGHBOURS decides on one shipped model: a row each, as `followed` without its
-    answers.
+    """Return what every number of NEIGHBOURS decides on one shipped model: `model`, `not_rising_share_of_box` and
+    `rows`.
 
-    `other_answers` is the share of answers that differ from those of the most neighbours. Besides, the share of the
-    model's box where its force does not rise. Raises LabError as `contacts`.
+    A row has `neighbours`, and the figures of `followed` without its answers. In their place is `other_answers`, the
+    share of answers that differ from those of the most neighbours. `not_rising_share_of_box` is the share of the
+    model's box where its force does not rise. Raises LabError as `contacts`, ConfigError or ModelFileError for a model
+    that cannot be loaded.
     """
     model = load_model(model_path(model_name, scene_path("pulse").parent), element=element)
     low_mT, high_mT = range_mT

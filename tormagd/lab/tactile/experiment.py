@@ -26,9 +26,11 @@ NOISES_N = (0.05, 0.5)
 def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]:
     """Run the experiment; return its figures as plain data, what table 4.1 was trained on, and the pulse's traces.
 
-    Table 4.1 is of the last of NOISES_N, the hold of the first.
-    A quick effort takes fewer rows and epochs and holds for a minute: it shows that all runs, not how well. Limits
-    torch to one thread. Raises ModuleNotFoundError where heartpy is not installed.
+    The figures are `table_4_1`, as `models.table_4_1`, `pulse` and `relaxation`. `pulse` is as `pulse.pulse`, with
+    `hold` and `hold_1h_force_error` besides. `relaxation` has `fractions`, `field_fractions` and `times_s`, s. Table
+    4.1 is of the last of NOISES_N, the hold of the first. A quick effort takes fewer rows and epochs and holds for a
+    minute: it shows that all runs, not how well. Limits torch to one thread, for good. Raises ModuleNotFoundError where
+    heartpy is not installed.
     """
     torch.set_num_threads(1)
     trained = [train(noise_N, effort) for noise_N in tqdm(NOISES_N, desc="training", disable=None, leave=False)]

@@ -85,6 +85,9 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
 def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
     """Return table 4.1 per class on the random split, with the noise floor, whole groups left out, and monotonicity.
 
+    Keys: `synthetic`, `sensor_noise_N`, `random` (`r2`, `mae_N`, `noise_mae_N`). `leave_one_field_out`,
+    `leave_one_class_out` and `leave_cycles_out` are as `left_out`. `monotonicity` has `network` and `relaxation_aware`,
+    as the function of that name. `rows` has a dict for each class, and for All at the end: `class`, `train` and `test`.
     Trains one network for each group left out.
     """
     data = trained.cycles.data
@@ -128,7 +131,8 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
 def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) -> dict[str, Any]:
     """Train a network without the rows of each fold, judge it on them, and return the errors, N.
 
-    A fold is a label and the mask (n) of its rows. The errors are those over all folds together, and each fold's own.
+    A fold is a label and the mask (n) of its rows. The result has `r2` and `mae_N` over all folds together, and
+    `folds`, `left_out` and `mae_N` each. At least one fold with rows is needed.
     """
     predicted = np.empty(len(data))
     judged = np.zeros(len(data), dtype=np.bool_)
@@ -147,8 +151,8 @@ def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, 
 
     `not_rising_share_of_box` is of the model's training box, as `not_rising_share`. The box spans from class to class,
     also where there are no data. `not_rising_share_where_scored` is of a grid of displacement, rate and field at the
-    classes of `pads`. There only places count where the pad's own slope is `SCORED_SLOPE_N_MT` or more; at least one
-    place has to.
+    classes of `pads`. There only places count where the pad's own slope is `SCORED_SLOPE_N_MT` or more;
+    ZeroDivisionError where none is.
     """
     places = np.meshgrid(
         np.linspace(TOUCHING_MM, FULL_INDENTATION_MM, 18),
@@ -169,7 +173,7 @@ def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, 
 def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
     """Return dF/dB, N/mT (n), of a worked pad at (displacement, mm, rate, mm/s, field, mT) (n x 3), without relaxation.
 
-    It is a secant over 0.5 mT to either side, above 0 mT.
+    It is a secant over 0.5 mT to either side, above 0 mT. Raises DomainError for a place outside the pad's law.
     """
     pad = worked_pad(parameters)
     displacement, rate, field = places.T
@@ -181,5 +185,8 @@ def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
 
 def plant_force_N(pad: Any, places: Array) -> Array:
     """Return the force, N (n), of a `TactilePad` at (displacement, mm, rate, mm/s, field, mT) (n x 3), without
-    relaxation."""
+    relaxation.
+
+    The pad's state stays. Raises DomainError for a place outside its law.
+    """
     return np.array([sum(pad.elastic_parts_N(*place)) for place in places.tolist()])

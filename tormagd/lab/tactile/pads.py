@@ -47,7 +47,8 @@ that table 4.1 implies."""
 def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
     """Draw another pad of the same recipe: moduli, saturation, relaxation and rate gain 3..15% about `parameters`.
 
-    The same seed gives the same pad.
+    The same seed gives the same pad. The bounds of a plant file are not checked again. Raises ValueError where the
+    drawn shares of relaxation sum to 1 or more.
     """
     draw = np.random.default_rng(seed)
 
@@ -136,7 +137,7 @@ def holding_records(
     """Return relaxation tests, one at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely.
 
     Each has `samples` rows, of a worked pad, with the sensor's noise `noise_N`, N, drawn by `seed`. The thesis did not
-    have these.
+    have these. Raises ValueError for under RISE_SAMPLES or a noise under 0, DomainError for a field outside 0..500 mT.
     """
     rise_s = FULL_INDENTATION_MM
     held_s = np.geomspace(0.05, HOLD_S, samples - RISE_SAMPLES)

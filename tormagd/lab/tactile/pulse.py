@@ -57,7 +57,8 @@ def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
 def program(shape: Array) -> Program:
     """Return the experiment's program: indentation to 4.5 mm at 1 mm/s, then a hold while the field follows `shape`.
 
-    `shape` fills the last of the SAMPLES samples; before it the field is that of its first.
+    `shape` (0..1) fills the last of the SAMPLES samples; before it the field is that of its first. Raises ValueError
+    for a longer one, IndexError for an empty one.
     """
     time_s = np.arange(1, SAMPLES + 1) / RATE_HZ
     displacement_mm = np.minimum(time_s, FULL_INDENTATION_MM)
@@ -75,10 +76,11 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 def solve_all(
     solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
 ) -> list[FieldSolution]:
-    """Find the field for each of `force_N` (n) in turn, from the last answer on; return the answers.
+    """Find the field for each of `force_N` (n) in turn, from the last answer on; return the answers (n).
 
-    `features` (n x 4) are the network's, their field unused. With `memory` each force is freed of the pad's relaxation
-    first, and `memory` advances with the fields found; None: forces are taken as they are.
+    `features` (n x 4) are the network's, their field unused; another number of them raises ValueError. With `memory`
+    each force is freed of the pad's relaxation first, and `memory` advances with the fields found; None: forces are
+    taken as they are. Raises DomainError for a feature that is not finite.
     """
     answers: list[FieldSolution] = []
     for row, wanted_N in zip(features.tolist(), force_N.tolist(), strict=True):
@@ -114,9 +116,11 @@ class Course(NamedTuple):
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 
     def scores(self, fields_mT: Array) -> dict[str, float]:
-        """Return by name how far `fields_mT` are off: the field over the scored rows, mT, over the others the force, N.
+        """Return how far `fields_mT` (n) are off: the field over the scored rows, mT, over the others the force, N.
 
-        The force is what the wrong field would cost on the pad itself.
+        Keys: `mae_mT`, `sd_mT`, `max_mT`, `elsewhere_force_mae_N`; that is NaN where all rows are scored. The force is
+        what the wrong field would cost on the pad itself. Raises ValueError where no row is scored, DomainError for a
+        field outside the pad's law.
         """
         absolute = np.abs(fields_mT - self.features[:, 2])[self.scored]
         pad, places = worked_pad(self.pad), self.features[~self.scored, :3].copy()
@@ -156,9 +160,10 @@ def aware_fields(trained: Trained, along: Course, noise_N: float = 0.0) -> Array
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return the scores of each way from force to field by name, and the traces over time by name (n each).
 
-    The ways are the network, the network with the thesis's search, and the relaxation-aware model without and with
-    noise. Besides, the field error that noise alone would make, mT, and the share of rows scored. Traces are the ways'
-    fields, the reference, what was given, and the pad's slope.
+    The ways are the network, `mlp`, the network with the thesis's search, `mlp_thesis_search`, and the relaxation-aware
+    model without and with noise, `relaxation_aware` and `relaxation_aware_noisy`. Scores are as `Course.scores`.
+    Besides, `noise_bound_mae_mT`, the field error that noise alone would make, and `scored_share` of the rows. Traces
+    are the ways' fields, `reference`, `time_s`, `displacement_mm`, `force_N`, and the pad's `slope_N_mT`.
     """
     linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
@@ -178,8 +183,9 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
     """Run the pulse experiment with each of `trainings`, and return its figures and the traces of the first training.
 
-    The first training's scores stand on top, each training's by its sensor noise, with other pads and pulses beside.
-    Raises ModuleNotFoundError where heartpy is not installed.
+    The first training's scores stand on top, beside `synthetic` and `shape`. `by_noise` has each training's by its
+    sensor noise, N, as text. There `other_pads` is a list of scores, and `other_pulses` a dict by file, empty without
+    recorded pulses. Traces are as `pulse_on`. Raises ModuleNotFoundError where heartpy is not installed.
     """
     shape = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
@@ -199,9 +205,10 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
 def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
     """Render pulses by feed-forward on a pad held at 4.5 mm for `duration_s` of virtual time.
 
-    Returns relative force errors of the network alone ("without") and with memory ("with"): the greatest of ten minutes
-    and in all, and the mean. Returns also the share of forces out of the field's reach. Raises ModuleNotFoundError
-    where heartpy is not installed.
+    Returns `duration_s` and relative force errors of the network alone, "without", and with memory, "with". Each has
+    `force_error_10min` and `force_error_1h`, the greatest of ten minutes and in all, and `mean_force_error`.
+    `out_of_reach_share` is that of forces out of the field's reach. Raises ModuleNotFoundError where heartpy is not
+    installed.
     """
     dt_s = 1.0 / HOLD_RATE_HZ
     rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)

@@ -19,7 +19,11 @@ WAYS = {
 
 
 def write_report(folder: Path, figures: Json, trained: Trained, traces: dict[str, Array]) -> None:
-    """Write learned_inverse.md into `folder`, and its pictures into `folder`/images."""
+    """Write learned_inverse.md into `folder`, which has to be there, and its pictures into `folder`/images, made where
+    missing.
+
+    Files there are replaced. Raises OSError.
+    """
     write_page(folder / "learned_inverse.md", sections(figures), folder / "images", pictures(trained, traces))
 
 

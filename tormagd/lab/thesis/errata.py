@@ -28,7 +28,7 @@ KEYS = ("place", "printed", "found", "used")
 
 
 def errata() -> list[dict[str, str]]:
-    """Return all errata by KEYS, in the order of the thesis."""
+    """Return all errata in the order of the thesis: a dict with KEYS for each, of plain text."""
     found = (*_chapter_2(), _eq_25(), *_chapter_3(), *_appendices(), *_chapter_4())
     return [dict(zip(KEYS, row, strict=True)) for row in found]
 

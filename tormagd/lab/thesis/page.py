@@ -211,7 +211,8 @@ def _table_3_2(data: Json) -> str:
 
 
 def best_start(starts: list[Json], use_case: int, objective: str) -> Json:
-    """Return the start of this use case and objective that covered most. Raises ValueError without one."""
+    """Return the start of this use case and objective that covered most, the first of equals. Raises ValueError without
+    one."""
     found = [each for each in starts if (each["use_case"], each["objective"]) == (use_case, objective)]
     return max(found, key=lambda each: float(each["coverage"]))
 

@@ -90,7 +90,8 @@ def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
 def _force_ranges(axes: Axes, rows: list[Json]) -> None:
     """Draw each insert's least and greatest force over its share of iron, one colour a matrix.
 
-    The ranges that the thesis measured stand on our least forces.
+    `rows` are the `ranges` of `reproduction.figure_2_7`, of three matrices exactly; others raise ValueError. A mark
+    shows where the range that the thesis measured would end above our least force.
     """
     for place, (matrix, colour) in enumerate(
         zip(dict.fromkeys(row["matrix"] for row in rows), (OURS, FREE, THESIS), strict=True)

@@ -129,7 +129,12 @@ def table_2_3() -> Json:
 
 
 def table_2_4() -> Json:
-    """Return friction per matrix fitted to the measured ranges, with Eq. 7 and, beside it, with the power law."""
+    """Return friction per matrix fitted to the measured ranges, with Eq. 7 and, beside it, with the power law.
+
+    The fit with Eq. 7 stands on top, as `_range_fit`, that of the power law in `power_field_law`, without `rows`.
+    `thesis` has the printed errors, as shares, and `registry` those of the friction in use. Besides `thesis_errors`, as
+    `table_2_4_errors`, and `measure`.
+    """
     ours, beside = _range_fit(ThesisFieldLaw()), _range_fit(PowerFieldLaw())
     return {
         **ours,
@@ -200,7 +205,9 @@ def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -
 def figure_2_5() -> Json:
     """Return the least and greatest force, N, over permeability and shear modulus, with mu_d = 0.2, by both field laws.
 
-    For each law also the forces at the thesis's working point, and their errors.
+    `eq_7` and `power` have `least_N` and `most_N` each, a row for each of `relative_permeability`, a column for each of
+    `shear_modulus_kPa`. They also have the forces at the thesis's working point, `working_point_N`, and their errors,
+    `error_N`.
     """
     permeabilities = np.linspace(2.0, 4.0, 9)
     moduli_kPa = np.linspace(80.0, 280.0, 11)
@@ -230,7 +237,12 @@ def figure_2_5() -> Json:
 
 
 def figure_2_7(tests: list[StepTest]) -> Json:
-    """Return the settled force at each gap on the simulated device, beside the force law, and all inserts' ranges."""
+    """Return the settled force at each gap on the simulated device, beside the force law, and all inserts' ranges.
+
+    `rows` has a dict for each of `tests`: `insert`, and `gap_mm`, `simulated_N`, `analytic_N` and `rel_error` by step.
+    `simulated_range_N` and `measured_range_N` are single numbers. `ranges` has `matrix`, `cip_percent`, `least_N`,
+    `most_N` and `measured_range_N` of every insert.
+    """
     rows = []
     for test in tests:
         brake = Brake.as_built(insert(test.insert).elastomer)
@@ -272,7 +284,9 @@ def figure_2_7(tests: list[StepTest]) -> Json:
 def phase_portrait(*gap_speeds_mm_s: float) -> Json:
     """Return how much of both use cases, and of a measured pulse's points, the device as built covers.
 
-    There is a row for each use case and gap speed. Raises ModuleNotFoundError where heartpy is not installed.
+    `as_built` has a row for each use case and gap speed, with the shares `trapezoid`, `true` and `thesis`. `pulse` is
+    as `_pulse_cloud`. Raises DomainError for a gap speed out of range, ModuleNotFoundError where heartpy is not
+    installed.
     """
     rows = []
     for number, case in USE_CASES.items():
@@ -369,7 +383,10 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
     """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's designs.
 
-    `outcomes` holds the outcome of each of `runs`. `gap_speed_mm_s` is the controller's.
+    `outcomes` holds the outcome of each of `runs`; one that is missing raises KeyError. `gap_speed_mm_s` is the
+    controller's. `starts`, `local_starts` and `corner_cost_starts` have a row for each run. `thesis_designs` has the
+    coverage of each design by objective, `best` the greatest coverage and its spread by use case and objective. Besides
+    `gap_speed_mm_s` by objective, `max_seconds` and `note`. Raises ValueError without a global run.
     """
     starts: list[Json] = []
     local: list[Json] = []

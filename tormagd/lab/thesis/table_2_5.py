@@ -27,7 +27,12 @@ COLUMNS = (
 
 
 def table_2_5() -> Json:
-    """Judge every insert for every task; return the verdicts, best first by the strict reading."""
+    """Judge every insert for every task; return the verdicts, best first by the strict reading.
+
+    Keys: `tasks`, each with `task`, `range_N`, `resolution_N`, `thesis_mN` by insert, and `ranked`, a dict as `_row`
+    for each insert. Besides `gap_resolution_mm`, `implied_gap_resolution_mm`, least and most that the thesis's figures
+    imply, and `note`.
+    """
     # the open gap is that of the device, but the law must hold beyond it where a task asks for less force
     brakes = {item.name: Brake.as_built(item.elastomer) for item in INSERTS.values()}
     steps = [
