@@ -153,6 +153,12 @@ def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypat
         open_serial(line.device, SerialOptions())
 
 
+def test_a_rate_that_the_driver_refuses_is_said(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial, "Serial", Mock(side_effect=ValueError("Failed to set custom baud rate")))
+    with pytest.raises(BackendError, match="custom baud rate"):
+        open_serial(line.device, SerialOptions())
+
+
 # -- on the simulator's bus ----------------------------------------------------------------------------------------
 
 

@@ -166,6 +166,7 @@ MEANINGS: list[tuple[str, Any, str]] = [
     ("ranges", {"field_mT": [100, 800]}, "ranges"),
     ("ranges", dict.fromkeys(UNITS, (1, 0)), "ranges"),
     ("ranges", dict.fromkeys(UNITS, (1, 1)), r"ranges\.force_N"),
+    ("ranges", {**dict.fromkeys(UNITS, (1, 2)), "field_mT": (0, 0)}, r"ranges\.field_mT"),
     ("scaling", {"input_offset": [0, 0, 0, 0]}, "input_gain"),
     (
         "scaling",

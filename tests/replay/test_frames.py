@@ -207,6 +207,8 @@ def test_one_that_begins_in_the_middle_begins_with_a_device_that_is_driven(path:
         ("nothing.at.all=1", "there is no 'nothing.at.all'"),
         ("scene=", "scene"),
         ("rates.control_hz=[1]", "control_hz"),
+        ("limits.skew_fault_mm=" + "[" * 100_000, "limits.skew_fault_mm"),
+        ("limits.skew_fault_mm=" + "9" * 5_000, "limits.skew_fault_mm"),
     ],
 )
 def test_settings_that_are_none_are_refused(setting: str, said: str) -> None:

@@ -46,7 +46,7 @@ def open_serial(device: Device, options: SerialOptions) -> SerialPort:
         reason = os.strerror(error.errno) if error.errno else str(error)
         reason, remedy = _REFUSALS.get(error.errno or 0, (reason, ""))
         raise BackendError(f"{device.port}: cannot be opened: {reason}", remedy) from error
-    except termios.error as error:  # no OSError; unplugged while it was set up
+    except (termios.error, ValueError) as error:  # unplugged while it was set up, or no rate of this driver
         raise BackendError(f"{device.port}: cannot be opened: {error.args[-1]}") from error
     return SerialPort(port)
 

@@ -105,13 +105,20 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 def _require_ranges(key: str, ranges: Ranges) -> None:
-    """Raise `DomainError` naming `key` unless each feature and `force_N` has a finite range, the force's not empty."""
+    """Raise `DomainError` naming `key` unless each feature and `force_N` has a finite range.
+
+    The ranges of the force and of the field may not be empty, and no field is below 0 mT.
+    """
     require_that(set(ranges) == set(UNITS), key, sorted(ranges), f"one range for each of {', '.join(UNITS)}")
     for name, (low, high) in ranges.items():
         is_range = -LARGEST <= low <= high <= LARGEST
         require_that(is_range, f"{key}.{name}", (low, high), f"[least, greatest], finite, within +-{LARGEST:g}")
     low, high = ranges["force_N"]
     require_that(low < high, f"{key}.force_N", (low, high), "a greatest force above the least")
+    low, high = ranges["field_mT"]
+    require_that(
+        0.0 <= low < high, f"{key}.field_mT", (low, high), "a least field of 0 mT or more, a greatest above it"
+    )
 
 
 class PhysicalLayers(NamedTuple):
@@ -190,8 +197,7 @@ class ForceModel:
         """Return the model of one of its several inserts: ranges of that insert alone, the field's lag to their scale.
 
         Scaled by the insert's greatest field over that of all inserts. Returns this model itself where it holds no
-        ranges for `insert`. Raises DomainError where the scaled lag makes no `Memory`, ZeroDivisionError where the
-        greatest field of all is 0 mT.
+        ranges for `insert`. Raises DomainError where the scaled lag makes no `Memory`.
         """
         whole, memory = self.metadata, self.metadata.memory
         ranges = (whole.boxes or {}).get(insert)

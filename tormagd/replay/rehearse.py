@@ -81,8 +81,7 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
     """Return the configuration with `KEY=VALUE` settings, as in limits.skew_fault_mm=2; a value is TOML, or else text.
 
     Of two settings of one key the later counts; without settings it is checked all the same. Raises ReplayError for an
-    unknown key, or a value that the configuration refuses. ValueError for an integer of over 4300 digits and
-    RecursionError for arrays nested without end are raised as they come.
+    unknown key, or a value that the configuration refuses or that is no TOML which can be read.
     """
     tables: dict[str, Any] = msgspec.to_builtins(config)
     for setting in settings:
@@ -99,6 +98,8 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
             table[names[-1]] = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             table[names[-1]] = text.strip()
+        except (ValueError, RecursionError) as error:  # an integer of thousands of digits, or endless nesting
+            raise ReplayError(f"--set {setting[:80]}: {error}") from error
     try:
         return checked(tables, Config)
     except ConfigError as error:
