@@ -89,11 +89,17 @@ class Core(NamedTuple):
         return self.element.portrait
 
     def planner(self, now_s: float = 0.0) -> Planner:
-        """Return a planner that begins at `now_s`, with the gap open and nothing known of the device."""
+        """Return a new planner that begins at `now_s`, with the gap open and nothing known of the device.
+
+        Planners of one core share nothing that changes.
+        """
         return Planner(self.config, self.scene, self.element, now_s)
 
     def stepper(self, now_s: float = 0.0) -> Stepper:
-        """Return a stepper that begins at `now_s`, DISABLED."""
+        """Return a new stepper that begins at `now_s`, DISABLED, without a measurement.
+
+        Steppers of one core share nothing that changes.
+        """
         return Stepper(self.config, self.scene, now_s)
 
 
@@ -102,8 +108,9 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
     `scene` replaces the scene in the file; None reads the file. `models` is the folder of the scene's model. None takes
     the folder of the scene's file, and also checks the scene's signal against the gap's speed, for `missed`. The gap's
-    speed is the scene's where that is lower. Raises ConfigError where scene, model and configuration do not fit each
-    other, or a file is refused.
+    speed is the scene's where that is lower; rates are `config`'s, see `at_rates_of`. Raises ConfigError where scene,
+    model and configuration do not fit each other, or a file is refused. All that the model and the gap's speed refuse
+    is told in one error; of other refusals the first.
     """
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
@@ -138,8 +145,8 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     """Return the scene's element as the model describes it, and the choice of the search for its field.
 
     The choice of the thesis's search also tells epsilon in its reason. A pad has no force law, and without the term
-    `memory` nothing is remembered. Raises DomainError where the model does not fit the scene's insert and gaps, or the
-    search does not fit the model.
+    `memory` nothing is remembered. A search in torch loads torch, as `inverse.choice.build`. Raises DomainError where
+    the model does not fit the scene's insert and gaps, or the search does not fit the model.
     """
     terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
@@ -157,9 +164,10 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
 
 
 def sources_hash() -> str:
-    """Return the SHA-256 of all sources that `plan` and `step` run; the compiled build gives the same.
+    """Return the SHA-256, hexadecimal, of all sources that `plan` and `step` run; the compiled build gives the same.
 
-    Reads the files of the rooms in SOURCES.
+    Reads the files of the rooms in SOURCES anew at every call. A room that is missing counts as empty. Raises OSError
+    for a file that cannot be read.
     """
     root, digest = Path(__file__).parents[2], hashlib.sha256()
     for room in SOURCES:
@@ -177,7 +185,7 @@ def platform_name() -> str:
 def _brake(scene: Scene) -> tuple[Contact, FieldOfGap, float]:
     """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent.
 
-    Raises DomainError for an unknown insert.
+    Raises DomainError for an unknown insert, and as `Insert.elastomer` and `FieldOfGap`.
     """
     fitted = insert(scene.insert.name)
     permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
@@ -187,7 +195,7 @@ def _brake(scene: Scene) -> tuple[Contact, FieldOfGap, float]:
 def _pad(finger: Finger, model: ForceModel) -> tuple[Contact, FieldOfGap, float]:
     """Return a tactile pad's contact, the mean field in the pad over the gap, and its share of iron, percent.
 
-    The share of iron is the least that the model was trained on.
+    The share of iron is the least that the model was trained on; the scene's insert is not looked at.
     """
     *_, (cip_percent, _) = model.feature_ranges
     return Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
@@ -238,7 +246,11 @@ def _known_fields_mT(
 
 
 def _stable_margins(config: Config) -> Margins:
-    """Return the position loop's stability margins. Raises ConfigError where the phase or gain margin is too small."""
+    """Return the stability margins of the position loop at the configured control rate.
+
+    Raises ConfigError where the phase margin is under MIN_PHASE_MARGIN_DEG, or the gain margin under
+    MIN_GAIN_MARGIN_DB.
+    """
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
     if stability.phase_margin_deg < MIN_PHASE_MARGIN_DEG or stability.gain_margin_dB < MIN_GAIN_MARGIN_DB:
         raise ConfigError(
@@ -264,8 +276,8 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
 def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
     """Return what the gaps do not reach of the scene's greatest and standby forces, with what is allowed.
 
-    Standby has to be above the open gap's force, by STANDBY_N at most, and not above the scene's greatest force. The
-    scene's least force may be any.
+    Empty where they reach both. Standby has to be above the open gap's force, by STANDBY_N at most, and not above the
+    scene's greatest force. A scene may leave it out. The scene's least force may be any.
     """
     # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
     unmet = []
@@ -286,7 +298,8 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
 def at_rates_of(scene: Scene, config: Config) -> Config:
     """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`.
 
-    The control rate is MIN_CONTROL_HZ at least. Raises ConfigError for rates that a configuration may not have.
+    The control rate is MIN_CONTROL_HZ at least. Whether control is stable at these rates is `build_core`'s to tell.
+    Raises ConfigError for rates that a configuration may not have.
     """
     if not config.rates.of_scene:
         return config
@@ -323,7 +336,11 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
-    """Return the smallest difference of force, N, that the device makes and measures at forces up to `most_N`."""
+    """Return the smallest difference of force, N, that the device makes and measures at forces up to `most_N`.
+
+    It is the greater of the sensor's step and of what SETTLES_MM changes at `most_N`, or at the nearer end of `reach`.
+    Raises DomainError for NaN.
+    """
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
@@ -340,7 +357,10 @@ def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
-    """Return which of the handle's rates, or of a finger's depth and rate, the model was not trained on."""
+    """Return which of the handle's rates, or of a finger's depth and rate, the model was not trained on; empty if none.
+
+    A line each, with key, value and what is allowed.
+    """
     depths_mm, rates_mm_s, *_ = model.feature_ranges
     handle, finger = scene.handle, scene.finger
     stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
@@ -410,9 +430,10 @@ def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    """Return the search that `scene` names, with its settings.
+    """Return the search that `scene` names, with its settings; a setting that the scene leaves out is the usual one.
 
-    Raises DomainError for an unknown name, and for settings that the search does not have.
+    Raises DomainError for an unknown name, and for settings that the search does not have. Whether the search fits the
+    model is `inverse.choice.build`'s to tell.
 
     Where the scene leaves the choice, it is the portrait if the handle's rate is no term. With the rate it is Newton's
     method where the force `rises` with the field, else the k-nearest search.

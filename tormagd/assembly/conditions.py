@@ -45,8 +45,8 @@ def conditions(
     """Return the conditions at `now_s` on which operators' commands are taken.
 
     `output` is the newest step's, None before the first. `sensor_doubted` tells whether the plans doubt the force
-    sensor. Skew and the greatest values that a command may find are not among them: `Watch.command_conditions` adds
-    these.
+    sensor. `cause` is a stream that stopped, else the connection's own. Skew and the greatest values that a command may
+    find are not among them: `Watch.command_conditions` adds these. Nothing changes, and nothing is waited for.
     """
     measurement = connection.measurement
     old = "" if measurement is None else _late_stream(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
@@ -68,7 +68,7 @@ def _late_stream(now_s: float, measurement: Measurement, timeout_s: float) -> st
     """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has.
 
     Of several it is the first of State, Sense and Status. A State is late after `timeout_s`, a Sense and a Status after
-    the times of their faults.
+    the times of their faults, all on the host's clock. A time of NaN counts as late.
     """
     for name, came_s, longest_s in (
         ("State", measurement.received_s, timeout_s),

@@ -58,8 +58,9 @@ Entry = str | TickRecord | tuple[Any, ...]
 class Journal:
     """The core's inputs since the last `take`, in their order. Every method but `take` adds an entry.
 
-    An entry costs a reference in a list: records do not change, and states are written out at once. With `is_kept`
-    False nothing is added. MAX_ENTRIES that nobody took are dropped, and MISSING stands for them.
+    An entry is STEP, a tick's record, or a tuple: its name, then what the method was given. An entry costs a reference
+    in a list: records do not change, and states are written out at once. With `is_kept` False nothing is added.
+    MAX_ENTRIES that nobody took are dropped, and MISSING stands for them.
     """
 
     def __init__(self, *, is_kept: bool = True) -> None:
@@ -67,15 +68,21 @@ class Journal:
         self._entries: list[Entry] = []
 
     def stepped(self) -> None:
-        """Note that a step ran."""
+        """Note that a step ran, before it runs; its inputs stand in the record that `ticked` adds after it."""
         self._add(STEP)
 
     def ticked(self, record: TickRecord) -> None:
-        """Note the record of a control period that is over; it has the inputs and results of the last step."""
+        """Note the record of a control period that is over; it has the inputs and results of the last step.
+
+        Call it after `stepped`, once for each; the record must not change any more.
+        """
         self._add(record)
 
     def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """Note that a plan begins for `setpoint`, None without a publisher; it uses the newest measurement."""
+        """Note that a plan begins at `now_s` for `setpoint`, None without a publisher; it uses the newest measurement.
+
+        The entry is (PLAN, now_s, setpoint). Whether the plan then failed, `began_afresh` says.
+        """
         self._add((PLAN, now_s, setpoint))
 
     def foresaw(self) -> None:
@@ -83,7 +90,7 @@ class Journal:
         self._add((FORESEE,))
 
     def began_afresh(self, now_s: float) -> None:
-        """Note that a plan or forecast failed, and that planning began anew."""
+        """Note that a plan or forecast failed, and that planning began anew at `now_s`."""
         self._add((AFRESH, now_s))
 
     def taught(self, learned: Learned) -> None:
@@ -91,7 +98,8 @@ class Journal:
         self._add((TEACH, learned))
 
     def confirmed(self, what: str) -> None:
-        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong."""
+        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong. Other words are
+        not refused."""
         self._add((CONFIRM, what))
 
     def answered(self, answer: Answer) -> None:
@@ -99,11 +107,14 @@ class Journal:
         self._add((ANSWER, answer))
 
     def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
-        """Note an operator's command, the conditions it was decided on, and whether it was refused."""
+        """Note an operator's command, the conditions it was decided on, and whether it was refused.
+
+        The entry is (COMMAND, name, now_s, is_refused, conditions): not in the order of the arguments.
+        """
         self._add((COMMAND, name, now_s, is_refused, conditions))
 
     def latched(self, fault: Fault) -> None:
-        """Note that a fault was latched that was found outside the step."""
+        """Note that a fault was latched that was found outside the step; the entry has its name as text."""
         self._add((LATCH, str(fault)))
 
     def lost_link(self) -> None:
@@ -123,7 +134,12 @@ class Journal:
         self._add((CONNECTED, memory))
 
     def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
-        """Note the whole state of the core and of the conversation (None without one): a replay may begin here."""
+        """Note the whole state of the core and of the conversation (None without one): a replay may begin here.
+
+        The states of `stepper` and `planner` are copied as plain data. `connection` is taken as it is, as
+        `Connection.memory` gives it. Where the journal is not kept nothing is done. Raises TypeError for a state that
+        `exact.plain` refuses.
+        """
         if self.is_kept:
             self._add((STATE, plain(stepper), plain(planner), connection))
 
@@ -132,7 +148,10 @@ class Journal:
         self._add((MISSING,))
 
     def take(self) -> list[Entry]:
-        """Return the entries since the last `take`, and remove them from the journal."""
+        """Return the entries since the last `take`, and remove them from the journal; empty where none came.
+
+        MISSING among them says that entries before it were lost. What follows can be rerun only from the next snapshot.
+        """
         entries, self._entries = self._entries, []
         return entries
 
@@ -155,13 +174,17 @@ class Packer:
         self._bytes, self._count = bytearray(_NONE), 0
 
     def add(self, entries: Sequence[Entry]) -> None:
-        """Append entries. Raises TypeError, ValueError or OverflowError for one that cannot be written."""
+        """Append entries; none changes nothing.
+
+        Raises TypeError, ValueError or OverflowError for one that cannot be written. Those before it stay. Part of it
+        may stay too, and spoil what follows: drop the packer then, or all that `take` gives next.
+        """
         for entry in entries:
             _ENCODER.encode_into(entry, self._bytes, -1)
             self._count += 1
 
     def take(self) -> bytes:
-        """Return the array's bytes, and begin an empty array."""
+        """Return the array's bytes, and begin an empty array. Without entries they are those of an empty array."""
         _LENGTH.pack_into(self._bytes, 1, self._count)
         packed = bytes(self._bytes)
         self._bytes, self._count = bytearray(_NONE), 0

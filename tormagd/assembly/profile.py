@@ -34,7 +34,8 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """What is known of a device, by its serial number, with an insert and a model, by its fingerprint.
 
     `saved_ns` is CLOCK_REALTIME. The other fields are those of `Learned`, with a standard deviation for the variance.
-    Old profiles have no `lag_s`: it is 0, nothing known of the carriages' lag.
+    Old profiles have no `lag_s`: it is 0, nothing known of the carriages' lag. Bounds are checked where a file is read,
+    not where one is made.
     """
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
@@ -53,8 +54,9 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def learned(self, now_ns: int) -> Learned:
         """Return what is still known of the device at CLOCK_REALTIME `now_ns`.
 
-        Scale and offset become as uncertain as a day makes them, and a sensor's zero saved ZERO_LASTS_S or more from
-        `now_ns` is 0. The factor at a creep and the carriages' lag stay.
+        Scale and offset become as uncertain as a day makes them, even a second after; without covariance. A sensor's
+        zero saved ZERO_LASTS_S or more from `now_ns`, before or after, is 0. The factor at a creep and the carriages'
+        lag stay.
         """
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)

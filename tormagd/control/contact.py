@@ -37,11 +37,15 @@ class Contact:
         raise NotImplementedError
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, to ask the model with for the present force."""
+        """Return the displacement, mm, and the rate, mm/s, to ask the model with for the present force.
+
+        Ask `is_known` first: without it the model's force at this motion is not the hand's.
+        """
         raise NotImplementedError
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether the model can give the present force."""
+        """Tell whether the model can give the present force, for the motion of `motion_now`. NaN in `measured` is
+        not."""
         raise NotImplementedError
 
 
@@ -74,7 +78,10 @@ class Sliding(Contact):
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return MOBILISED_MM and the handle's rate without its sign, as `Contact.motion_now`."""
+        """Return MOBILISED_MM and the handle's rate, mm/s, without its sign, whether or not friction `is_known`.
+
+        A rate below CREEP_MM_S stays as it is, unlike in `planned`.
+        """
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
     def is_known(self, measured: Measured) -> bool:
@@ -89,7 +96,10 @@ class Sliding(Contact):
 
 @final
 class Pressing(Contact):
-    """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest."""
+    """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest.
+
+    `depth_mm` > 0 is the scene's; it is not checked.
+    """
 
     def __init__(self, depth_mm: float) -> None:
         super().__init__(depth_mm, 0.0, slides=False)
@@ -98,7 +108,8 @@ class Pressing(Contact):
         """Return the depth, mm, and the rate, mm/s, that the force is planned for.
 
         `setpoint` is None without a publisher, `measured` before a measurement. A depth or rate that the setpoint
-        states is taken. The others are measured once the finger `is_known`. Before, they are the scene's depth and 0.
+        states is taken, with its sign and unchecked. The others are measured once the finger `is_known`. Before, they
+        are the scene's depth and 0.
         """
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
@@ -111,9 +122,10 @@ class Pressing(Contact):
         return depth_mm, rate_mm_s
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the measured depth, mm, and its rate, mm/s, as `Contact.motion_now`."""
+        """Return the measured depth, mm, 0 or more, and its rate, mm/s, positive inwards, whether or not it
+        `is_known`."""
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether the finger is deep enough: at least the share PRESSED of the scene's depth."""
+        """Tell whether the finger is deep enough: at least the share PRESSED of the scene's depth; not for NaN."""
         return measured.handle.displacement_mm >= PRESSED * self.displacement_mm

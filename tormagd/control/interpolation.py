@@ -16,10 +16,10 @@ MIN_STEP: Final = 1e-200
 
 @final
 class Rising:
-    """A list (n) of finite numbers that rises, with a fast search for a value's place. The order is not checked.
+    """A list (n >= 1) of finite numbers that rises, with a fast search for a value's place. The order is not checked.
 
-    Raises DomainError for a number that is not finite or too large, and for neighbours that differ by less than
-    MIN_STEP. Equal neighbours are allowed.
+    The list is kept, not copied: do not change it. Raises DomainError for a number that is not finite or too large, and
+    for neighbours that differ by less than MIN_STEP. Equal neighbours are allowed. An empty list raises IndexError.
     """
 
     def __init__(self, values: list[float]) -> None:
@@ -36,7 +36,10 @@ class Rising:
         self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     def after(self, value: float) -> int:
-        """Return how many numbers are at most `value`, as `bisect_right` does. Raises DomainError for NaN."""
+        """Return how many numbers are at most `value`, 0..n, as `bisect_right` does.
+
+        Infinity gives one of the ends. Raises DomainError for NaN.
+        """
         values = self.values
         stretch = (value - values[0]) * self._per_unit
         if not stretch >= 0.0:
@@ -50,15 +53,19 @@ class Rising:
 
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x`, linear between the points of `xs` and `ys` (n each).
+    """Return y at `x`, linear between the points of `xs` and `ys` (n each; the lengths are not checked).
 
-    Beyond the points the first or last of `ys` holds. Raises DomainError for NaN.
+    Beyond the points, also for infinity, the first or last of `ys` holds. Of points with an equal x the last counts
+    there. Raises DomainError for NaN.
     """
     return interpolated_before(xs.after(x), x, xs, ys)
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x` as `interpolated`, with the place `after` = `xs.after(x)` already known. NaN is not refused."""
+    """Return y at `x` as `interpolated`, with the place `after` = `xs.after(x)` already known.
+
+    Nothing is checked. It spares the search where two lists are read at one `x`.
+    """
     if after == 0:
         return ys[0]
     if after == len(ys):
@@ -69,9 +76,10 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n), linear between them.
+    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n >= 1), linear between them.
 
-    Beyond the last the last holds. Raises DomainError for NaN.
+    Beyond the last, also for infinity, the last holds. Below 0 nothing is refused, and the result means nothing. Raises
+    DomainError for NaN; empty `ys` raise IndexError.
     """
     if not steps < len(ys) - 1:
         if steps != steps:

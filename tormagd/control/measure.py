@@ -52,8 +52,10 @@ class Measure:
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
         """Measure at `now_s`, one tick after `last_s`: return the new record, and keep it in `measured`.
 
-        A `measurement` that is not new gives the last record again. Updates `sight`, and begins or ends a `leap`. A
-        leap ends when the counts come back, when the device says that it is not homed, or with `needs_homing`.
+        A `measurement` of the last number, or of the last device time, gives the last record again. Updates `sight`,
+        and begins or ends a `leap`. A leap ends when the counts come back, when the device says that it is not homed,
+        or with `needs_homing`. Nothing is refused: call it with a measurement that `is_finite` only, as NaN would stay
+        in the filters.
         """
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
@@ -69,24 +71,29 @@ class Measure:
         return measured
 
     def without_position(self, measured: Measured) -> Measured:
-        """Return `measured` marked as not homed, and keep it as the newest.
+        """Return `measured`, the newest record, marked as not homed, and keep it as the newest.
 
-        The next new measurement brings the device's own word again.
+        A record that is not homed is returned as it is. The places stay in the record. The next new measurement brings
+        the device's own word again.
         """
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
 
     def lose_device(self) -> None:
-        """Drop the newest measurement. `sight` and `leap` stay."""
+        """Drop the newest measurement: `measured` is None, and the next one is taken at rest. `sight` and `leap`
+        stay."""
         self.measured = None
 
     def forget(self) -> None:
-        """Drop the newest measurement, `leap` and `sight`."""
+        """Drop the newest measurement and `leap`, and bring `sight` to its state before the first step."""
         self.measured, self.leap = None, None
         self.sight.forget()
 
     def begin(self, measurement: Measurement) -> None:
-        """Replace the newest record by one of `measurement` at rest: speeds are 0, and the handle has not travelled."""
+        """Replace the newest record by one of `measurement` at rest: speeds are 0, and the handle has not travelled.
+
+        `sight` and `leap` stay. It serves while the origin of the places moves.
+        """
         self.measured = self._first(measurement)
 
     def _first(self, measurement: Measurement) -> Measured:
@@ -145,8 +152,8 @@ class Measure:
     def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
         """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` > 0 after `last`.
 
-        Rates are filtered, with their sign along the way of the handle, or inwards for a finger. A finger's depth is
-        its position, and at least 0 mm.
+        `dt_s` is from the last Sense, on the device's clock. Rates are filtered, with their sign along the way of the
+        handle, or inwards for a finger. A finger's depth is its position, and at least 0 mm. Nothing is kept here.
         """
         before = last.handle
         travel_mm = position_mm - last.handle_mm

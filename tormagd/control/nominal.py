@@ -14,7 +14,8 @@ class Nominal:
     """The nominal element: the force that one model gives over the field. It has no state.
 
     The model is asked only within the range that it was trained on. Without `has_rate`, `now` and `planned` always give
-    `only`, the curve for the portrait's motion.
+    `only`, the curve for the portrait's motion. The share of iron, `cip_percent`, is the caller's to hold within the
+    model's range. Raises DomainError for one that is not finite.
     """
 
     def __init__(self, model: ForceModel, contact: Contact, cip_percent: float, has_rate: bool) -> None:
@@ -31,7 +32,10 @@ class Nominal:
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        """Return the model's force over the field for the handle's present motion."""
+        """Return the model's force over the field for the handle's present motion, held within the model's range.
+
+        Without `has_rate` that is `only`, and `measured` is not looked at. Raises DomainError for a motion of NaN.
+        """
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.motion_now(measured)
@@ -43,7 +47,9 @@ class Nominal:
         """Return the model's force over the field for the motion to plan for, and what of it is out of range.
 
         `setpoint` is None without a publisher, `measured` before a measurement. Each `Outside` names a quantity of the
-        motion that the model does not know, the value asked for and the value used. Without `has_rate` there is none.
+        motion that the model does not know, the value asked for and the value used. Of two the displacement comes
+        first; none gives an empty tuple, and so does a scene without `has_rate`. Raises DomainError for a motion of
+        NaN.
         """
         if not self._has_rate:
             return self.only, ()
@@ -57,7 +63,10 @@ class Nominal:
         return curve, outside
 
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
-        """Return the model's force over the field at this displacement, mm, and rate, mm/s, each held within the
-        model's range."""
+        """Return the model's force over the field at this displacement, mm, and rate, mm/s.
+
+        Each is held within the model's range, infinity too; the displacement of a handle is always the mobilised one.
+        The curve tells the values used. Raises DomainError for NaN.
+        """
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

@@ -55,7 +55,7 @@ class Leap(Value):
         """Tell whether both carriages read places that they can have reached by `now_s` from before the step.
 
         The leap was noise on a line then. They can have gone LEAP_MM, and at LEAP_SPEEDS times `full_speed_mm_s`, one
-        carriage's.
+        carriage's. The longer it lasts, the more they can have gone. NaN has not come back.
         """
         max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
@@ -72,9 +72,10 @@ def leap_between(
 ) -> Leap | None:
     """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None.
 
-    `last` was found at `seen_s`, `measured` at `now_s`. The step took the longer of two times, by the device's clock
-    and by the host's. In it a carriage goes LEAP_MM, and at LEAP_SPEEDS times `full_speed_mm_s`, one carriage's. NaN
-    counts as a leap.
+    `last` was found at `seen_s`, `measured` at `now_s`, both on the host's clock. The step took the longer of two
+    times, by the device's clock and by the host's. In it a carriage goes LEAP_MM, and at LEAP_SPEEDS times
+    `full_speed_mm_s`, one carriage's. NaN counts as a leap. That both records are of a homed device is the caller's to
+    know: homing moves the places.
     """
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
@@ -87,20 +88,20 @@ def leap_between(
 def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
     """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`.
 
-    A place more than OVERRUN_MM outside the stroke is impossible, and NaN. A `closed_mm` over CLOSED_END_MM counts as
-    that. Whether it is homed is the caller's to know.
+    A place more than OVERRUN_MM outside the stroke is impossible, and NaN. One carriage is enough. A `closed_mm` over
+    CLOSED_END_MM counts as that. Whether it is homed is the caller's to know.
     """
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     return not (min_mm <= measured.left_mm <= max_mm and min_mm <= measured.right_mm <= max_mm)
 
 
 def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm: float) -> bool:
-    """Tell whether an end switch of a homed device contradicts its carriage's place, for gaps from `closed_mm` to
-    `open_mm`.
+    """Tell whether an end switch contradicts its carriage's place, for gaps from `closed_mm` to `open_mm`.
 
     `switches` are bits of `Switches`, of about the time of `measured`. An open switch is to be closed at the open end,
     and only there. A closed switch is not to be closed but near the closed end; there it may be open, as no scene goes
-    on to it. NaN contradicts nothing: `is_outside` finds it.
+    on to it. One of the four is enough. NaN contradicts nothing: `is_outside` finds it. Whether the device is homed is
+    the caller's to know.
     """
     inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
     is_open, is_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0

@@ -24,7 +24,10 @@ class Wall(Value):
         self.friction_N: Final = friction_N
 
     def force_N(self, handle_mm: float) -> float:
-        """Return the force, N, on a handle that pushes on and is at `handle_mm`."""
+        """Return the force, N, on a handle that pushes on and is at `handle_mm`.
+
+        In front of the wall that is the friction alone. Nothing is checked: NaN gives NaN.
+        """
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
 
 
@@ -76,7 +79,8 @@ class TimedSetpoint(Value):
         """Return the force, N, that is asked for a handle with this `travel`: its `is_pushing` decides, not its rate.
 
         A handle that withdraws is asked for `withdraw_N`. Where that is None, it is asked for the wall's friction, or
-        for `force_N` without a wall: a brake cannot push the handle back.
+        for `force_N` without a wall: a brake cannot push the handle back. Neither the preview nor the stamp's age
+        counts here, and nothing is held within what the device gives.
         """
         if not travel.is_pushing and self.withdraw_N is not None:
             return self.withdraw_N
@@ -91,7 +95,10 @@ class TimedSetpoint(Value):
 
     @property
     def preview_slope_N_s(self) -> float:
-        """The mean slope of the preview, N/s. Ask only where there is a preview."""
+        """The mean slope of the preview, N/s, from `force_N` to its last force.
+
+        Ask only where there is a preview: without one it raises IndexError.
+        """
         return (self.preview_N[-1] - self.force_N) / self.preview_s
 
 
@@ -180,17 +187,17 @@ class Measured(Value):
 
     @property
     def gap_mm(self) -> float:
-        """Distance between the magnets, mm."""
+        """Distance between the magnets, mm; meaningless unless `is_homed`."""
         return self.left_mm + self.right_mm
 
     @property
     def gap_speed_mm_s(self) -> float:
-        """How fast the gap opens, mm/s."""
+        """How fast the gap opens, mm/s, filtered; negative while it closes."""
         return self.left_mm_s + self.right_mm_s
 
     @property
     def skew_mm(self) -> float:
-        """Place of the left carriage minus that of the right, mm."""
+        """Place of the left carriage minus that of the right, mm; meaningless unless `is_homed`."""
         return self.left_mm - self.right_mm
 
 

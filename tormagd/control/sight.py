@@ -21,7 +21,8 @@ SHOWN_S: Final = 0.1
 class Sight:
     """Whether the loop is blind, told from the times of steps and of new States; at first it is not.
 
-    It keeps when a State was last new, and when the last stall of the loop ended and how long it was.
+    It keeps when a State was last new, and when the last stall of the loop ended and how long it was. `period_s` is the
+    control period, > 0; times are the host's, s.
     """
 
     seen_s: float = math.inf
@@ -39,12 +40,12 @@ class Sight:
         self._blind_s: Final = max(BLIND_S, BLIND_PERIODS * period_s)
 
     def forget(self) -> None:
-        """Return to the state before the first step."""
+        """Return to the state before the first step: not blind, no State seen, and no stall."""
         self.seen_s, self.stalled_s, self.stall_s = math.inf, -math.inf, 0.0
         self.is_blind = self.was_blind = False
 
     def has_stalled(self, now_s: float) -> bool:
-        """Tell whether a stall ended within SHOWN_S before `now_s`."""
+        """Tell whether a stall ended within SHOWN_S before `now_s`; not before the first stall."""
         return now_s - self.stalled_s < SHOWN_S
 
     def is_waiting(self, now_s: float) -> bool:
@@ -58,8 +59,9 @@ class Sight:
         """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind` and `was_blind`.
 
         `is_new` says that a State has come since the last step. The loop is blind after no new State for longer than
-        BLIND_S and BLIND_PERIODS periods. A step that comes later than that ends a stall, which is noted. The loop is
-        then blind until a later step finds a new State.
+        BLIND_S and BLIND_PERIODS periods; waiting for the very first does not make it blind. A step that comes later
+        than that ends a stall, which is noted, before the first State too. The loop is then blind until a later step
+        finds a new State.
         """
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:
@@ -72,5 +74,6 @@ class Sight:
 
 
 def unsensed_s(period_s: float) -> float:
-    """Return the greatest age of a Sense. With an older one, force and handle count as not measured."""
+    """Return the greatest age of a Sense, s, at this control period. With an older one, force and handle count as not
+    measured."""
     return max(UNSENSED_S, BLIND_PERIODS * period_s)

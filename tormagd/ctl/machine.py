@@ -62,7 +62,9 @@ class Machine:
     def taken(self) -> Taken:
         """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi).
 
-        Without such a file ticks are 0, and the time waited is None.
+        `stolen` and `ticks` are of all processors since boot, in the kernel's clock ticks. Both are 0 without
+        /proc/stat; the time waited is None without /proc/pressure/cpu. Raises ValueError for a first line of /proc/stat
+        that is not the kernel's.
         """
         first = (self.text("/proc/stat") or "").split("\n", 1)[0]
         fields = [int(field) for field in first.split()[1:9]]  # beyond: guests, who are counted as users already

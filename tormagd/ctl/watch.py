@@ -149,8 +149,10 @@ class StatusWatch:
     def finish(self, sent: int) -> Fate:
         """Wait up to ARRIVAL_S until the daemon has taken all `sent` setpoints, and return what became of them.
 
-        Raises CommandError (REFUSED) where under MIN_TAKEN of them were taken, the force never came, or was held back
-        later. Raises CommandError (FAULT) where the device is in FAULT.
+        Call it once, after the last setpoint; those of the source before this watch do not count. Raises CommandError
+        (REFUSED) where under MIN_TAKEN of them were taken, the force never came, or was held back later. Where no
+        `look` saw a status, only `held_back` is asked whether it came. Raises CommandError (FAULT) where the device is
+        in FAULT, and as `Client.status`.
         """
         until_s = time.monotonic() + ARRIVAL_S
         while True:

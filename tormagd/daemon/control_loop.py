@@ -38,7 +38,9 @@ class ControlLoop:
     def drive(self, beat: Beat, plan: Plan) -> None:
         """Step the core along `plan` with the newest measurement, and send its output to the device.
 
-        Keeps output, plan and measurement for telemetry, and records the tick in journal and timing.
+        Without a device the measurement is None: the core is stepped all the same, and the connection may open its
+        port. Keeps output, plan and measurement for telemetry. Notes in the journal that a step ran, not the tick's
+        record. Records the beat's times in `timing`.
         """
         now_s = time.monotonic()  # now, not when the beat began: a stall within the beat counts, too
         self.used, self.measurement = plan, self._connection.measurement

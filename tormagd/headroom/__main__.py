@@ -82,14 +82,17 @@ async def _in_real_time(
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Return mean, p50, p99, p99.9 and the largest of `values`, rounded to 0.1; `values` has one at least."""
+    """Return `mean`, `p50`, `p99`, `p999` and `max` of `values`, in their unit, rounded to 0.1.
+
+    `values` has one at least: an empty list raises IndexError. Between two values a quantile is linear.
+    """
     return {"mean": round(float(np.mean(values)), 1)} | {
         name: round(float(np.percentile(values, share)), 1) for name, share in SHARES.items()
     }
 
 
 def build() -> str:
-    """Return which build of the core this interpreter runs: `compiled` or `interpreted`."""
+    """Return which build of the core this interpreter runs: `compiled` or `interpreted`. Warns as `settle`."""
     return "compiled" if settle().is_compiled else "interpreted"
 
 

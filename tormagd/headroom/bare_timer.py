@@ -31,7 +31,9 @@ class Lateness(NamedTuple):
 async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
     """Call `on_beat` in every period until `ended` is set; missed beats are told in its arguments.
 
-    The caller has asked for the thread's scheduling (`prepare`). Freezes the garbage collector's present objects.
+    The caller has asked for the thread's scheduling (`prepare`). Freezes the garbage collector's present objects, for
+    good. What `on_beat` raises, the event loop only logs; the beat goes on. Cancelled, it leaves the timer open. Raises
+    OSError where the kernel gives no timer.
     """
     heartbeat = Heartbeat(period_ns)
 
@@ -51,8 +53,9 @@ async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
 async def lateness(realtime: RealTime, rate_hz: int, seconds: float) -> Lateness:
     """Measure for `seconds` how late a bare timer of `rate_hz` beats: return each beat's lateness, us.
 
-    WARM_UP_BEATS are left out. Returns also how many beats were missed, and what scheduling of `realtime` the kernel
-    refused. The thread keeps what it was granted.
+    WARM_UP_BEATS are left out, and come before the `seconds`. Returns also how many beats were missed, and what
+    scheduling of `realtime` the kernel refused. The thread keeps what it was granted, and the process its frozen
+    garbage. Raises OSError as `beat`.
     """
     not_granted = prepare(realtime)
     late_us: list[float] = []

@@ -31,9 +31,10 @@ BESIDE_PLANS = ("thesis",)
 def named(
     solver: str, step_mT: float | None = None, neighbours: int | None = None, reason: str = "named by the scene"
 ) -> Choice:
-    """Return the choice of a search by its name; None stands for its usual grid step or number of neighbours.
+    """Return the choice of a search by its name; None stands for its usual grid step, mT, or number of neighbours.
 
-    Raises `DomainError` for an unknown name, and for a setting that the search does not have.
+    Raises `DomainError` for an unknown name, and for a setting that the search does not have. The value of a setting is
+    not checked here, but by `build`.
     """
     require_that(solver in _USUAL, "solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
     settings = []
@@ -47,7 +48,8 @@ def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel
     """Build the chosen search over a range of fields. `rises`: every curve of the model rises over the whole range.
 
     "newton" is a RisingSearch, "nearest" and "torch" are a NearestFieldSearch, "thesis" is RowByRow. "torch" and
-    "thesis" import torch, and hold it to one thread. Raises `DomainError` where the settings do not fit the range, and
+    "thesis" import torch, and hold it to one thread, for the whole process. They ask `model`; the others ask the curve
+    that they are given. Raises `DomainError` where the settings or the name do not fit, the range does not rise, and
     where torch is needed and not installed. It is raised, too, for "newton" without `rises`, and for "thesis" where the
     model states no mean error.
     """

@@ -62,8 +62,9 @@ class NearestFieldSearch:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """Return the field for `force_N`; of several the one nearest `last_field_mT`, or the least where that is None.
 
-        A force out of reach gets the field that comes nearest; `reach` says so. `iterations` is 2. Raises `DomainError`
-        for numbers that are not finite or too large.
+        A force out of reach gets the field that comes nearest; `reach` says so. A last field may lie out of range.
+        `iterations` is 2. Keeps nothing from call to call. Raises `DomainError` for numbers that are not finite or too
+        large.
         """
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
         forces_N = curve.forces_N(self._fields_mT) if self._batch is None else self._batch(curve)

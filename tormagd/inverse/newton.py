@@ -40,7 +40,9 @@ class RisingSearch:
         """Return the field for `force_N`. The search begins at `last_field_mT`, or at the least field where it is None.
 
         A last field out of range counts as the end that it lies beyond. A force out of reach gets the nearer end of the
-        range; `reach` says so. Raises `DomainError` for numbers that are not finite or too large.
+        range; `reach` says so. `iterations` is 1 to a little over MAX_EVALUATIONS. Keeps nothing from call to call. A
+        curve that falls somewhere is not noticed: any of its roots, or an end, may be the answer. Raises `DomainError`
+        for numbers that are not finite or too large.
         """
         low, high = self._low_mT, self._high_mT
         span = high - low

@@ -19,7 +19,8 @@ torch.set_num_threads(1)  # a second thread costs more than it saves at these si
 def batch(model: ForceModel, fields_mT: Floats) -> Batch:
     """Return a function from a curve to the forces of `model`, N, at all `fields_mT` (n), in one pass in torch.
 
-    Of the curve it takes displacement, rate and share of iron only.
+    Of the curve it takes displacement, rate and share of iron only, unchecked. The weights and fields are copied: later
+    changes do not count. Two threads must not call it at once.
     """
     network, rows = to_network(model), torch.zeros((len(fields_mT), len(FEATURES)), dtype=torch.float64)
     rows[:, FIELD] = torch.from_numpy(fields_mT)
@@ -38,7 +39,7 @@ def batch(model: ForceModel, fields_mT: Floats) -> Batch:
 def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
     """Return a function from a curve and one field, mT, to the force of `model`, N: a pass in torch for one row.
 
-    Of the curve it takes displacement, rate and share of iron only.
+    Of the curve it takes displacement, rate and share of iron only. Nothing is checked. The weights are copied.
     """
     network = to_network(model)
 
@@ -53,9 +54,10 @@ def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
 class RowByRow:
     """The thesis's search: one field of a grid after the other from the least, until |F - NN| <= epsilon.
 
-    `predict_N` evaluates a row: `row` of a model, as the thesis did it, or the curve's own `force_N`. Where no row is
-    within `epsilon_N`, the nearest is the answer. The search knows no continuity: the last field is checked, not used.
-    Raises `DomainError` unless `epsilon_N` is a finite number, 0 or more.
+    `fields_mT` (n >= 1) rise, which is not checked. `predict_N` evaluates a row: `row` of a model, as the thesis did
+    it, or the curve's own `force_N`. Where no row is within `epsilon_N`, the nearest is the answer. The search knows no
+    continuity: the last field is checked, not used. Raises `DomainError` unless `epsilon_N` is a finite number, 0 or
+    more.
     """
 
     def __init__(self, fields_mT: Floats, epsilon_N: float, predict_N: Callable[[ForceCurve, float], float]) -> None:
@@ -68,8 +70,8 @@ class RowByRow:
         """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest.
 
         `reach` is INSIDE where a row is within epsilon, or rows lie on both sides. It is BELOW where all rows give more
-        than `force_N`, ABOVE where none does. `last_field_mT` may be None; it is checked and not used. Raises
-        `DomainError` for numbers that are not finite or too large.
+        than `force_N`, ABOVE where none does. `iterations` counts the rows evaluated. `last_field_mT` may be None; it
+        is checked and not used. Raises `DomainError` for numbers that are not finite or too large.
         """
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0

@@ -78,8 +78,8 @@ class FieldSolver(Protocol):
 def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float) -> float:
     """Check the arguments of a search; return the field that its answer should be near, mT.
 
-    That is the last field, or `least_mT`, the opener gap, where it is None. Raises `DomainError` naming the field or
-    the force that is not finite, or too large.
+    That is the last field, or `least_mT`, the opener gap, where it is None. It is not held within the search's range.
+    Raises `DomainError` naming the field or the force that is not finite, or too large.
     """
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):
@@ -89,13 +89,19 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
 
 
 def tie_N(curve: ForceCurve) -> float:
-    """Return the difference of force up to which two forces of `curve` count as equal: its rounding error."""
+    """Return the difference of force, N, up to which two forces of `curve` count as equal: its rounding error.
+
+    It is the same for all fields of the curve.
+    """
     return TIE * curve.magnitude_N
 
 
 def answer(
     curve: ForceCurve, field_mT: float, force_N: float, predicted_N: float, iterations: int, reach: Reach
 ) -> FieldSolution:
-    """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence."""
+    """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence.
+
+    The confidence counts how far the two forces are apart. Nothing is checked, and the curve is not evaluated.
+    """
     trust = curve.confidence(field_mT, force_N - predicted_N)
     return FieldSolution(field_mT, predicted_N, trust, iterations, reach)

@@ -47,7 +47,10 @@ _SCALAR = SimpleNamespace(
 
 
 def functions(value: Any) -> SimpleNamespace | ModuleType:
-    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for an array."""
+    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for an array.
+
+    For a float there are those of `_SCALAR` only. They raise ValueError where numpy's give NaN or infinity.
+    """
     return _SCALAR if isinstance(value, float | int) else np
 
 
@@ -67,7 +70,11 @@ class BrakeCurve(NamedTuple):
         return cls(wall, 1.0 - 0.5 * wall * body_force, wall * (1.0 + 1.5 * body_force))
 
     def compression(self, load: Real) -> Real:
-        """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq. 29)."""
+        """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq. 29).
+
+        It may be over MAX_COMPRESSION, and over 1, where the model does not hold: keep the load within `load` of
+        MAX_COMPRESSION.
+        """
         fn = functions(load)
         p = 1.0 - self.a * load
         larger = fn.sqrt(p * p + 2.0 * self.b * load) + abs(p)
@@ -76,12 +83,16 @@ class BrakeCurve(NamedTuple):
         return compression
 
     def load(self, compression: Real) -> Real:
-        """Return the load y that compresses by eps: the inverse of `compression`."""
+        """Return the load y that compresses by eps, 0 to MAX_COMPRESSION: the inverse of `compression`."""
         load: Real = 0.5 * compression * (2.0 + compression) / (self.b + self.a * compression)
         return load
 
     def force(self, compression: Real, load: Real) -> Real:
-        """Return the force phi (Eq. 33, 34) from a load and the compression that this load gives."""
+        """Return the force phi (Eq. 33, 34) from a load and the compression, below 1, that this load gives.
+
+        That both belong together is not checked. A float compression of 1 or more raises ValueError, an array gives
+        infinity or NaN.
+        """
         fn = functions(load)
         stretch = 1.0 - compression
         elastic: Real = fn.expm1(-4.0 * fn.log1p(-compression))

@@ -36,8 +36,8 @@ def require_that(condition: bool, variable: str, value: object, allowed: str) ->
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:
     """Raise `DomainError`, naming `variable`, unless `value` or every element of it is in [low, high]; NaN never is.
 
-    Of an array the error names the first element outside. It is raised, too, for a value that is no float, int or array
-    of float32 or float64.
+    Of an array the error names the first element outside; an empty array passes. It is raised, too, for a value that is
+    no float, int or array of float32 or float64. NumPy's whole numbers are none of these.
     """
     if isinstance(value, float | int):
         if low <= value <= high:

@@ -40,19 +40,23 @@ class ThesisFieldLaw:
     "Smallest and largest gap for which the law holds, mm."
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
-        """Return the radial moment at a gap, T m."""
+        """Return the radial moment at a gap, T m. Raises `DomainError` for a gap outside 45..95 mm, and for NaN."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return _TM_PER_MT_MM * (_EQ7_C1 * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P) + _EQ7_C2)
 
     def gap_mm(self, radial_moment_Tm: Real) -> Real:
-        """Return the gap that gives a radial moment, mm."""
+        """Return the gap that gives a radial moment, mm. Raises `DomainError` for a moment that no gap of 45..95 mm
+        gives."""
         _require_moment(radial_moment_Tm, self)
         # abs(): the weakest moment itself, times 1e6, may round to just under c2
         excess = abs(radial_moment_Tm / _TM_PER_MT_MM - _EQ7_C2)
         return _EQ7_MAX_MM - _power(excess / _EQ7_C1, 1.0 / _EQ7_P)
 
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
-        """Return the slope of the radial moment at a gap, T m / mm, negative."""
+        """Return the slope of the radial moment at a gap, T m / mm, negative, and 0 at 95 mm.
+
+        Raises `DomainError` for a gap outside 45..95 mm.
+        """
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return -_TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 1.0)
 
@@ -75,17 +79,21 @@ class PowerFieldLaw:
         require("exponent", self.exponent, -6.0, -0.1)
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
-        """Return the radial moment at a gap, T m."""
+        """Return the radial moment at a gap, T m. Raises `DomainError` for a gap outside 1 mm to 10 m, and for NaN."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * _power(gap_mm, self.exponent)
 
     def gap_mm(self, radial_moment_Tm: Real) -> Real:
-        """Return the gap that gives a radial moment, mm."""
+        """Return the gap that gives a radial moment, mm. Raises `DomainError` for a moment that no gap of 1 mm to 10 m
+        gives."""
         _require_moment(radial_moment_Tm, self)
         return _power(radial_moment_Tm / self.coefficient, 1.0 / self.exponent)
 
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
-        """Return the slope of the radial moment at a gap, T m / mm, negative."""
+        """Return the slope of the radial moment at a gap, T m / mm, negative.
+
+        Raises `DomainError` for a gap outside 1 mm to 10 m.
+        """
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * self.exponent * _power(gap_mm, self.exponent - 1.0)
 
@@ -101,7 +109,8 @@ Every method takes a float or an array and returns the same kind and shape. It r
 def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_m: float) -> Real:
     """Return the radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq. 6 with Eq. 8's permeability).
 
-    Raises `DomainError` unless 0 <= a <= 1e6 T m, 1 <= mu_r <= 1000 and 10 um <= R <= 1 m.
+    `radial_moment_Tm` is a float or an array, whose shape and type the result keeps. Raises `DomainError` unless 0 <= a
+    <= 1e6 T m, 1 <= mu_r <= 1000 and 10 um <= R <= 1 m.
     """
     require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e6)
     require("relative_permeability", relative_permeability, 1.0, 1e3)
@@ -110,7 +119,8 @@ def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_
 
 
 def _require_moment(radial_moment_Tm: Real, law: FieldLaw) -> None:
-    """Raise `DomainError` for a radial moment that no gap in the law's range gives."""
+    """Raise `DomainError` for a radial moment that no gap in the law's range gives, and for NaN; of an array for any
+    element."""
     nearest_mm, farthest_mm = law.gap_range_mm
     weakest_Tm, strongest_Tm = law.radial_moment_Tm(farthest_mm), law.radial_moment_Tm(nearest_mm)
     require("radial_moment_Tm", radial_moment_Tm, weakest_Tm, strongest_Tm)

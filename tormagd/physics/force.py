@@ -71,14 +71,18 @@ class Elastomer:
 
 
 def max_radial_moment_Tm(elastomer: Elastomer, geometry: Geometry) -> float:
-    """Return the largest admissible radial moment, T m: it compresses the elastomer to lambda1 = 0.05."""
+    """Return the largest admissible radial moment, T m: it compresses the elastomer to lambda1 = 0.05.
+
+    `brake_force_N` refuses more, `Reduced.force` does not.
+    """
     return reduced(elastomer, geometry).max_moment_Tm
 
 
 def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34).
+    """Return the kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34), 0 without field.
 
-    Raises `DomainError` unless the radial moment is from 0 to `max_radial_moment_Tm`.
+    A float gives a float, an array one of its shape and type. Raises `DomainError` unless the radial moment is from 0
+    to `max_radial_moment_Tm`.
     """
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
@@ -98,12 +102,15 @@ class Reduced(NamedTuple):
     max_moment_Tm: float
 
     def load(self, moment_Tm: Real) -> Real:
-        """Return the dimensionless load y at a radial moment."""
+        """Return the dimensionless load y at a radial moment, T m; nothing is checked."""
         root = self.load_root_per_Tm * moment_Tm
         return root * root
 
     def force(self, moment_Tm: Real) -> Real:
-        """Return the friction force at the roller, N, at a radial moment."""
+        """Return the friction force at the roller, N, at a radial moment of 0 to `max_moment_Tm`, T m.
+
+        Nothing is checked: above that the force means nothing, and a float may raise ValueError.
+        """
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
 

@@ -38,17 +38,21 @@ class Friction(Value):
         self.stribeck_speed_mm_s: Final = stribeck_speed_mm_s
 
     def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
-        """Return the steady level g(v) of the dry part at a speed, N."""
+        """Return the steady level g(v) of the dry part at a speed, N; the speed's sign does not matter.
+
+        `kinetic_N` >= 0 is the level of a fast handle. Nothing is checked.
+        """
         ratio = speed_mm_s / self.stribeck_speed_mm_s
         return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))
 
     def advance(self, deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> tuple[float, float]:
         """Return force, N, and deflection, mm, at the end of a step of `dt_s` at constant speed and kinetic level.
 
-        Exact in the deflection for any `dt_s`. A deflection above what the level now carries (the field fell) slips
-        back to that level first, so the dry force never exceeds `level_N`. Passive: the deflection moves with the
-        speed, so the returned force times the step's displacement is at least the exact work. The hand gets back sigma0
-        / 2 times the deflection squared at most. At a level of 0 the deflection is 0, and the force viscous alone.
+        The caller keeps the deflection, 0 at first. Exact in the deflection for any `dt_s` >= 0. A deflection above
+        what the level now carries (the field fell) slips back to that level first, so the dry force never exceeds
+        `level_N`. Passive: the deflection moves with the speed, so the returned force times the step's displacement is
+        at least the exact work. The hand gets back sigma0 / 2 times the deflection squared at most. At a level of 0 the
+        deflection is 0, and the force viscous alone. Nothing is checked: NaN stays in the deflection.
         """
         viscous_N = self.viscous_N_s_mm * speed_mm_s
         reach_mm = self.level_N(speed_mm_s, kinetic_N) / self.presliding_stiffness_N_mm

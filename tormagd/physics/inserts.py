@@ -45,7 +45,7 @@ class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def thesis_estimate_N(self) -> float:
-        """The thesis's estimate, N. Raises `DomainError` where there is none."""
+        """The thesis's estimate of the force range, N. Raises `DomainError` where there is none."""
         if self.estimate_N is None:
             raise DomainError("estimate_N", None, "stated for the thesis's inserts only")
         return self.estimate_N
@@ -64,7 +64,8 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
     """One fabricated insert. Fractions are of volume; the shear modulus is without field.
 
     None for friction stands for the matrix's, for permeability for that of Eq. 5; `measured` is None where the force
-    range has not been measured.
+    range has not been measured. Bounds are checked where the registry is read, not where one is made; whether the
+    fractions leave room for the matrix is not.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
@@ -113,9 +114,10 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def masses_g(self) -> dict[str, float]:
-        """Mass of each content in 100 cc, g: matrix, cip, slacker, thinner. The matrix fills what the others leave.
+        """Mass of each content in 100 cc, g: `matrix`, `cip`, `slacker`, `thinner`.
 
-        Raises `DomainError` where the insert's matrix is not in `MATRICES`.
+        The matrix fills what the others leave; its mass is negative where they leave nothing. Raises `DomainError`
+        where the insert's matrix is not in `MATRICES`.
         """
         matrix_fraction = 1.0 - self.cip_fraction - self.slacker_fraction - self.thinner_fraction
         return {
@@ -137,6 +139,9 @@ INSERTS = {item.name: item for item in _FILE.insert}
 
 
 def insert(name: str) -> Insert:
-    """Return an insert by its name, such as "MRE-50-40". Raises `DomainError` listing the names if there is none."""
+    """Return an insert by its name, such as "MRE-50-40"; capitals count.
+
+    Raises `DomainError` listing the names if there is none.
+    """
     require_that(name in INSERTS, "insert", repr(name), "one of " + ", ".join(INSERTS))
     return INSERTS[name]

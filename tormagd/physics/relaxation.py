@@ -41,8 +41,9 @@ class PronyStep(Value):
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
         """Return the force, N, and the state at the end of a step, from the state at its beginning.
 
-        `driving_N` is the driving force at the end. Raises `DomainError` if it is not finite or beyond MAX_FORCE_N, or
-        if the state is not of as many branches as the series.
+        `driving_N` is the driving force at the end. The force may be below 0; the given state stays as it is. Raises
+        `DomainError` if `driving_N` is not finite or beyond MAX_FORCE_N, or if the state is not of as many branches as
+        the series. The state's forces are not checked: NaN stays.
         """
         if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
             require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
@@ -58,7 +59,10 @@ class PronyStep(Value):
         return force_N, tuple(following)
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
-        """Return the step, of equal length, of a series with equal times and other fractions."""
+        """Return the step, of equal length, of a series with equal times and other fractions.
+
+        There are as many `fractions` as before, with a sum below 1: neither is checked here.
+        """
         return PronyStep(fractions, self.decays, self.gains)
 
 

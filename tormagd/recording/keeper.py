@@ -169,8 +169,10 @@ class Keeper:
 
 
 def _key(file: str) -> bytes:
-    """Read the seals' key from `file`; empty, and a warning, where it cannot be read: a box is worth more than its
-    seal."""
+    """Read the seals' key from `file`, without surrounding white space; empty, without a warning, for an empty name.
+
+    Where it cannot be read, or is no key, it is empty, and a warning goes to stderr. A box is worth more than its seal.
+    """
     from tormagd.recording.seal import read_key
 
     try:

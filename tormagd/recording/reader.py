@@ -75,9 +75,9 @@ def readable(name: str) -> Iterator[None]:
 def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Callable[[Sent], None]) -> bool:
     """Read an MCAP file from its beginning: each message goes to `message`, any other record, also a chunk, to `take`.
 
-    Returns whether the file ends as it should; False for one cut short. `take` gets END last, which is no MCAP record,
-    where it does. Raises RecordingError, naming the file `name`: not MCAP, empty, damaged, or refused by a callback
-    that raises UNREADABLE (ValueError among them).
+    `file` has to stand at byte 0, and is left where reading ended. Returns whether the file ends as it should; False
+    for one cut short. `take` gets END last, which is no MCAP record, where it does. Raises RecordingError, naming the
+    file `name`: not MCAP, empty, damaged, or refused by a callback that raises UNREADABLE (ValueError among them).
     """
     last = -1
     with readable(name):

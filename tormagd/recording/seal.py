@@ -178,7 +178,11 @@ class _Check:
         "The first thing that is not as it was sealed."
 
     def take(self, record: Record) -> None:
-        """Check the next record in the file's order, and note the first thing that is not as it was sealed."""
+        """Check the next record in the file's order, and note the first thing that is not as it was sealed.
+
+        Give it every record of `records`, END too. What is wrong with a seal is noted, not raised. Raises McapError,
+        ValueError or struct.error for metadata or a footer that cannot be parsed.
+        """
         if record.opcode == END:
             self._is_over = True
         elif record.opcode == SEAL:

@@ -25,14 +25,18 @@ class Thinning:
         self._faults: Any = ()
 
     def happened(self, t_ns: int) -> None:
-        """Keep all ticks from AROUND_S before to AROUND_S after `t_ns`."""
+        """Keep all ticks from AROUND_S before to AROUND_S after `t_ns`, ns since 1970.
+
+        Those that wait are returned by the next `take`. Nothing is kept that `take` has already thinned out.
+        """
         self._full_to_ns = max(self._full_to_ns, t_ns + AROUND_NS)
 
     def take(self, tick: Tick) -> list[Tick]:
-        """Add a tick, and return the ticks that are to be written now, in their order; others wait for AROUND_S.
+        """Add a tick, later than those before, and return the ticks to be written now, in their order.
 
-        A new set of faults in the tick, or a mark noted by `happened`, keeps all ticks around it: all that wait are
-        then returned.
+        The others wait for AROUND_S; after the last tick `rest` gives them. A new set of `faults` in the message, or a
+        mark noted by `happened`, keeps all ticks around it. All that wait are then returned. A message without `faults`
+        has none.
         """
         if self.every == 1:
             return [tick]
@@ -50,7 +54,10 @@ class Thinning:
         return given
 
     def rest(self, every: int) -> list[Tick]:
-        """Return one of `every` of the ticks that wait, and forget them all."""
+        """Return one of `every` of the ticks that wait, in their order, and forget them all; 1 returns all.
+
+        Which of them are kept goes on from the ticks before.
+        """
         given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
         self._waiting.clear()
         return given

@@ -79,8 +79,9 @@ def _key(configured: Config | None) -> bytes:
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
     """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it.
 
-    Returns plant, faults and settings, and what happened: `recorded`, `simulated`, and `instead`, None without
-    settings. Raises ReplayError for a setting, plant or fault that cannot be used, and as `script` and `rehearse`.
+    Returns `plant`, `faults` and `settings`, and what happened: `recorded`, `simulated`, and `instead`, None without
+    settings. Each of the three is a dict with the fields of `Happened`. Raises ReplayError for a setting, plant or
+    fault that cannot be used, and as `script` and `rehearse`.
     """
     todo = script(known.columns, box.entries)
     config = changed(known.config, options.settings)

@@ -41,7 +41,10 @@ class Explanation(NamedTuple):
 
     @property
     def clears(self) -> str:
-        """The commands that clear a fault with this explanation and allow `enable` again, in words."""
+        """The commands that clear a fault with this explanation and allow `enable` again, in words.
+
+        That is "clear-fault", or "clear-fault, then home". A limit needs neither: for one this means nothing.
+        """
         return "clear-fault" if self.position is Position.KEPT else "clear-fault, then home"
 
 

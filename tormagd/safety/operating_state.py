@@ -144,7 +144,8 @@ class SafetyState(Value):
         return self.operating_state is OperatingState.ENABLED or self.operating_state is OperatingState.PAUSED
 
     def ask(self, request: DeviceRequest) -> "SafetyState":
-        """Return this state with a new request to the device, under the next request number."""
+        """Return this state with a new request to the device, under the next request number; NONE would be numbered,
+        too."""
         return self.replaced(request=request, request_number=self.request_number + 1)
 
 
@@ -334,7 +335,8 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
     """Return `state` in FAULT with `faults` latched and the device asked to open; `state` itself where none is new.
 
     New faults stand behind those latched before, and among themselves in the order of `Fault`: causes before their
-    consequences. Faults of LOST_POSITION set `needs_homing`.
+    consequences. A new fault in FAULT asks the device again, under a new number. Faults of LOST_POSITION set
+    `needs_homing`.
     """
     if not faults:  # as nearly always, a thousand times a second
         return state
@@ -354,7 +356,8 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
     """Return `state` after the device said whether it is homed: a device that is not homed ends `needs_homing`.
 
-    Such a device has begun to home or was reset, so that its next HOMED is of a new origin.
+    Such a device has begun to home or was reset, so that its next HOMED is of a new origin. In any other case it is
+    `state` itself. Give it the device's own word, not that of a record marked as not homed.
     """
     return state if is_homed or not state.needs_homing else state.replaced(needs_homing=False)
 
@@ -397,7 +400,8 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
     """Raise RefusedError where `guard` does not hold in `state` under `conditions`; else do nothing.
 
-    For a device that is not connected, the remedy of `conditions`, if any, replaces the guard's.
+    The error has the guard's `code`, what is wrong with its figures, and the guard's remedy as hint. For a device that
+    is not connected, the remedy of `conditions`, if any, replaces the guard's.
     """
     message = guard.refuses(state, conditions)
     if message:
@@ -432,7 +436,8 @@ def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
 def reason(name: str, source: OperatingState) -> str:
     """Return the log's line for a command that was taken in the state `source`: where it led, and why.
 
-    Empty where the table refuses the command there. Raises ValueError for an unknown command.
+    `name` is the value of an `Event`, as in "clear-fault". Empty where the table refuses the command there; whether
+    guards held is not asked. Raises ValueError for an unknown command.
     """
     row = TRANSITIONS[Event(name), source]
     return f"{source} to {row.target}: {row.reason}" if isinstance(row, Transition) else ""
@@ -441,7 +446,7 @@ def reason(name: str, source: OperatingState) -> str:
 def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -> SafetyState:
     """Return `state` in the operating state `target`, with a new `request` to the device unless `request` is NONE.
 
-    Every change of the operating state is made here.
+    Every change of the operating state is made here; guards are the caller's to ask. With NONE the last request stays.
     """
     after = state.replaced(operating_state=target)
     return after if request is DeviceRequest.NONE else after.ask(request)

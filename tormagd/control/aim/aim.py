@@ -96,7 +96,9 @@ class Aim:
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open, no setpoint, the limit NO_SETPOINT and this `number`.
 
-        The element's field there lags `lag_mT` behind the gap's: it becomes `element_mT`, and the newest `answer`.
+        Call it before the first `update`. The element's field there lags `lag_mT` behind the gap's: it becomes
+        `element_mT`, and the newest `answer`. A `question` stays. Raises DomainError where the open gap is none of the
+        field law's.
         """
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
@@ -119,7 +121,7 @@ class Aim:
         `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent.
         `memory` gives the lag of the element's field. Updates `number` and `element_mT`, and `question` where a search
         runs beside the plans. Raises DomainError where no gap gives the field, a number is not finite, or the newest
-        answer is older than OLDEST_ANSWER_S.
+        answer is older than OLDEST_ANSWER_S. The stage may then be half updated: begin anew.
         """
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
@@ -141,7 +143,8 @@ class Aim:
     def answer_to(self, question: Question) -> Answer:
         """Search the field for `question`, for a search that runs beside the plans, and return the answer.
 
-        Changes nothing: the answer is not kept. Raises DomainError for a number that is not finite or too large.
+        The answer has the question's time. Changes nothing: the answer is not kept, and may be searched for in another
+        process. Raises DomainError for a number that is not finite or too large.
         """
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
@@ -210,11 +213,11 @@ class Aim:
         is_held: bool,
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
-        """Return what holds the force back, in the order in which it does.
+        """Return what holds the force back, in the order in which it does; empty where nothing does.
 
         The limits of `ask` and of the belief (`believed`) come first. MODEL_RANGE is added where a quantity is
         `outside` the model, CEILING where `is_held`, and LOW_CONFIDENCE, F_MIN and F_MAX by the search's `solution`.
-        F_MIN is told only while a publisher asks for a force.
+        F_MIN is told only while a publisher asks for a force. F_MIN and F_MAX are not told twice.
         """
         limits = (*ask.limits, *believed)
         if outside:
@@ -234,7 +237,8 @@ class Aim:
         """Return the gap's speed, mm/s, and acceleration, mm/s^2, at the beginning of the path `path_N` (7) of forces.
 
         They are those of the parabola nearest to the path along the portrait, opening positive. Both are held within
-        what the configuration lets the gap do.
+        what the configuration lets the gap do. A path out of reach stands at the portrait's end, without motion. Raises
+        DomainError for NaN.
         """
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
         start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))

@@ -13,20 +13,28 @@ LAW_SHARE: Final = 0.12
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap allowed, mm: the greater of `ceiling_mm` and `unseen_mm`."""
+    """Return the least gap allowed, mm: the greater of `ceiling_mm` and `unseen_mm`.
+
+    `ceiling_N` is the greatest force that the device may surely give, CEILING times the scene's. The result is within
+    the portrait's gaps. Raises DomainError where a fit gives NaN.
+    """
     return max(ceiling_mm(portrait, belief.device, ceiling_N, bounds), unseen_mm(portrait, belief, ceiling_N, bounds))
 
 
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap, mm, at which the device, taken SURE deviations stronger, gives no more than `ceiling_N`."""
+    """Return the least gap, mm, at which the device, taken SURE deviations stronger, gives no more than `ceiling_N`.
+
+    It is held within the portrait's gaps: at the open end a device that is stronger still gives more. Raises
+    DomainError where the fit gives NaN.
+    """
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
 
 
 def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
     """Return the least gap, mm, as `ceiling_mm`, for a device of which nothing is known (`belief.unseen`).
 
-    Until the handle has slid, the real device may be that one. Where `belief.unseen` is None, the closed gap is
-    returned.
+    Until the handle has slid, the real device may be that one. Where `belief.unseen` is None, the portrait's closed gap
+    is returned, which holds nothing back. Raises DomainError as `ceiling_mm`.
     """
     if belief.unseen is None:
         return portrait.gap_mm[-1]
@@ -36,7 +44,9 @@ def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Devi
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
     """Return `field_mT`, held within a share LAW_SHARE of the field that the force law gives for `wanted_N`.
 
-    `wanted_N` is the model's force. `law` is None where no law is known: the field stays as it is.
+    `wanted_N` is the model's force, N. For one that no field of the law gives, the law's nearer end counts. `law` is
+    None where no law is known: the field stays as it is. Raises DomainError for a force of NaN; a field of NaN stays
+    NaN.
     """
     if law is None:
         return field_mT

@@ -66,8 +66,9 @@ _LONGEST: Final = BEAT_DELAYS[-1]
 def embedding(delays: tuple[int, ...]) -> Array:
     """Return the places of all stretches in a full history, as negative indices from its end.
 
-    Shape (TAPS + 1 + HORIZON, n). A column holds one stretch: the points at `delays` (TAPS), its end, and the points
-    that followed. The first column is the newest stretch, after which its own end is repeated.
+    `delays` are TAPS rising whole numbers, at most BEAT_DELAYS' last. Shape (TAPS + 1 + HORIZON, n), whole numbers. A
+    column holds one stretch: the points at `delays`, its end, and the points that followed. The first column is the
+    newest stretch, after which its own end is repeated.
     """
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
     ends = np.arange(-1 - HORIZON, _LONGEST - HISTORY - 1, -STRIDE)
@@ -101,8 +102,9 @@ LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
 class Forecast:
     """Learner of one stream of setpoints, which forecasts how the force goes on.
 
-    It keeps the forces of the last ten seconds on a grid of GRID_S. It also keeps the newest forecast, the guesses that
-    are not judged yet, and the forecast's skill.
+    Give each setpoint to `update`, and call `foresee` after plans; read `trust` before `forces_N`. It keeps the forces
+    of the last ten seconds on a grid of GRID_S. It also keeps the newest forecast, the guesses that are not judged yet,
+    and the forecast's skill.
     """
 
     stamp_s: float
@@ -143,14 +145,15 @@ class Forecast:
         return min(max(earned, 0.0), 1.0) * min(max(1.0 - lost, 0.0), 1.0)
 
     def forget(self) -> None:
-        """Begin anew, with nothing learned."""
+        """Begin anew, with nothing learned: no setpoint, no history, no forecast, and no skill."""
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     def update(self, stamp_s: float, force_N: float) -> None:
         """Take one setpoint, judge what was forecast for its time, and remember it on the grid. Makes no forecast.
 
-        A stamp up to GRID_S before the newest counts as the newest. A force with the newest stamp replaces the newest
-        force. An older stamp, or a pause of more than MAX_STEP_S, begins anew.
+        `stamp_s` and `force_N` are finite; they are not checked. A stamp up to GRID_S before the newest counts as the
+        newest. A force with the newest stamp replaces the newest force. An older stamp, or a pause of more than
+        MAX_STEP_S, begins anew. A forecast stays until the next, as far as it reaches.
         """
         if -GRID_S < stamp_s - self.stamp_s < 0.0:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
@@ -166,9 +169,10 @@ class Forecast:
     def foresee(self, slope_N_s: float) -> bool:
         """Make a forecast from the newest point of the grid, and return whether one was due.
 
-        A forecast is due after every EVERY points, once the history has MIN_HISTORY points. It is empty where the
-        history has no stretch like the newest; the skill of SHORT_S is then lost. Its guess, and that of the slope
-        `slope_N_s`, are noted; `update` judges them by what comes.
+        A forecast is due after every EVERY points, once the history has MIN_HISTORY points; else nothing changes. It is
+        empty where the history has no stretch like the newest; the skill of SHORT_S is then lost. So True does not say
+        that there is a forecast: `trust` does. Its guess, and that of the slope `slope_N_s`, are noted; `update` judges
+        them by what comes.
         """
         if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
             return False
@@ -191,7 +195,8 @@ class Forecast:
     def forces_N(self, begins_after_s: float, after_s: list[float]) -> list[float]:
         """Return the forecast forces (n) at `begins_after_s` + `after_s` (n), s, after the newest setpoint's stamp.
 
-        The times are >= 0. Beyond the forecast's end its last force holds. Call it only while `trust` is above 0.
+        The times are >= 0; no times give no forces. Beyond the forecast's end its last force holds. Call it only while
+        `trust` is above 0: an empty forecast raises IndexError. Raises DomainError for a time of NaN.
         """
         changes = self.changes_N
         # the forecast is shifted through the newest setpoint, which may have come after the point it was made from
@@ -206,9 +211,10 @@ class Forecast:
         self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
 
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
-        """Add `count` points to the grid, up to a new setpoint, and judge the guesses for them by what came.
+        """Add `count` >= 1 points to the grid, up to a setpoint later than the newest, and judge the guesses for them.
 
-        A forecast that reaches at most one point beyond the new setpoint is dropped.
+        Between the newest setpoint and this one, at `stamp_s`, the force is taken as linear. The caller keeps the
+        setpoint itself. A forecast that reaches at most one point beyond the new setpoint is dropped.
         """
         spacing_s = stamp_s - self.stamp_s
         times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]
@@ -225,7 +231,8 @@ class Forecast:
             self.changes_N = []
 
     def _judge(self, guess: Guess, came_N: float) -> None:
-        """Update the skills and both embeddings' errors with what came at the point of one guess."""
+        """Update the skills and both embeddings' mean squared errors with `came_N`, what came at the point of one
+        guess."""
         error_N, slope_error_N = guess.forecast_N - came_N, guess.slope_N - came_N
         self.long = self.long.after(error_N, slope_error_N, _LONG_SHARE)
         self.short = self.short.after(error_N, slope_error_N, _SHORT_SHARE)
@@ -248,16 +255,21 @@ class Forecast:
 
 
 def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
-    """Return the force JUDGED points ahead, along changes from a point `since_s` before the newest force."""
+    """Return the force, N, JUDGED points ahead, along changes from a point `since_s` before the newest force.
+
+    `changes_N` has more than JUDGED numbers, the first 0. Over `since_s` the force counts as having changed as to the
+    first point ahead.
+    """
     return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
 
 
 def _search(history: Array) -> list[tuple[list[float], float]]:
-    """Forecast with each embedding, and return for each the changes of force and a distance.
+    """Forecast with each embedding, and return for each the changes of force, N, and a distance, N².
 
-    The changes go from the newest point of the grid to itself and the next HORIZON points. There are none where no
-    stretch is like the newest, or where its leverage is over MAX_LEVERAGE. The distance is that of the stretch most
-    like the newest: the mean square of a point, N², at least SAME_N's.
+    `history` holds the forces on the grid, MIN_HISTORY to HISTORY of them, the newest last. The first result is that of
+    RISE_DELAYS. The changes (1 + HORIZON) go from the newest point of the grid to itself and the next HORIZON points.
+    The list is empty where no stretch is like the newest, or where its leverage is over MAX_LEVERAGE. The distance is
+    that of the stretch most like the newest: the mean square of a point, at least SAME_N's.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.
@@ -279,10 +291,11 @@ def _search(history: Array) -> list[tuple[list[float], float]]:
 
 
 def _constants(rows: list[list[float]]) -> list[float]:
-    """Return the regression's constants, the first 0, by elimination from its normal equations.
+    """Return the regressions' constants (1 + HORIZON), by elimination: 0, then one for each point that followed.
 
-    `rows` are weighted sums of products, one row for each regressor, with 1 last. Columns are the regressors, then the
-    points that followed. A newest stretch of more leverage than MAX_LEVERAGE gives an empty list.
+    `rows` (TAPS + 1) are weighted sums of products, one row for each regressor, with 1 last; they are not changed.
+    Columns are the regressors, then the HORIZON points that followed. A newest stretch of more leverage than
+    MAX_LEVERAGE gives an empty list.
     """
     total = rows[TAPS][TAPS]
     variance = 0.0

@@ -23,7 +23,11 @@ class Skill(Value):
         self.apart: Final = apart
 
     def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
-        """Return the skill with both guesses' newest errors, which count for `share` of the means, 0..1."""
+        """Return the skill with both guesses' newest errors, N, which count for `share` of the means, 0..1.
+
+        The sign of an error does not matter; `error_N` is this guess's. Nothing is checked: NaN stays in all skills
+        that follow.
+        """
         gained = other_error_N * other_error_N - error_N * error_N
         difference_N = other_error_N - error_N
         apart = difference_N * difference_N
@@ -31,9 +35,10 @@ class Skill(Value):
 
     @property
     def score(self) -> float:
-        """Return the skill score: `gained` over `apart`.
+        """Return the skill score: `gained` over `apart`. Above 0 this guess is the better one, at 0 both are as good.
 
-        The mixture with the share (1 + score) / 2 of the first guess would have had the least squared error.
+        The mixture with the share (1 + score) / 2 of the first guess would have had the least squared error. The score
+        is not held within -1..1, but guesses that hardly differ have one near 0.
         """
         return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
 

@@ -20,7 +20,10 @@ SLID_MM: Final = 0.5
 
 
 def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
-    """Return the handle's place, mm, and rate, mm/s, both positive pushing on. `push_sign` is 1 or -1, as for `Way`."""
+    """Return the handle's place, mm, and rate, mm/s, both positive pushing on. `push_sign` is 1 or -1, as for `Way`.
+
+    The rate is the quick one, `quick_mm_s`. Neither is checked.
+    """
     handle = measured.handle
     return push_sign * measured.handle_mm, push_sign * handle.turn.direction * handle.quick_mm_s
 
@@ -44,10 +47,11 @@ class Way:
     def update(self, measured: Measured | None, is_sensor_believed: bool) -> Travel:
         """Return the handle's travel, and keep it in `travel`.
 
-        `measured` is None while the device is silent: the handle counts as resting where it was. A force over PULLS_N
-        against the encoder's motion shows that the handle goes that way; one below -UNSEEN_N, that it goes the other.
-        Between them, the way changes after SLID_MM on the encoder: since it turned, and from where the way last
-        changed. With `is_sensor_believed` False only such travel counts.
+        `measured` is None while the device is silent: the handle counts as resting where it was, and keeps its way. A
+        force over PULLS_N against the encoder's motion shows that the handle goes that way; one below -UNSEEN_N, that
+        it goes the other. Between them, the way changes after SLID_MM on the encoder: since it turned, and from where
+        the way last changed. With `is_sensor_believed` False, or a force of NaN, only such travel counts. A change of
+        way is kept in `changed_mm`.
         """
         before = self.travel
         if measured is None:
