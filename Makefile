@@ -162,7 +162,7 @@ uninstall:
 wheels: | $(BIN)/python
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheels ./client .
 
-# a Debian package in build/, for the Python of this Debian: without torch, which only `tormagctl calibrate` needs
+# a Debian package in build/, for the Python of this Debian: without torch, which only networks' training and two searches need
 deb: $(VENV)/.man
 	$(BIN)/python -c 'import sys, subprocess as s; v = "%d.%d" % sys.version_info[:2]; a = s.check_output(["/usr/bin/python3", \
 	    "-c", "import sys; print(\"%d.%d\" % sys.version_info[:2], end=\"\")"], text=True); \

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Packs a Debian package:  deb.sh LIBRARY OUT
 # LIBRARY is a folder with both distributions and all that they import, for PYTHON (/usr/bin/python3), which the package runs with. All
-# of it is in the package, but for torch, which only `tormagctl calibrate` needs: a console need not reach a registry.
+# of it is in the package, but for torch, which only networks' training and two searches need: a console need not reach a registry.
 set -eu
 library=$1 out=$2
 python=${PYTHON:-/usr/bin/python3}

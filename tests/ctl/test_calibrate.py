@@ -134,6 +134,14 @@ def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, caps
     assert "MRE-99-99" in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
+def test_a_law_is_judged_on_the_same_sweeps(table):
+    data = rows(table)
+    metrics = fit(data, INSERT, CREATED, hidden=12, epochs=60, by_law=True).metadata.metrics
+    assert metrics["judged_r2"] > 0.98
+    assert metrics["judged_mae_N"] <= metrics["most_mae_N"]
+    assert metrics["law_static"] >= 0.0
+
+
 def test_a_missing_package_is_told_before_anybody_turns_the_handle(monkeypatch, capsys):
     assert calibration.main(["--insert", INSERT]) == 0
     assert json.loads(capsys.readouterr().out) == {"result": {"insert": INSERT}}
@@ -142,6 +150,8 @@ def test_a_missing_package_is_told_before_anybody_turns_the_handle(monkeypatch, 
     told = json.loads(capsys.readouterr().out)["error"]
     assert (told["code"], told["message"]) == ("not_installed", "a_package_that_is_not is not installed")
     assert "pip install" in told["hint"]
+    assert told["hint"].endswith("; or calibrate with --law")
+    assert calibration.main(["--insert", INSERT, "--law"]) == 0
 
 
 NOISE_N = np.random.default_rng(0).normal(0.0, 0.01, 100_000)
@@ -317,6 +327,7 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, t
         (("--motors",), "--out"),
         (("--insert", "A", "--motors", "--out", "m"), "--motors"),
         (("--motors", "--csv", "t", "--out", "m"), "--csv"),
+        (("--motors", "--law", "--out", "m"), "--law is for --insert alone"),
         (("--insert", "A", "--out", "there"), "exists"),
         (("--insert", "A", "--out", "none/m"), "not a directory"),
         (("--insert", "A", "--out", "m"), "--yes"),

@@ -10,6 +10,7 @@ import pytest
 
 from tormagd.lab import errors
 from tormagd.lab.main import COMMANDS, main
+from tormagd.model.model_file import load_model
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [path for folder in ("tormagd", "firmware_protocol") for path in sorted((ROOT / folder).rglob("*.py"))]
@@ -115,6 +116,10 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
             ("given", GOOD, ("--epochs", "0"), "epochs = 0"),
             ("given", GOOD, ("--insert", "two words"), "insert"),
             ("given", GOOD, ("--validation-share", "1"), "validation_share"),
+            ("given", GOOD, ("--law", "--insert", "MRE-50-40", "MRE-50-30"), "--law: allowed is --element torque"),
+            ("given", GOOD, ("--law", "--element", "tactile"), "--law: allowed is --element torque"),
+            ("given", GOOD, ("--law", "--insert", "MRE-99-99"), "MRE-99-99"),
+            ("given", GOOD.replace(",5,", ",-5,"), ("--law",), "rate_mm_s = -5.0 is not allowed: magnitudes"),
         )
     ),
 ]
@@ -177,12 +182,23 @@ def test_the_law_and_a_fitted_grey_box_need_no_torch():
     subprocess.run([sys.executable, "-P", "-c", line], check=True, timeout=60)
 
 
-def test_a_missing_package_is_one_sentence_with_the_command_that_brings_it():
-    done = without_heavy(COMMAND, "train-model", "data.csv", "--element", "torque", "--insert", "A", "--out", "m")
+def test_a_missing_package_is_one_sentence_with_the_command_that_brings_it(tmp_path):
+    (tmp_path / "rows.csv").write_text(GOOD)
+    given = str(tmp_path / "rows.csv"), "--out", str(tmp_path / "m")
+    done = without_heavy(COMMAND, "train-model", *given, "--element", "torque", "--insert", "A")
     assert (done.returncode, done.stderr) == (
         2,
         "tormag-lab train-model: torch is not installed: pip install 'tormagd[lab]'\n",
     )
+
+
+def test_the_law_trains_without_torch(tmp_path):
+    (tmp_path / "rows.csv").write_text(GOOD)
+    out = tmp_path / "m.safetensors"
+    given = str(tmp_path / "rows.csv"), "--out", str(out), "--hidden", "5", "--epochs", "5"
+    done = without_heavy(COMMAND, "train-model", *given, "--element", "torque", "--insert", "MRE-50-40", "--law")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "law_exponent" in load_model(out, element="torque", insert="MRE-50-40").metadata.metrics
 
 
 def test_where_tormagd_stands_in_a_folder_of_its_own_packages_are_brought_there(monkeypatch, tmp_path):

@@ -1,5 +1,6 @@
 """Training: its data, splits and sweeps; the network's derivatives, noise floor, determinism, scaling; the command."""
 
+import datetime
 import json
 import math
 from pathlib import Path
@@ -15,7 +16,7 @@ from tormagd.lab.main import main
 from tormagd.lab.training import train_model
 from tormagd.lab.training.bench_sweep import LOADED_MM, LOADED_STEP_MM, loading, sliding, strokes
 from tormagd.lab.training.dataset import ALLOWED, COLUMNS, Dataset, read_csv, write_csv
-from tormagd.lab.training.fitting import scaling_of
+from tormagd.lab.training.law import Law, fit_law, fit_law_model
 from tormagd.lab.training.levenberg_marquardt import jacobian, train
 from tormagd.lab.training.metrics import leave_cycles_out, leave_one_out, random_split
 from tormagd.lab.training.unremembered import identify
@@ -26,6 +27,7 @@ from tormagd.model.model_file import load_model
 from tormagd.model.network import ForceNetwork
 from tormagd.physics.errors import DomainError
 from tormagd.physics.friction import Friction
+from tormagd.physics.inserts import insert
 
 # -- data: what is read is what was written, what is wrong is refused by row, column and value -------------------------
 
@@ -180,7 +182,7 @@ def synthetic(rows: int, seed: int, noise_N: float = NOISE_N) -> Dataset:
 
 
 def network_for(data: Dataset, hidden: int = 10, seed: int = 0) -> ForceNetwork:
-    return ForceNetwork(scaling_of(data), hidden, seed=seed)
+    return ForceNetwork(data.scaling(), hidden, seed=seed)
 
 
 def test_the_jacobian_is_that_of_automatic_differentiation() -> None:
@@ -251,7 +253,7 @@ def test_a_rising_force_rises_where_the_data_fall() -> None:
 def test_what_cannot_be_trained_is_refused() -> None:
     data = synthetic(50, 1)
     with pytest.raises(DomainError, match="force_N"):
-        scaling_of(Dataset(data.features, np.ones(50)))
+        Dataset(data.features, np.ones(50)).scaling()
     with pytest.raises(DomainError, match="hidden"):
         network_for(data, hidden=0)
     for wrong in ({"epochs": 0}, {"patience": 0}):
@@ -268,6 +270,49 @@ class _Scaled(torch.nn.Module):
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         return self.network.forward_scaled(inputs)
+
+
+# -- the law of a brake ------------------------------------------------------------------------------------------------
+
+
+LAW = Law(0.1, -0.7, 1.1, 0.05, 0.15, 2.0, 0.01, 2e-4, 1.8, 0.5)
+
+
+def lawful(rows: int, least_mm: float = 2.0, noise_N: float = NOISE_N) -> Dataset:
+    """A synthetic brake that keeps to the law LAW."""
+    rng, fitted = np.random.default_rng(4), insert("MRE-50-40")
+    rates = np.exp(rng.uniform(np.log(0.5), np.log(310.0), rows))
+    features = np.column_stack(
+        (rng.uniform(least_mm, 2.0, rows), rates, rng.uniform(150, 850, rows), np.full(rows, 40.0))
+    )
+    return Dataset(features, LAW.forces_N(features, fitted) + noise_N * rng.normal(size=rows))
+
+
+def test_fifty_rows_tell_the_law() -> None:
+    fresh = lawful(2000, noise_N=0.0)
+    found_N = fit_law(lawful(50), insert("MRE-50-40")).forces_N(fresh.features, insert("MRE-50-40"))
+    assert np.abs(found_N - fresh.force_N).mean() < 0.01
+
+
+def test_a_law_becomes_a_network_that_rises_and_is_near_it() -> None:
+    data, fresh = lawful(400, least_mm=0.0), lawful(500, noise_N=0.0)
+    model = fit_law_model(
+        data, data, insert_name="MRE-50-40", data_sha256="0" * 64, created=datetime.date(2024, 1, 1), epochs=80
+    )
+    metrics = model.metadata.metrics
+    assert np.abs(model.predict(fresh.features) - fresh.force_N).mean() < 0.015  # of 4.3 N, the fit's own errors within
+    assert metrics["law_mae_N"] < 0.04
+    assert metrics["not_rising_share"] == 0.0
+    assert metrics["law_exponent"] == pytest.approx(LAW.exponent, abs=0.02)
+    assert (model.physical.hidden_weight[:, FIELD] > 0.0).all()
+    assert (model.output_weight > 0.0).all()
+
+
+def test_a_law_of_one_field_is_refused() -> None:
+    data = lawful(50)
+    data.features[:, FIELD] = 300.0
+    with pytest.raises(DomainError, match="field_mT = 300"):
+        fit_law_model(data, data, insert_name="MRE-50-40", data_sha256="0" * 64, created=datetime.date(2024, 1, 1))
 
 
 # -- rows that a bench sweep keeps, and the memory that is taken out of them; all records are synthetic ----------------

@@ -47,15 +47,19 @@ def calibrate_insert(
     out: Path,
     training_csv: Path | None,
     rates_N_s: Sequence[float],
+    by_law: bool,
     wait_s: float,
 ) -> Outcome:
     """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`.
+
+    It is a network, `by_law` the law of the brake, which takes no torch.
 
     `training_csv` also gets the training data, unless it is None. The gap opens after the sweeps. Raises as `armed` and
     `Run.follow`. Raises CommandError (REFUSED) for an unknown insert, a still handle, another publisher, or a sweep or
     fit that is not good enough. Then there is neither file.
     """
-    _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
+    law = ("--law",) if by_law else ()
+    _ask_fitter("--insert", insert, *law)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
         known = known_of(config, client.status(), scene.force.most_N)
         forces = Range(known.least_N, known.most_N)
@@ -66,7 +70,7 @@ def calibrate_insert(
         write_sweeps(table, sweeps)
         result = _ask_fitter(
             str(table),
-            *("--insert", insert, "--out", str(out)),
+            *("--insert", insert, "--out", str(out), *law),
             *("--inner-radius-mm", str(scene.insert.inner_radius_mm)),
             *([] if training_csv is None else ["--csv", str(training_csv)]),
         )
@@ -177,15 +181,16 @@ def calibrate(
     out: Path | None,
     csv: Path | None,
     rates_N_s: Sequence[float],
+    by_law: bool,
     side: Literal["left", "right"],
     is_agreed: bool,
 ) -> Outcome:
     """Calibrate one of: the device, an `insert`, or the `motors`; asks for agreement first unless `is_agreed`.
 
     `out` is the new file of the model or motor log, and None for `device`. `csv` gets an insert's training data.
-    `rates_N_s` are an insert's sweeps, `side` the motor that is logged. Raises CommandError (USAGE) for options that do
-    not fit each other, a file that exists or has no folder, or a faulty scene. USAGE is also agreement that is needed
-    where stdin is no terminal. Raises as the three calibrations do.
+    `rates_N_s` are an insert's sweeps, `by_law` is the kind of its model, `side` the motor that is logged. Raises
+    CommandError (USAGE) for options that do not fit each other, a file that exists or has no folder, or a faulty scene.
+    USAGE is also agreement that is needed where stdin is no terminal. Raises as the three calibrations do.
     """
     if [insert is not None, motors, device].count(True) != 1:
         raise usage_error("calibrate takes one of three things", "give one of --insert NAME, --motors and --device")
@@ -193,6 +198,8 @@ def calibrate(
         raise usage_error(
             "--csv is for --insert alone: the training data", "leave it out; with --motors, --out is the log"
         )
+    if insert is None and by_law:
+        raise usage_error("--law is for --insert alone: the kind of its model", "leave it out")
     if device is (out is not None):
         raise usage_error(
             "--out is not for --device" if device else "--out is missing: the file of the model or the log",
@@ -215,7 +222,7 @@ def calibrate(
         return calibrate_device(config, endpoints, most_N, wait_s)
     if insert is None:
         return calibrate_motors(endpoints, most_N, out, side, wait_s)
-    return calibrate_insert(config, endpoints, scene, insert, out, csv, rates_N_s, wait_s)
+    return calibrate_insert(config, endpoints, scene, insert, out, csv, rates_N_s, by_law, wait_s)
 
 
 def agree() -> None:

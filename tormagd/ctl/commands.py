@@ -307,6 +307,7 @@ COMMANDS = {
                 metavar="N/s,...",
                 help="of the sweeps, at least three (0.1,0.2,0.4,0.2,0.1,0.4)",
             ),
+            option("--law", dest="by_law", action="store_true", help="fit the law of the brake, which takes no torch"),
             option("--side", choices=("left", "right"), default="left", help="whose log to write (left)"),
             option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),
         ),

@@ -52,7 +52,8 @@ STEADY_MM_S = 10.0
 RARE_SHARE = 0.01
 
 NEEDED = ("torch", "tqdm")
-"Packages that a fit needs and not every installation has: checked before anybody turns a handle."
+"Packages that a network needs and not every installation has: checked before anybody turns a handle."
+NEEDED_BY_LAW = ("scipy",)
 
 LEAST_R2 = 0.97
 "R2 of the thesis's own network, table 4.1."
@@ -177,30 +178,34 @@ def noise_sd_N(data: Dataset) -> float:
     return float(1.4826 * np.median(np.abs(third[together])) / math.sqrt(20.0)) if together.any() else 0.0
 
 
-def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int = 50, epochs: int = 200) -> ForceModel:
+def fit(
+    data: Dataset,
+    insert_name: str,
+    created: datetime.date,
+    *,
+    hidden: int = 50,
+    epochs: int = 200,
+    by_law: bool = False,
+) -> ForceModel:
     """Train a model on all sweeps but the judging ones, and return it with the judgement in its metrics.
 
-    Raises CalibrationError where the judging sweeps fit too badly (poor_fit), or the force falls with the field
-    (not_rising). Raises LabError and DomainError as `Dataset.split` and `fit_model`.
+    It is a network, `by_law` the law of the brake. Raises CalibrationError where the judging sweeps fit too badly
+    (poor_fit), or the force falls with the field (not_rising). Raises LabError and DomainError as `Dataset.split`,
+    `fit_model` and `fit_law_model`.
     """
-    from tormagd.lab.training.fitting import (
-        fit_model,  # with torch, two seconds: whatever is refused is told without it
-    )
-
     assert data.cycle is not None  # training_rows sets it
     numbers = np.unique(data.cycle)
     is_judging = np.isin(data.cycle, numbers[JUDGING[1] :: JUDGING[0]])
     training, validation = data.subset(~is_judging).split(VALIDATION_SHARE, seed=0)
-    model, _ = fit_model(
-        training,
-        validation,
-        element=Element.TORQUE,
-        inserts=(insert_name,),
-        data_sha256=data.sha256(),
-        created=created,
-        hidden=hidden,
-        epochs=epochs,
-    )
+    shared: dict[str, Any] = {"created": created, "hidden": hidden, "epochs": epochs, "data_sha256": data.sha256()}
+    if by_law:
+        from tormagd.lab.training.law import fit_law_model  # SciPy, and torch below, take seconds to load
+
+        model = fit_law_model(training, validation, insert_name=insert_name, **shared)
+    else:
+        from tormagd.lab.training.fitting import fit_model
+
+        model, _ = fit_model(training, validation, element=Element.TORQUE, inserts=(insert_name,), **shared)
     judging = data.subset(is_judging)
     found = fit_metrics(model, judging)
     noise_mae_N = MEAN_OVER_SIGMA * noise_sd_N(data)
@@ -251,9 +256,17 @@ def require_rising(model: ForceModel, points: int = 64) -> None:
 
 
 def calibrate(
-    sweep: Path, insert_name: str, inner_radius_mm: float, out: Path, training_csv: Path | None, created: datetime.date
+    sweep: Path,
+    insert_name: str,
+    inner_radius_mm: float,
+    out: Path,
+    training_csv: Path | None,
+    created: datetime.date,
+    by_law: bool = False,
 ) -> dict[str, Any]:
     """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file).
+
+    The model is a network, `by_law` the law of the brake.
 
     Returns as plain data the files' names, the insert, the date, and the data's rows, ranges and metrics. Raises
     CalibrationError, LabError, DomainError and OSError; no new file is there then, so that the same command can be
@@ -261,7 +274,7 @@ def calibrate(
     """
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     require_usable(data)
-    model = fit(data, insert_name, created)
+    model = fit(data, insert_name, created, by_law=by_law)
     with nullcontext() if training_csv is None else in_place_of(training_csv) as beside:
         if beside is not None:
             write_csv(beside, data)
@@ -296,13 +309,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--inner-radius-mm", type=float, default=4.0, help="where the field is stated (4)")
     parser.add_argument("--out", type=Path, metavar="MODEL.safetensors", help="with a sweep")
     parser.add_argument("--csv", type=Path, metavar="TRAINING.csv", help="write the training data too")
+    parser.add_argument("--law", dest="by_law", action="store_true", help="the law of the brake, no network")
     options = parser.parse_args(arguments)
     if (options.sweep is None) != (options.out is None):
         parser.error("SWEEP.csv and --out go together")
     try:
         if options.sweep is None:
             result: dict[str, Any] = {"insert": insert(options.insert).name}
-            for module in NEEDED:
+            for module in NEEDED_BY_LAW if options.by_law else NEEDED:
                 if importlib.util.find_spec(module) is None:
                     raise ModuleNotFoundError(name=module)
         else:
@@ -313,6 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 options.out,
                 options.csv,
                 datetime.datetime.now(datetime.UTC).date(),
+                options.by_law,
             )
     except CalibrationError as error:
         return _refuse(error.code, error.message, error.hint)
@@ -320,7 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse("data", str(error), "correct what is named and calibrate again")
     except ModuleNotFoundError as error:
         told, _, command = not_installed(error.name or "").partition(": ")
-        return _refuse("not_installed", told, command)
+        return _refuse("not_installed", told, command if options.by_law else f"{command}; or calibrate with --law")
     except OSError as error:
         return _refuse("file", f"{error.filename}: {error.strerror}", "give files in a directory you may write to")
     print(json.dumps({"result": result}))

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
-from tormagd.model.features import FEATURES
+from tormagd.model.features import FEATURES, Scaling
+from tormagd.physics.errors import DomainError
 
 COLUMNS = (*FEATURES, "force_N")
 OPTIONAL_COLUMNS = ("cycle", "time_s")
@@ -60,6 +61,27 @@ class Dataset:
         """Return the least and the greatest value of each feature and of force_N."""
         columns = self.columns()
         return {name: (float(columns[name].min()), float(columns[name].max())) for name in COLUMNS}
+
+    def scaling(self) -> Scaling:
+        """Return the scaling that maps each feature's range, and the force's, onto -1..1; a constant feature gets gain
+        0.
+
+        Raises `DomainError` where the force does not vary.
+        """
+        low, high = self.features.min(axis=0), self.features.max(axis=0)
+        span = high - low
+        gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
+        force_low, force_high = float(self.force_N.min()), float(self.force_N.max())
+        if not force_high > force_low:
+            raise DomainError(
+                "force_N", force_low, "at least two different values, otherwise there is nothing to learn"
+            )
+        return Scaling(
+            input_offset=tuple(((low + high) / 2).tolist()),
+            input_gain=tuple(gain.tolist()),
+            output_offset=(force_low + force_high) / 2,
+            output_gain=2 / (force_high - force_low),
+        )
 
     def sha256(self) -> str:
         """Return the digest of names and values: the same whatever the file's number format or line ends."""

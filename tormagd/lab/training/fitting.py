@@ -10,7 +10,7 @@ import torch
 from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.levenberg_marquardt import Training, train
-from tormagd.lab.training.metrics import fit_metrics, not_rising_share, random_split
+from tormagd.lab.training.metrics import random_split, trained_metrics
 from tormagd.model.features import CIP, Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata, Ranges
@@ -47,7 +47,7 @@ def fit_model(
     that does not vary.
     """
     ranging = scaled_by or training
-    scaling = scaling_of(ranging)
+    scaling = ranging.scaling()
     network = ForceNetwork(scaling, hidden, seed=seed)
     if start is not None:
         _begin_with(network, scaling, start)
@@ -66,11 +66,7 @@ def fit_model(
     result = train(network, training, validation, epochs=epochs, rising=rising)
     model = to_model(network, metadata)
     metrics = {
-        **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},
-        **{f"validation_{name}": value for name, value in fit_metrics(model, validation).items()},
-        "not_rising_share": not_rising_share(model),
-        "train_rows": float(len(training)),
-        "validation_rows": float(len(validation)),
+        **trained_metrics(model, training, validation),
         "epochs": float(len(result.history)),
         "best_epoch": float(result.best.epoch),
     }
@@ -119,22 +115,3 @@ def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> N
     network.hidden_bias.copy_(torch.tensor(bias + weight @ np.array(scaling.input_offset)))
     network.output_weight.copy_(torch.tensor(output * scaling.output_gain))
     network.output_bias.fill_((constant - scaling.output_offset) * scaling.output_gain)
-
-
-def scaling_of(data: Dataset) -> Scaling:
-    """Return the scaling that maps each feature's range, and the force's, onto -1..1; a constant feature gets gain 0.
-
-    Raises DomainError where the force does not vary.
-    """
-    low, high = data.features.min(axis=0), data.features.max(axis=0)
-    span = high - low
-    gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
-    force_low, force_high = float(data.force_N.min()), float(data.force_N.max())
-    if not force_high > force_low:
-        raise DomainError("force_N", force_low, "at least two different values, otherwise there is nothing to learn")
-    return Scaling(
-        input_offset=tuple(((low + high) / 2).tolist()),
-        input_gain=tuple(gain.tolist()),
-        output_offset=(force_low + force_high) / 2,
-        output_gain=2 / (force_high - force_low),
-    )

@@ -38,6 +38,17 @@ def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[
         yield fold, np.isin(dataset.cycle, part)
 
 
+def trained_metrics(model: ForceModel, training: Dataset, validation: Dataset) -> dict[str, float]:
+    """Return what a model file says of its training: errors on both data sets, their rows, and `not_rising_share`."""
+    return {
+        **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},
+        **{f"validation_{name}": value for name, value in fit_metrics(model, validation).items()},
+        "not_rising_share": not_rising_share(model),
+        "train_rows": float(len(training)),
+        "validation_rows": float(len(validation)),
+    }
+
+
 def fit_metrics(model: ForceModel, dataset: Dataset) -> dict[str, float]:
     """Return a model's errors on a data set as `force_metrics` does; percents are of the training force span."""
     return force_metrics(model.predict(dataset.features), dataset.force_N, model.force_span_N)

@@ -1,19 +1,21 @@
 """Train a force model from recorded data and write it as a model file.
 
 tormag-lab train-model DATA.csv --element torque --insert MRE-50-40 --out FILE.safetensors
+
+A network takes some hundreds of rows, and the package torch. The law of a brake (--law) takes fifty, and no torch.
 """
 
 import argparse
 import datetime
 import sys
 from pathlib import Path
+from typing import Any
 
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.options import SEED
 from tormagd.lab.training.dataset import Dataset, read_csv
-from tormagd.lab.training.fitting import fit_model
-from tormagd.lab.training.levenberg_marquardt import Training
+from tormagd.lab.training.law import fit_law_model
 from tormagd.lab.training.unremembered import identify
 from tormagd.model.features import Element
 from tormagd.model.memory import NO_MEMORY
@@ -32,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
     parser.add_argument("--hidden", type=int, default=50, help="hidden units (default: 50)")
-    parser.add_argument("--epochs", type=int, default=200, help="most epochs (default: 200)")
+    parser.add_argument("--epochs", type=int, default=200, help="most steps of the training (default: 200)")
     parser.add_argument("--seed", type=SEED, default=0, help="decides the split and the initial weights (default: 0)")
     parser.add_argument("--validation-share", type=float, default=0.3, help="rows or cycles held out (default: 0.3)")
     parser.add_argument(
@@ -40,6 +42,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rising", action="store_true", help="train a force that rises with the field everywhere, whatever the data"
+    )
+    parser.add_argument(
+        "--law",
+        action="store_true",
+        help="fit the law of a brake with one insert, ten numbers that rise with the field",
     )
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
@@ -52,18 +59,23 @@ def run(options: argparse.Namespace) -> Found:
     """
     if options.out.is_dir() or not options.out.parent.is_dir():
         raise LabError(f"cannot write {options.out}: allowed is a file in a folder that exists")
-    model, training = fit(options, read_csv(options.data))
+    if options.law and (options.element is not Element.TORQUE or len(options.insert) > 1):
+        raise LabError("--law: allowed is --element torque with one --insert: the law is of a brake")
+    model, told = fit(options, read_csv(options.data))
     save_model(options.out, model)
     report = {"out": str(options.out), "data_sha256": model.metadata.training_data_sha256, **model.metadata.metrics}
-    return Found({**report, "stopped_by": training.stopped_by})
+    return Found(report | told)
 
 
-def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
-    """Train on `data` as `options` say, and return the model with its metrics, and how the training went.
+def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, dict[str, str]]:
+    """Train on `data` as `options` say, and return the model with its metrics, and of a network `stopped_by`.
 
     With `options.without_memory` the memory is taken out of the data first, told on stderr, and kept in the model.
-    Raises DomainError as `fit_model`, and LabError for a share that leaves too few rows on a side.
+    Raises DomainError as `fit_model` and `fit_law_model`, and LabError for a share that leaves too few rows on a side.
+    Raises ModuleNotFoundError for a network without torch, before anything is computed.
     """
+    if not options.law:
+        from tormagd.lab.training.fitting import fit_model  # with torch, which a law does without
     data_sha256, memory = data.sha256(), NO_MEMORY
     if options.without_memory:
         memory, data = identify(data)
@@ -71,16 +83,19 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
         relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
         told = f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
         write_line(told, sys.stderr)
+    sides = data.split(options.validation_share, options.seed)
+    created = options.created or datetime.date.today()
+    steps: dict[str, Any] = {"hidden": options.hidden, "epochs": options.epochs, "seed": options.seed, "memory": memory}
+    if options.law:
+        [name] = options.insert
+        return fit_law_model(*sides, insert_name=name, data_sha256=data_sha256, created=created, **steps), {}
     model, training = fit_model(
-        *data.split(options.validation_share, options.seed),
+        *sides,
         element=options.element,
         inserts=options.insert,
         data_sha256=data_sha256,
-        created=options.created or datetime.date.today(),
-        memory=memory,
-        hidden=options.hidden,
-        epochs=options.epochs,
-        seed=options.seed,
+        created=created,
         rising=options.rising,
+        **steps,
     )
-    return model, training
+    return model, {"stopped_by": training.stopped_by}
