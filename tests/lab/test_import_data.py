@@ -74,6 +74,14 @@ GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
         ("--column", "rate_mm_s=omega", "--column", "field_mT=Hall:T", "--column", "force_N=Zug:N"),
         "as it was",
     ),
+    "time that begins anew with each cycle": (
+        text(
+            renamed({"x": "x_mm", "field": "field_mT", "force": "force_N"})
+            | {"t_s": measured()["time"] % 10.0, "cycle": np.arange(600) // 200}
+        ),
+        (),
+        "over time_s",
+    ),
     "an outlier": (text({USUAL[name]: WITH_OUTLIER[name] for name in USUAL}), (), "as it was"),
     "rows twice, and one with a hole": (
         text(renamed(USUAL)) + text(renamed(USUAL)).partition("\n")[2] + "1,1,,1\n",
@@ -128,6 +136,7 @@ REFUSED: dict[str, tuple[str, str]] = {
     "a word": (text(renamed(USUAL)) + "1,2,three,4\n", "row 602, field_mT: 'three' is no number"),
     "commas in commas": (text(renamed(USUAL), ",", ","), "decimal commas need ; or tab"),
     "time that falls": (text(renamed({**USUAL, "time": "t"}, time=-1.0)), "t falls after -0 s"),
+    "a cycle of one row": ("t,cycle,F,B,v\n5,0,1,90,1\n0,1,1,91,1\n1,1,1,92,1\n", "a cycle of one row"),
     "newtons of a press": (text(renamed(USUAL, force=1e6)), "is its unit another?"),
     "nothing": ("", "no column is"),
 }

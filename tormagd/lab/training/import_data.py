@@ -159,7 +159,9 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
         if value is not None and name not in quantities:
             quantities[name] = np.full(len(force_N), float(value))
     made = [f"force_N {_sign(path, quantities)}", *_motion(path, quantities)]
-    far = _outliers(path, quantities["force_N"])
+    far = quantities["displacement_mm"] >= MOBILISED_MM  # where a handle turns, forces leap from row to row
+    if far.any():
+        far[far] = _outliers(path, quantities["force_N"][far])
     for name, values in quantities.items():
         least, most = ALLOWED[name]
         if not (values.min() >= least and values.max() <= most):
@@ -246,16 +248,32 @@ def _header(
 
 
 def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[str, Array]) -> None:
-    """Raise LabError for fields of no stated unit that are more likely in tesla, and for a time that falls."""
+    """Raise LabError for fields of no stated unit that are more likely in tesla, and for a time that falls in a cycle.
+
+    From cycle to cycle time may begin anew, where a column says which cycle a row is of. Each has two rows at least.
+    """
     field, most_mT = columns["field_mT"], found["field_mT"].max()
     if not field.has_unit and most_mT < MIN_FIELD_MT:
         raise LabError(
             f"{path}: {field.name} has no unit and is {most_mT:g} at most; state --column field_mT={field.name}:T if "
             "these are tesla, :mT if not"
         )
-    if "time_s" in found and (fallen := np.flatnonzero(np.diff(found["time_s"]) < 0.0)).size:
-        before_s = found["time_s"][fallen[0]]
-        raise LabError(f"{path}: {columns['time_s'].name} falls after {before_s:g} s; allowed is to rise")
+    if "time_s" not in found:
+        return
+    fallen = np.flatnonzero(np.diff(found["time_s"]) < 0.0)
+    for place in fallen[np.diff(found.get("cycle", found["time_s"] * 0.0))[fallen] == 0.0][:1]:
+        before_s = found["time_s"][place]
+        raise LabError(
+            f"{path}: {columns['time_s'].name} falls after {before_s:g} s; allowed is to rise, and to begin anew with "
+            "each cycle, a column"
+        )
+    if min(map(len, _records(found["time_s"]))) < MIN_ROWS:
+        raise LabError(f"{path}: a cycle of one row; at least {MIN_ROWS} are needed")
+
+
+def _records(time_s: Array) -> list[Array]:
+    """Return the places (n) of each record's rows; a new one begins wherever time falls."""
+    return np.split(np.arange(len(time_s)), np.flatnonzero(np.diff(time_s) < 0.0) + 1)
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -332,7 +350,8 @@ def _outliers(path: Path, force_N: Array) -> Mask:
     around = np.lib.stride_tricks.sliding_window_view(np.pad(force_N, half, mode="edge"), NEIGHBOURS)
     off_N = np.abs(force_N - np.median(around, axis=1))
     range_N = np.subtract(*np.percentile(force_N, (98.0, 2.0)))
-    far = off_N > max(OUTLIER_SDS * 1.4826 * float(np.median(off_N)), OUTLIER_OF_RANGE * float(range_N))
+    most_N = max(OUTLIER_SDS * 1.4826 * float(np.median(off_N)), OUTLIER_OF_RANGE * float(range_N))
+    far: Mask = off_N > most_N
     # rows of a table without order jump everywhere: there nothing is an outlier by its neighbours
     if np.median(off_N) > OUTLIER_OF_RANGE * range_N:
         return np.zeros(len(force_N), bool)
@@ -377,7 +396,8 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
     if "rate_mm_s" not in quantities:
         if place is None or time_s is None:
             raise LabError(f"{path}: no column is rate_mm_s; needed is that, or time_s and displacement_mm")
-        quantities["rate_mm_s"] = np.gradient(place, time_s)
+        rates = [np.gradient(place[rows], time_s[rows]) for rows in _records(time_s)]
+        quantities["rate_mm_s"] = np.concatenate(rates)
         made.append("rate_mm_s from displacement_mm over time_s")
     rate = quantities["rate_mm_s"]
     if place is None:
