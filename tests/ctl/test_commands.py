@@ -521,19 +521,36 @@ def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(
 ):
     """A weak device does not give 1.7 N with MRE-10-20, whose model gives 1.9."""
     forces, out = recording(tmp_path / "forces.csv", 1.4, 1.7, rate_hz), tmp_path / "mine.toml"
-    assert ("a weak device" in ctl("scene", "new", str(out), "--force", str(forces)).ended(0).out) == is_told
+    told = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(0).result["unmet_if_weak"]
+    assert ("force.most_N = 1.7: it gives 1.33" in told) == is_told
     assert load_scene(str(out)).insert.name == insert
+    lines = out.read_text().splitlines()
+    assert [line for line in lines if line.startswith("# ")] == [f"# NOT MET BY A WEAK DEVICE: {each}" for each in told]
+
+
+def test_a_flank_near_the_gaps_speed_is_told_with_the_tolerance_that_a_weak_device_keeps(tmp_path, ctl, checked_here):
+    """Its carriages have mass: of recorded pulses the samples miss twice what speed alone does."""
+    forces = recording(tmp_path / "f.csv", 0.9, 1.3, 3.0)
+    result = ctl("scene", "new", str(tmp_path / "mine.toml"), "--force", str(forces), "--json").ended(0).result
+    told = f"force.tolerance_rms_N = 0.026: it keeps {4.0 * result['missed_rms_N']:.2g}"
+    assert told in result["unmet_if_weak"]
 
 
 @pytest.mark.parametrize(
-    ("most_N", "rate_hz", "parts"),
-    [(40.0, 0.1, ["force.most_N = 40"]), (2.0, 5.0, ["tolerance_rms_N = 0.065: allowed for its signal is at least"])],
+    ("most_N", "rate_hz", "insert", "parts"),
+    [
+        (40.0, 0.1, "MRE-50-40", ["force.most_N = 40"]),
+        (2.0, 5.0, "MRE-50-40", ["tolerance_rms_N = 0.065: allowed for its signal is at least"]),
+        (1.5, 5.0, "MRE-10-20", ["tolerance_rms_N = 0.04: allowed for its signal is at least"]),
+    ],
 )
-def test_a_force_that_no_insert_renders_is_written_and_marked(tmp_path, ctl, checked_here, most_N, rate_hz, parts):
+def test_a_force_that_no_insert_renders_is_written_and_marked(
+    tmp_path, ctl, checked_here, most_N, rate_hz, insert, parts
+):
     out = tmp_path / "mine.toml"
     forces = recording(tmp_path / "f.csv", 0.7, most_N, rate_hz)
     result = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(1).result
-    assert result["insert"] == "MRE-50-40"
+    assert result["insert"] == insert
     assert all(any(part in line for line in result["unmet"]) for part in parts)
     assert out.read_text().startswith(f"# NOT MET: {result['unmet'][0]}\n")
     told = ctl("scene", "check", str(out), "--json").ended(1).error["message"]
@@ -571,6 +588,12 @@ def test_what_can_be_no_scene_is_told_and_leaves_no_file(tmp_path, ctl, options,
     out = tmp_path / "mine.toml"
     assert words in ctl("scene", "new", str(out), "--force", str(forces), *options, "--json").ended(2).error["message"]
     assert [file.name for file in tmp_path.iterdir()] == ["f.csv"]
+
+
+def test_the_scenes_forces_overwrite_no_file(tmp_path, ctl):
+    forces = recording(tmp_path / "mine.csv", 1.0, 1.4, 1.0)
+    told = ctl("scene", "new", str(tmp_path / "mine.toml"), "--force", str(forces), "--offset", "0.1", "--json")
+    assert told.ended(2).error["message"] == f"{forces} exists, where the scene's forces go"
 
 
 def test_an_insert_that_there_is_not_is_refused_and_leaves_no_file(tmp_path, ctl, checked_here):
