@@ -12,6 +12,8 @@ import pyarrow.parquet
 import pytest
 from distributed import LocalCluster
 
+from tormagd.commission.finding import Finding
+from tormagd.commission.report import Report
 from tormagd.lab.consoles.devices import Console, Drift, consoles
 from tormagd.lab.consoles.reading import files, read, read_all
 from tormagd.lab.consoles.summary import Summary
@@ -95,11 +97,27 @@ def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
     for error_N in (0.01, 0.03):
         write(tmp_path / f"{error_N}.mcap", 1, 0, error_N, 1.0)
     first, second = (read(str(tmp_path / f"{error_N}.mcap")) for error_N in (0.01, 0.03))
-    assert not isinstance(first, str)
-    assert not isinstance(second, str)
-    (console,) = consoles([msgspec.structs.replace(first, enabled_s=6.0), second])
+    assert isinstance(first, Summary)
+    assert isinstance(second, Summary)
+    (console,) = consoles([msgspec.structs.replace(first, enabled_s=6.0), second], [])
     assert (console.tracking_rms_N, console.worst_rms_N) == pytest.approx((((3 * 0.01**2 + 0.03**2) / 4) ** 0.5, 0.03))
     assert console.trim == Drift(1.0, 1.0, None)
+
+
+def test_a_commissioning_is_told_of_its_device_whether_it_was_recorded_or_not(tmp_path, capsys):
+    write(tmp_path / "1" / "a.mcap", 1, 0, 0.01, 1.0)
+    row = Finding("drag", 4.0, 0.1, "N", 0.0, 3.0, "grease it")
+    for serial_number, day, findings in ((1, 1, {"step": [row]}), (2, 0, {})):
+        report = Report(serial_number=serial_number, began_ns=(START_S + day * DAY_S) * 10**9, findings=findings)
+        (tmp_path / f"{serial_number:08x}.json").write_bytes(msgspec.json.encode(report))
+    (tmp_path / "notes.json").write_text("of somebody else")
+    (tmp_path / "0000000a.json").write_text("{}")
+    assert main(["fleet", str(tmp_path), "--workers", "1"]) == 1
+    told = capsys.readouterr()
+    assert [line.split()[0] for line in told.out.splitlines()] == ["device", "00000001", "00000002"]
+    assert "2026-09-22, not whole, drag 4 ± 0.1 N" in told.out
+    assert told.err.count("\n") == 1
+    assert "left out 0000000a.json: " in told.err
 
 
 def test_what_cannot_be_kept_is_told_after_what_was_found(folder, scheduler, capsys, tmp_path):
@@ -121,7 +139,7 @@ def test_a_bucket_is_read_like_a_folder(folder):
 
 def test_a_worker_that_dies_is_told_with_its_file(folder):
     with ThreadPoolExecutor(1) as here:
-        _, left_out = read_all({"a.mcap": 3}, here)  # type: ignore[dict-item]
+        _, _, left_out = read_all({"a.mcap": 3}, here)  # type: ignore[dict-item]
     assert left_out["a.mcap"].startswith("the worker that read it failed: ")
 
 

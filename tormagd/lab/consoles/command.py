@@ -2,10 +2,12 @@
 
 Every `.mcap` in the folder, or under a URL that fsspec knows (`s3://bucket/recordings` takes the package s3fs), is read
 by one of the workers. It is summed up as `summary.py` says; `--out` keeps one row of a recording. The table has one
-line for each device and insert. A file that cannot be read is named and left out.
+line for each device and insert. A file that cannot be read is named and left out. The findings of `tormagctl
+commission`, `SERIAL.json` in the same place, give their device the day and the rows that did not pass.
 """
 
 import argparse
+import datetime
 import os
 import sys
 
@@ -14,6 +16,7 @@ import msgspec
 import pyarrow
 import pyarrow.parquet
 
+from tormagd.commission.report import Report
 from tormagd.lab import executors
 from tormagd.lab.consoles.devices import Console, Drift, consoles
 from tormagd.lab.consoles.reading import SUFFIX, files, read_all
@@ -24,7 +27,18 @@ from tormagd.lab.told import table
 from tormagd.output import write_line
 from tormagd_client.printable import printable
 
-HEADINGS = ("device", "insert", "files", "enabled", "RMS, worst mN", "trim", "current A", "clock ppm", "held back by")
+HEADINGS = (
+    "device",
+    "insert",
+    "files",
+    "enabled",
+    "RMS, worst mN",
+    "trim",
+    "current A",
+    "clock ppm",
+    "commissioned",
+    "held back by",
+)
 MIN_SHARE, MAX_LIMITS = 0.001, 3
 "Least share of the time, and most limits, that are shown to a person."
 KINDS = {
@@ -69,6 +83,7 @@ def _cells(console: Console) -> tuple[str, ...]:
         _shown(console.trim, ".3f"),
         _shown(console.current_A, ".2f"),
         _shown(console.clock_drift_ppm, ".0f"),
+        "unknown" if console.commissioned is None else printable(_judged(console.commissioned)),
         printable(", ".join([*held, *faults])) or "nothing",
     )
 
@@ -84,6 +99,13 @@ def _shown(drift: Drift | None, form: str) -> str:
     if first == newest:
         return first
     return f"{first}..{newest}" + ("" if drift.per_day is None else f" ({drift.per_day:+.1g}/day)")
+
+
+def _judged(report: Report) -> str:
+    """Return the day of a commissioning, UTC, and what did not pass of it."""
+    day = datetime.datetime.fromtimestamp(report.began_ns * 1e-9, datetime.UTC).date()
+    short = [] if report.is_whole else ["not whole"]
+    return ", ".join([f"{day}", *short, *(f"{each.name} {each.shown}" for each in report.failed)])
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -107,7 +129,7 @@ def run(options: argparse.Namespace) -> Found:
     if not urls:
         raise LabError(f"{options.recordings}: no {SUFFIX} in it; `tormagctl record` makes them")
     with executors.chosen(options) as executor:
-        summaries, left_out = read_all(urls, executor)
+        summaries, reports, left_out = read_all(urls, executor)
     for name, reason in left_out.items():
         write_line(f"tormag-lab fleet: left out {printable(name)}: {printable(reason)}", sys.stderr)
     exit_code = 1 if left_out else 0
@@ -117,7 +139,7 @@ def run(options: argparse.Namespace) -> Found:
     except (OSError, ValueError, ImportError) as error:  # the consoles are told all the same
         write_line(f"tormag-lab fleet: {printable(str(error))}", sys.stderr)
         exit_code = 2
-    found = consoles(summaries.values())
+    found = consoles(summaries.values(), reports.values())
     result = {"consoles": found, "recordings": summaries, "left_out": left_out}
     rows = (dict(zip(HEADINGS, _cells(console), strict=True)) for console in found)
     return Found(msgspec.to_builtins(result), table(rows), exit_code)

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
+from tormagd.commission.report import Report
 from tormagd.lab.consoles.summary import Summary
 
 DAY_S = 86_400.0
@@ -40,20 +41,31 @@ class Console(msgspec.Struct, frozen=True, kw_only=True):
     trim: Drift | None
     current_A: Drift | None
     clock_drift_ppm: Drift | None
+    commissioned: Report | None
+    "The device's newest commissioning, whatever its insert was."
 
 
-def consoles(summaries: Iterable[Summary]) -> list[Console]:
-    """Return one console for each device and insert, sorted by both; unknown devices count as one and come first."""
+def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Console]:
+    """Return one console for each device and insert, sorted by both; unknown devices count as one and come first.
+
+    A device that was only commissioned has one, too, without an insert.
+    """
     groups: dict[tuple[int, str], list[Summary]] = defaultdict(list)
     for each in summaries:
         groups[-1 if each.serial_number is None else each.serial_number, each.insert].append(each)
-    return [_console(sorted(group, key=lambda each: each.start_s)) for _, group in sorted(groups.items())]
+    newest = {each.serial_number: each for each in sorted(reports, key=lambda each: each.began_ns)}
+    for serial_number in newest.keys() - {known for known, _ in groups}:
+        groups[serial_number, ""] = []
+    return [
+        _console(serial_number, insert, sorted(group, key=lambda each: each.start_s), newest.get(serial_number))
+        for (serial_number, insert), group in sorted(groups.items())
+    ]
 
 
-def _console(group: list[Summary]) -> Console:
+def _console(serial_number: int, insert: str, group: list[Summary], commissioned: Report | None) -> Console:
     """Return the console of a group of recordings in order of time; what none of them says is None.
 
-    The error over all is weighted by the time ENABLED.
+    A `serial_number` below 0 is unknown. The error over all is weighted by the time ENABLED.
     """
     enabled_s = sum(each.enabled_s for each in group)
     errors = [(each.enabled_s, each.tracking_rms_N) for each in group if each.tracking_rms_N is not None]
@@ -61,8 +73,8 @@ def _console(group: list[Summary]) -> Console:
     for each in group:
         limits_s.update(each.limits_s)
     return Console(
-        serial_number=group[0].serial_number,
-        insert=group[0].insert,
+        serial_number=None if serial_number < 0 else serial_number,
+        insert=insert,
         recordings=len(group),
         enabled_s=enabled_s,
         tracking_rms_N=_pooled(errors),
@@ -72,6 +84,7 @@ def _console(group: list[Summary]) -> Console:
         trim=_drift([(each.start_s, each.trim) for each in group]),
         current_A=_drift([(each.start_s, each.current_A) for each in group]),
         clock_drift_ppm=_drift([(each.start_s, each.clock_drift_ppm) for each in group]),
+        commissioned=commissioned,
     )
 
 
