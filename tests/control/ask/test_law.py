@@ -21,6 +21,8 @@ PORTRAIT = Portrait(
 SCENE = Force(least_N=0.0, most_N=2.0, resolution_N=0.1, tolerance_rms_N=0.05)
 WALL = Wall(10.0, 0.25, 0.6)
 PERIOD_S = 0.002
+PASSES = 10
+"So many plans before the wall the gap may be on its way already: 20 ms."
 
 
 class Following:
@@ -44,17 +46,24 @@ def following() -> Following:
 @pytest.mark.parametrize(("rate_mm_s", "is_slow"), [(3.0, True), (10.0, False), (60.0, False)])
 def test_a_handle_feels_the_wall_where_it_is_and_at_most_a_little_before(following, rate_mm_s, is_slow) -> None:
     """The gap itself follows 1.4 N/s at most, the wall rises by 0.75, 2.5 and 15."""
-    most_N = WALL.friction_N + EARLY_N
-    before_N = 0.0
+    before_N = []
     for place_mm in np.arange(-20.0, 14.0, rate_mm_s * PERIOD_S).tolist():
         ask = following.ask(Travel(place_mm, rate_mm_s), wall=WALL)
         assert ask.asked_N == WALL.force_N(place_mm)
         if place_mm < WALL.place_mm:
-            before_N = ask.path_N[0]
-            assert before_N <= most_N + 1e-3
-    assert before_N > WALL.friction_N + (0.0 if is_slow else 0.05)
+            before_N.append(ask.path_N[0])
+    assert max(before_N[:-PASSES]) <= WALL.friction_N + EARLY_N + 1e-3
+    assert before_N[-1] > WALL.friction_N + (0.0 if is_slow else 0.05)
     assert (ask.path_N[0] == pytest.approx(ask.asked_N, abs=0.03)) is is_slow
     assert (Limit.RATE in ask.limits) is not is_slow
+
+
+def test_the_gap_passes_the_place_of_a_stiff_wall_at_speed(following: Following) -> None:
+    wall, at_once_s = Wall(10.0, 1.0, 0.6), 0.2 / (38.0 * 0.036)
+    places_mm = np.arange(-20.0, 20.0, 30.0 * PERIOD_S).tolist()
+    gap_N = [following.ask(Travel(place_mm, 30.0), wall=wall).path_N[0] for place_mm in places_mm]
+    felt_mm = next(place for place, each_N in zip(places_mm, gap_N, strict=True) if each_N > 0.8 + EARLY_N)
+    assert (felt_mm - wall.place_mm) / 30.0 == pytest.approx(at_once_s, abs=0.01)
 
 
 def test_from_one_wall_to_the_next_the_force_goes_along_a_ramp() -> None:
@@ -85,8 +94,8 @@ def test_a_wall_that_goes_with_the_handle_asks_for_what_it_says(following: Follo
     for place_mm in np.arange(0.0, 60.0, 0.03).tolist():
         ask = following.ask(Travel(place_mm, 15.0), wall=Wall(place_mm - 1.2, 1.0))
         assert ask.asked_N == pytest.approx(1.2)
-        # each message says that the wall stands: the gap sets out to what would come
-        assert ask.force_N <= 1.2 + PORTRAIT.min_N + EARLY_N + 1e-3
+        # each message says that the wall stands: the gap sets out to what would come, at 1 mm of 0.036 N
+        assert ask.force_N <= 1.2 + PORTRAIT.min_N + EARLY_N + 0.036
 
 
 def test_a_wall_that_is_met_again_is_there_at_once(following: Following) -> None:

@@ -36,7 +36,7 @@ _FORECAST_S: Final = TIMES_S[:MIN_TIMES]
 OUTRUN_N: Final = 0.02
 "Where the path misses what is known ahead by more, the carriages are too slow: the limit RATE."
 
-EARLY_N: Final = 0.09
+EARLY_N: Final = 0.08
 """By so much more than is felt there the gap closes before a wall: 0.1 N with what is not known of a device. The least
 RMS error would brake the handle more."""
 
@@ -237,7 +237,8 @@ class Governor:
     ) -> list[float]:
         """Return the forces (7) at PATH_S on the best path for a handle that pushes against `wall` at its present rate.
 
-        The gap closes early by at most EARLY_N over the force at each moment. Updates `sent_N` and `expected_N`.
+        The gap closes early by at most EARLY_N over the force at each moment, and passes the wall's place at speed.
+        Updates `sent_N` and `expected_N`.
         """
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
         begins_s = lag_s + SPEEDING_UP_S
@@ -246,7 +247,10 @@ class Governor:
             for after_s in TIMES_S
         ]
         over_N = within(within(wall.friction_N, self._allowed) + added_N, bounds) - wall.friction_N + EARLY_N
-        most_N = [wall.force_N(place_mm + rate_mm_s * after_s) + over_N for after_s in PATH_S]
+        most_N: list[Bounds] = []
+        for after_s in PATH_S:
+            now_N = wall.force_N(place_mm + rate_mm_s * after_s) + over_N
+            most_N.append((now_N, wall.force_N(place_mm + rate_mm_s * (begins_s + after_s)) + over_N))
         return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
@@ -295,12 +299,12 @@ class Governor:
         bounds: Bounds,
         device: DeviceFit,
         lag_s: float,
-        most_N: list[float] | None = None,
+        most_N: list[Bounds] | None = None,
     ) -> list[float]:
         """Return the forces (7) at PATH_S, within `bounds`, on the gap's best path for `wanted_N` at TIMES_S.
 
-        `most_N` are upper bounds at PATH_S; None: none. `force_N` is where the path begins during a ramp. Updates
-        `sent_N` and `expected_N`.
+        `most_N` are upper bounds at PATH_S, in pairs as `Path.pursue` takes them; None: none. `force_N` is where the
+        path begins during a ramp. Updates `sent_N` and `expected_N`.
         """
         from_N, sent_N = self._left_from(force_N)
         path_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, wanted_N, device, lag_s, most_N)

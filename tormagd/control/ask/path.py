@@ -60,7 +60,7 @@ class Path:
         wanted_N: list[float],
         device: DeviceFit,
         lag_s: float,
-        most_N: list[float] | None = None,
+        most_N: list[tuple[float, float]] | None = None,
     ) -> tuple[list[float], float]:
         """Find the best path for the forces `wanted_N` at TIMES_S, and return forces (7) at PATH_S and a force to send.
 
@@ -69,7 +69,9 @@ class Path:
         are those of the gap. `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`.
 
         With `most_N` None the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7)
-        opens the path where it would give more than that. Then `wanted_N` has to be of so much later already.
+        opens the path where it would give more. Its pairs are the most at that time, and the most when the gap gets
+        there. The carriages may set out to the second by as much as the gap lags at top speed. `wanted_N` has to be of
+        so much later already.
         """
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
@@ -85,8 +87,10 @@ class Path:
         sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(from_N))
         path_mm = nearest_path_mm(sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
         if most_N is not None:
-            for place, force_N in enumerate(most_N):
-                path_mm[place] = max(path_mm[place], portrait.gap_mm_at(device.model_N(force_N)))
+            lead_mm = late_s * self._gap_speed_mm_s
+            for place, (now_N, then_N) in enumerate(most_N):
+                least_mm = portrait.gap_mm_at(device.model_N(now_N)) - lead_mm
+                path_mm[place] = max(path_mm[place], least_mm, portrait.gap_mm_at(device.model_N(then_N)))
         forces_N: list[float] = []
         left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for to_mm in path_mm:
