@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
-from contact import LATER_MS, WORSE, WORSE_N, judged, kept, shown
+from contact import LATER_MS, WORSE, WORSE_N, held_ms, judged, kept, shown
 from rendering.device_draws import device
 from rendering.following import VALID_S, armed
-from rendering.touching import Case, core_of
+from rendering.touching import Case, Touch, core_of
 
 from tormagd.control.records import TimedSetpoint
 from tormagd.simulation.hand import FeltHand, Impedance
@@ -36,6 +37,13 @@ def test_a_law_with_a_standby_is_felt_in_half_the_time_and_not_before(rows) -> N
 def test_a_hand_that_draws_back_is_let_go(rows) -> None:
     assert rows["way"]["withdrawal_held_ms"] < 0.75 * rows["force"]["withdrawal_held_ms"]
     assert rows["way"]["withdrawal_held_ms"] <= rows["way"]["withdrawal_bound_ms"] + 100.0
+
+
+def test_a_handle_that_only_sticks_at_the_waiting_level_is_not_held() -> None:
+    """Static friction is more than kinetic; a brake that is still closed holds."""
+    time_s, nothing = np.arange(4.0), np.zeros(4)
+    touch = Touch(time_s, nothing, nothing, np.array([0.6, 0.6, 0.9, 0.6]), np.full(4, -0.75), nothing, (), ())
+    assert held_ms(touch, 0.6) == 1.0
 
 
 def test_the_table_has_a_row_for_each_way(rows) -> None:
