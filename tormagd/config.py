@@ -10,13 +10,15 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import checked as checked, convert_as, table_in as table_in
-from tormagd_client.endpoints import Endpoints, Strict, require_usable
+from tormagd.toml_file import checked as checked, convert, convert_as, placed, table_in as table_in
+from tormagd_client.endpoints import ConfigError, Endpoints, Strict, require_usable
 from tormagd_client.printable import require
 
 MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 MAX_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
+CALIBRATED = ("motor", "position", "trim")
+"Tables of which a device's calibration may state keys."
 MOST_PLAYOUT_MS = 200.0
 "Half of what the whole way from sensor to force may take."
 
@@ -33,6 +35,9 @@ class Device(Strict, frozen=True):
     profiles: str = ""
     """Folder for the profiles: what each device has shown of itself. Without one it is the service's,
     $STATE_DIRECTORY/profiles. Where there is none nothing is kept."""
+    calibrations: str = ""
+    """Folder of what `tormagctl commission` found: a device's SERIAL.toml goes before [motor], [position] and [trim].
+    Without one it is the service's, $STATE_DIRECTORY/calibrations."""
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0
@@ -279,6 +284,33 @@ class Config(Strict, frozen=True):
             f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
         )
         require_usable(self.endpoints)
+
+
+class Calibration(Strict, frozen=True):
+    """What a commissioning found of the device `serial_number`: keys that go before those of a configuration."""
+
+    serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
+    motor: dict[str, float] = msgspec.field(default_factory=dict)
+    position: dict[str, float] = msgspec.field(default_factory=dict)
+    trim: dict[str, float] = msgspec.field(default_factory=dict)
+
+
+def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
+    """Return `config` with what the calibration file `path` states in place of its own motor, position and trim.
+
+    Raises ConfigError naming file, key, value and what is allowed. Refused are another device than `serial_number`, and
+    values that no configuration may have.
+    """
+    found = convert(path, Calibration)
+    stated = msgspec.to_builtins(found)
+    try:
+        require(
+            found.serial_number == serial_number, "serial_number", found.serial_number, f"{serial_number}, the device's"
+        )
+        own = msgspec.to_builtins(config)
+        return checked({key: {**own[key], **stated[key]} if key in CALIBRATED else own[key] for key in own}, Config)
+    except ValueError as error:
+        raise ConfigError(placed(path, str(error))) from error
 
 
 def load_config(path: Path | None) -> Config:

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import MIN_INFERENCE_HZ, Config, Rates, load_config
+from tormagd.config import MIN_INFERENCE_HZ, Config, Rates, load_calibration, load_config
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
 from tormagd_client.endpoints import ConfigError
@@ -330,3 +330,35 @@ def test_the_sample_files_are_accepted(example: Path) -> None:
     config = load_config(example)
     assert config.scene == "coronary"
     choose(config.device, config.rates)
+
+
+# -- what a device's calibration states goes before it -----------------------------------------------------------------
+
+
+def test_a_calibration_goes_before_the_configurations_own_keys(write) -> None:
+    config = load_config(write("[motor]\nsupply_V = 11.0\nresistance_ohm = 3.0"))
+    calibrated = load_calibration(
+        write("serial_number = 7\n[motor]\nresistance_ohm = 2.5\n[trim]\nleast = 0.8"), config, 7
+    )
+    motor = msgspec.structs.replace(config.motor, resistance_ohm=2.5)
+    assert calibrated == msgspec.structs.replace(
+        config, motor=motor, trim=msgspec.structs.replace(config.trim, least=0.8)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "serial_number"),
+        ("serial_number = 8", "serial_number = 8: allowed is 7, the device's (line 1)"),
+        ("serial_number = 7\n[trim]\nleast = 1.5", "`float` <= 1.0 - at `$.trim.least` (it is 1.5) (line 3)"),
+        ("serial_number = 7\n[trim]\nleast = nan", "trim.least"),
+        ("serial_number = 7\n[motor]\nresistance = 2.0", "did you mean"),
+        ("serial_number = 7\n[limits]\nskew_fault_mm = 2.0", "unknown field `limits`"),
+    ],
+)
+def test_a_calibration_that_no_device_may_have_is_refused_by_name(write, text, says) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_calibration(path := write(text), Config(), 7)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert says in str(caught.value)

@@ -293,6 +293,19 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
         ("          it is of another serial\n          next: tormagctl calibrate --device, which keeps a new profile",),
         (),
     ),
+    "the calibration in force": (
+        {"calibration": {"file": "/c/00000007.toml"}},
+        ("calibrated by /c/00000007.toml",),
+        (),
+    ),
+    "why the device's calibration is not used": (
+        {"calibration": {"refusal": "serial_number = 8: allowed is 7"}},
+        (
+            "          serial_number = 8: allowed is 7\n"
+            "          next: tormagctl commission FOLDER writes a new one; then systemctl reload tormagd",
+        ),
+        ("calibrated",),
+    ),
     "nothing of a profile where none was to be": ({"profile": ANOTHERS | {"folder": ""}}, (), ("another serial",)),
     "what to do next": (
         {"next_commands": ("clear-fault", "home", "enable")},

@@ -182,12 +182,13 @@ def test_a_daemon_that_runs_says_itself_what_it_was_granted(good, told):
 
 def test_a_daemon_s_device_and_build_are_what_it_says(told, status_with):
     link = status_with()["link"] | {"state": "BACK_OFF", "cause": "no such port", "remedy": "plug it in"}
-    found = told(link=link, build="interpreted: no C compiler")
+    found = told(link=link, build="interpreted: no C compiler", calibration={"refusal": "serial_number = 8"})
     assert (found["device port"]["found"], found["device port"]["remedy"]) == (
         "/dev/tormag: BACK_OFF: no such port",
         "plug it in",
     )
     assert (found["build"]["verdict"], found["build"]["found"]) == ("warn", "interpreted: no C compiler")
+    assert (found["calibration"]["verdict"], found["calibration"]["found"]) == ("warn", "serial_number = 8")
 
 
 def test_where_none_answers_it_is_said_that_the_caller_is_judged(good, run_dir):

@@ -19,7 +19,7 @@ import pytest
 from firmware_protocol.build import settle
 from tormagd.assembly.build import Core
 from tormagd.closed_loop import VirtualPort
-from tormagd.config import Config, Rates, RealTime
+from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, load_calibration
 from tormagd.control.core import Planner
 from tormagd.control.records import Plan
 from tormagd.daemon import daemon as daemon_module, telemetry_loop
@@ -146,13 +146,19 @@ class Running:
         self.clients.append(Client.local(self.folder, 1e-3, source))
         return self.clients[-1]
 
-    def start(self, rates: Rates = Rates(), *, is_plugged_in: bool = True) -> None:  # noqa: B008 it is immutable
+    def start(
+        self,
+        rates: Rates = Rates(),  # noqa: B008 it is immutable
+        *,
+        is_plugged_in: bool = True,
+        device: DeviceTable = DeviceTable(),  # noqa: B008
+    ) -> None:
         """Begins to run; that takes some seconds."""
         self.port.is_plugged_in = is_plugged_in
-        self._runner.run(self._begun(rates))
-
-    async def _begun(self, rates: Rates) -> None:
         config = Config(endpoints=in_folder(self.folder), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
+        self._runner.run(self._begun(msgspec.structs.replace(config, device=device)))
+
+    async def _begun(self, config: Config) -> None:
         self.daemon = Daemon(config, self.core, self.port.open, list(NOT_GRANTED), config_file=CONFIG_FILE)
         self.planner = FailingPlanner(self.daemon._inference.planner)
         self.daemon._inference.planner = self.planner  # type: ignore[assignment]
@@ -521,7 +527,7 @@ def test_what_may_not_be_done_yet_is_refused_and_stop_opens_and_latches(armed: R
     armed.until(lambda status: not status["is_busy"], "open")
     home, enable, look = (armed.client.ask(name) for name in ("home", "enable", "status"))
     assert armed.answer(home)
-    with pytest.raises(RefusedError, match="homing"):
+    with pytest.raises(RefusedError, match="homes"):
         armed.answer(enable)
     assert armed.answer(look)["is_busy"]
     status = armed.until(lambda status: status["is_homed"] and not status["is_busy"], "homed")
@@ -581,6 +587,47 @@ def test_a_scene_is_changed_while_disabled_and_the_device_stays_homed(armed: Run
     assert status["arm"]["given"] == ["enable"]
     armed.command("stop")
     assert armed.refused("use-scene", scene="coronary") == "fault"
+
+
+def test_a_device_runs_by_its_calibration_and_is_busy_until_then(
+    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, gate = tmp_path / "00000001.toml", threading.Event()
+
+    def once_open(path: Path, config: Config, serial_number: int) -> Config:
+        gate.wait()
+        return load_calibration(path, config, serial_number)
+
+    monkeypatch.setattr("tormagd.daemon.calibrations.load_calibration", once_open)
+
+    def in_force(text: str) -> tuple[float, dict[str, str]]:
+        """The motor's resistance in force, and what status says, once this file was read."""
+        file.write_text(text)
+        running.until(lambda status: awaits(1), "it is to be read")
+        assert running.refused("enable") == running.refused("use-scene", scene="pulse") == "busy"
+        gate.set()
+        known = running.until(lambda status: not awaits(1), "it was read")["calibration"]
+        gate.clear()
+        return running.command("describe")["configuration"]["motor"]["resistance_ohm"], known
+
+    running.start(device=DeviceTable(calibrations=str(tmp_path)))
+    awaits = running.daemon._calibrations.is_awaited
+    calibrated = "serial_number = 1\n[motor]\nresistance_ohm = 2.5\n[trim]\nleast = 0.7\n"
+    assert in_force(calibrated) == (2.5, {"file": str(file), "refusal": "", "folder": str(tmp_path)})
+    running.arm()
+    running.command("disable")
+    running.until(lambda status: not status["is_busy"], "open")
+    assert running.scene("pulse")["scene_change"]["error"] is None
+    assert running.command("describe")["configuration"]["motor"]["resistance_ohm"] == 2.5
+    running.daemon._read_again = lambda: running.daemon._calibrations.configured
+    for refused, says in (
+        (calibrated.replace("= 1", "= 2"), "serial_number = 2: allowed is 1, the device's (line 1)"),
+        (calibrated.replace("2.5", "0.0"), "$.motor.resistance_ohm` (it is 0.0) (line 3)"),
+        ("serial_number = 1\n[position]\nproportional_per_mm = 900.0\n", "gain margin"),
+    ):
+        signal.raise_signal(signal.SIGHUP)
+        resistance_ohm, known = in_force(refused)
+        assert (resistance_ohm, known["file"], says in known["refusal"]) == (2.2, "", True), known
 
 
 def test_fifty_changes_of_the_scene_leave_nothing_behind(alone: Running) -> None:

@@ -17,7 +17,7 @@ import pytest
 
 from tormagd.assembly.profile import ProfileError
 from tormagd.bounded_file import in_place_of, read_bounded
-from tormagd.config import Config, load_config
+from tormagd.config import Config, load_calibration, load_config
 from tormagd.control.believe.strength import device_bounds
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
@@ -103,6 +103,7 @@ def _key(path: Path) -> None:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "config": lambda path: load_scene(load_config(path).scene),
+    "calibration": lambda path: load_calibration(path, Config(), 7),
     "scene": lambda path: load_scene(str(path)),
     "plant": load_plant,
     "model": lambda path: load_model(path, element="torque"),

@@ -56,10 +56,11 @@ V1: dict[type[msgspec.Struct], str] = {
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver roller_radius_mm uptime_s least_N "
     "most_N trim device profile least_gap_mm link setpoints peers "
     "rates phases_us late_ticks_by fault_details limit_details newest_stall not_granted way "
-    "black_box output next_commands is_open following arm scene_change",
+    "black_box output next_commands is_open following arm scene_change calibration",
     FollowingReport: "rms_N aligned_rms_N delay_ms",
     messages.ArmReport: "given is_over error",
     messages.SceneReport: "scene is_over error",
+    messages.CalibrationReport: "file refusal folder",
     OutputReport: "rate slew not_finite range",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
     "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock unsent refused "

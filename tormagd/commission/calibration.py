@@ -18,7 +18,7 @@ DIGITS = "{:.4g}"
 
 
 def calibration(report: Report, config: Config) -> str:
-    """Return the tables [motor], [position] and [trim] of the device of `report`, as TOML; `config` was in force.
+    """Return the TOML that `load_calibration` reads: [motor], [position], [trim]; `config` was in force.
 
     A table is left out where its findings are not known, or where no gain is robust; [position] also goes with [motor].
     The first line is a comment, and without tables the only one.
@@ -35,7 +35,11 @@ def calibration(report: Report, config: Config) -> str:
         "inertia_kg_m2": motor.inertia_kg_m2 * share("inertia over motor.inertia_kg_m2"),
         "coulomb_V": motor.coulomb_V * share("friction over the configured") * resistance / back_emf,
     }
-    lines = [f"# device {report.serial_number}, by `tormagctl commission`; {len(report.failed)} rows failed"]
+    lines = [
+        f"# by `tormagctl commission`; {len(report.failed)} rows failed",
+        f"serial_number = {report.serial_number}",
+        "",
+    ]
     if all(math.isfinite(value) for value in measured.values()):
         lines += _table("motor", measured)
         lines += _position(msgspec.structs.replace(config, motor=msgspec.structs.replace(motor, **measured)))

@@ -315,7 +315,7 @@ COMMANDS = {
     "commission": Command(
         "guided: judge this device row by row, in a page and a file; then let the daemon begin from what it showed",
         "commission.commission",
-        ("config", "endpoints", "wait_s"),
+        ("endpoints", "wait_s"),
         (
             option("folder", type=Path, metavar="FOLDER", help="for the page and the findings, by serial number"),
             option("--resume", dest="is_resumed", action="store_true", help="go on after the steps that are done"),

@@ -13,12 +13,11 @@ from tormagd.commission.known import Known
 from tormagd.commission.page import page_of
 from tormagd.commission.report import MAX_BYTES, Report, begun
 from tormagd.commission.sequence import STEPS, Findings, Step, Stopped, sequence
-from tormagd.config import Config
+from tormagd.config import Config, checked
 from tormagd.ctl.calibrate import agree
 from tormagd.ctl.calibrate_run import Run, connected, known_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.output import write_line
-from tormagd.scenes.scene import load_scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError
@@ -33,6 +32,16 @@ class _Conformance(msgspec.Struct):
     checks: list["_Check"]
 
 
+class _Scene(msgspec.Struct):
+    """What is read of the daemon's scene."""
+
+    force: "_Force"
+
+
+class _Force(msgspec.Struct):
+    most_N: float
+
+
 class _Check(msgspec.Struct):
     name: str
     passed: bool
@@ -41,7 +50,6 @@ class _Check(msgspec.Struct):
 
 
 def commission(
-    config: Config,
     endpoints: Endpoints,
     wait_s: float,
     folder: Path,
@@ -52,6 +60,8 @@ def commission(
 ) -> Outcome:
     """Run all steps on the device, and keep findings and page in `folder`, named by its serial number.
 
+    The configuration that the daemon has in force judges, an earlier calibration included.
+
     Findings (.json) and page (.html) are written after each step; after the last one also the calibration (.toml).
     `is_resumed` goes on with those that are there. `weight_N` is the weight to hang up, N; None: there is none.
     `conformance` is the kit's report, None without one. The outcome has the `page` and the report's fields. It is
@@ -60,10 +70,10 @@ def commission(
     `known_of`, `Run.follow` and `calibrate.agree`; the gap opens then, too.
     """
     checks = None if conformance is None else _failed_checks(conformance)
-    with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
-        scene = load_scene(config.scene)
     with Client(endpoints, wait_s, SOURCE) as client:
-        status = client.status()
+        status, running = client.status(), client.describe()
+        with as_usage_error(ConfigError, hint="check that tormagd and tormagctl are of the same version"):
+            config, scene = checked(running.configuration, Config), checked(running.scene, _Scene)
         known = known_of(config, status, scene.force.most_N, weight_N)
         serial_number = status.link.serial_number
         if serial_number is None:

@@ -21,7 +21,7 @@ from tormagd.config import Config
 from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rate, measured, rates
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
-from tormagd.ctl.status import refused
+from tormagd.ctl.status import RECOMMISSION, refused
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, not_understood
@@ -159,11 +159,12 @@ def nobody(why: ClientError | None) -> tuple[Finding, ...]:
 
 
 def of_daemon(known: Running) -> tuple[Finding, ...]:
-    """Return findings on what a daemon says of itself: that it runs, build, what it asked of the kernel, and its
-    device.
+    """Return findings on what a daemon says of itself: that it runs, build, what it asked of the kernel, its device,
+    and the device's calibration.
 
     FAIL for a setting that the kernel refused, or a link that is not RUNNING. WARN for an interpreted build, and for
-    `fifo_priority` or `lock_memory` that is not set; other settings that are not set have no finding.
+    `fifo_priority` or `lock_memory` that is not set; other settings that are not set have no finding. WARN for a
+    calibration that is refused, too.
     """
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
@@ -184,6 +185,9 @@ def of_daemon(known: Running) -> tuple[Finding, ...]:
     device = f"{link.port}: {link.state}{link.cause and f': {link.cause}'}"
     is_there = link.state == "RUNNING"
     findings.append(_finding("device port", is_there, device, link.remedy or "tormagctl firmware", Severity.FAIL))
+    calibration = status.calibration
+    found = calibration.refusal or calibration.file or "none: the device runs by the configuration"
+    findings.append(_finding("calibration", not calibration.refusal, found, RECOMMISSION))
     return tuple(findings)
 
 

@@ -25,6 +25,7 @@ from tormagd_client.messages import (
 from tormagd_client.wire import understood
 
 UNKNOWN = "-"
+RECOMMISSION = "tormagctl commission FOLDER writes a new one; then systemctl reload tormagd"
 OLD_MS = 1_000.0
 "An older setpoint may still be valid; its age is shown."
 SURE_WINDOWS = 20
@@ -104,7 +105,7 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 def _device(known: Status, colour: Colour) -> list[str]:
     """Return lines on what the device has shown of itself, and why a kept profile is not used.
 
-    They also tell how long ago that was kept, and the other beliefs that act.
+    They also tell how long ago that was kept, the other beliefs that act, and the calibration in force.
     """
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
@@ -115,6 +116,8 @@ def _device(known: Status, colour: Colour) -> list[str]:
         f"{shown.sensor_zero_N:+.3f} ± {shown.sensor_zero_sd_N:.3f} N{age}",
         *_said("believed  ", believed(known.belief, ("scale", "offset", "sensor_zero")), str),
         *_explained(refusal, refusal and "tormagctl calibrate --device, which keeps a new profile", colour.yellow),
+        *_said("calibrated", known.calibration.file and f" by {known.calibration.file}", str),
+        *_explained(known.calibration.refusal, known.calibration.refusal and RECOMMISSION, colour.yellow),
     ]
 
 

@@ -16,6 +16,7 @@ from tormagd.config import Config
 from tormagd.control.believe.strength import device_bounds
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox, header
+from tormagd.daemon.calibrations import Calibrations
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
@@ -96,12 +97,16 @@ class Daemon:
             beside=beside,
         )
         self._profiles = self._profiles_of(core)
+        self._calibrations = Calibrations(
+            state_folder(config.device.calibrations, "calibrations"), config, self._run_core
+        )
         self._telemetry = TelemetryLoop(
             config,
             core,
             self._control,
             self._inference,
             self._profiles,
+            self._calibrations,
             self._connection,
             self._endpoint,
             self._phases,
@@ -227,20 +232,24 @@ class Daemon:
         self._control.command("use-scene", self._telemetry.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
-        """Replace the running core by `core`, made for `scene`, between two beats.
+        """Replace the running core by `core`, made for `scene`; what was learned stays where insert and model do."""
+        before, learned = self._core, self._inference.planner.believe.learned()
+        self._calibrations.configured = msgspec.structs.replace(self._calibrations.configured, scene=scene)
+        self._run_core(msgspec.structs.replace(self._config, scene=scene), core)
+        if (core.model, core.scene.insert.name) == (before.model, before.scene.insert.name):
+            self._inference.teach(learned)
 
-        Operating state, faults and homing stay. What was learned of the device stays where insert and model do. The
-        newest setpoint is forgotten, profiles are read again, telemetry reports on the new scene, and the black box
-        begins anew.
+    def _run_core(self, config: Config, core: Core) -> None:
+        """Replace the running core by `core`, made of `config`, between two beats.
+
+        Operating state, faults and homing stay. Nothing is known of the device. The newest setpoint is forgotten,
+        profiles are read again, telemetry reports on the new core, and the black box begins anew.
         """
-        control, inference, before, now_s = self._control, self._inference, self._core, time.monotonic()
-        learned, safety = inference.planner.believe.learned(), control.stepper.safety
-        stepper, planner = core.stepper(now_s), core.planner(now_s)
+        control, inference, now_s = self._control, self._inference, time.monotonic()
+        safety, stepper, planner = control.stepper.safety, core.stepper(now_s), core.planner(now_s)
         stepper.safety = safety
         stepper.opening.rest(safety.request_number)
-        if (core.model, core.scene.insert.name) == (before.model, before.scene.insert.name):
-            planner.teach(learned)
-        self._config, self._core = msgspec.structs.replace(self._config, scene=scene), core
+        self._config, self._core = config, core
         control.stepper, inference.planner = stepper, planner
         self._endpoint.inbox.begin_scene(core.scene)
         self._profiles.close()
@@ -256,7 +265,8 @@ class Daemon:
     async def _reload(self) -> None:
         """Read keys and configuration again, and take over what may change while control runs.
 
-        Logs which keys of the configuration changed, and which wait for a restart. Lists of keys that are refused stay
+        The device's calibration is read again, too. Logs which keys of the configuration changed, and which wait for a
+        restart. Lists of keys that are refused stay
         as they were; so does a configuration that is refused. Neither raises.
         """
         # in threads: no beat waits for a file
@@ -268,12 +278,14 @@ class Daemon:
         except ConfigError as error:
             log.error("the lists of keys stay as they were: %s; next: mend that and reload again", error)
         try:
-            again = reread(self._config, await asyncio.to_thread(self._read_again))
+            read = await asyncio.to_thread(self._read_again)
         except ConfigError as error:
             log.error("the configuration stays as it was: %s; next: mend that and reload again", error)
             return
-        self._config = again.config
-        self._telemetry.config = again.config
+        again = reread(self._calibrations.configured, read)
+        self._calibrations.configured, self._config = again.config, reread(self._config, read).config
+        self._calibrations.read_again()
+        self._telemetry.config = self._config
         self._endpoint.inbox.sources = again.config.sources
         log.info(
             "configuration read again: %s", f"now in force: {', '.join(again.taken)}" if again.taken else "no news"

@@ -19,6 +19,7 @@ from tormagd.control.believe.sensor import Disputed
 from tormagd.control.move.opening import is_open
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import BlackBox
+from tormagd.daemon.calibrations import Calibrations
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
@@ -79,6 +80,7 @@ class TelemetryLoop:
         control: ControlLoop,
         inference: InferenceLoop,
         profiles: Profiles,
+        calibrations: Calibrations,
         connection: Connection,
         endpoint: Endpoint,
         phases: Phases,
@@ -89,7 +91,7 @@ class TelemetryLoop:
     ) -> None:
         self._not_granted, self._config_file = tuple(not_granted), config_file
         self._control, self._inference = control, inference
-        self._connection, self._endpoint = connection, endpoint
+        self._calibrations, self._connection, self._endpoint = calibrations, connection, endpoint
         self._phases, self._causes, self._box = phases, causes, box
         self.timing = RateGroup("telemetry", 1_000_000_000 // config.rates.telemetry_hz)
         self._groups = [control.timing, inference.timing, self.timing]
@@ -172,12 +174,23 @@ class TelemetryLoop:
             endpoint.publish(self._newest)
         self._publish_ticks()
         # before the next plan learns from a new device
-        identity = None if self._connection.link is None else self._connection.link.identity
-        self._profiles.look(
-            None if identity is None else identity.serial_number, self._control.stepper.safety.is_driven
-        )
+        self._look_at_device()
         self.timing.record(beat.due_ns, start_ns, time.monotonic_ns())
         return True
+
+    def _look_at_device(self) -> None:
+        """Let calibrations and profiles look at the connected device; the profile of one that is awaited waits, too."""
+        serial_number, is_driven = self._serial_number(), self._control.stepper.safety.is_driven
+        change = None if self.scene_change is None else self.scene_change.newest
+        is_idle = not (is_driven or self.is_busy()) and (change is None or change.is_over)
+        self._calibrations.look(serial_number, self.config, is_idle=is_idle)
+        is_awaited = self._calibrations.is_awaited(serial_number)
+        self._profiles.look(None if is_awaited else serial_number, is_driven)
+
+    def _serial_number(self) -> int | None:
+        """Return the connected device's serial number; None while it is not known."""
+        identity = None if self._connection.link is None else self._connection.link.identity
+        return None if identity is None else identity.serial_number
 
     def _publish_ticks(self) -> None:
         """Publish the kept ticks if a peer listens to the recording, and drop them in any case."""
@@ -226,11 +239,15 @@ class TelemetryLoop:
         return self._box.write(reason, after_s, details)
 
     def conditions(self) -> Conditions:
-        """Return the conditions, as they are now, on which a command is taken or refused."""
+        """Return the conditions, as they are now, on which a command is taken or refused.
+
+        A device whose calibration is not in force yet is busy.
+        """
         control, doubted = self._control, self._inference.planner.believe.sensor.is_doubted
-        return conditions(
+        found = conditions(
             time.monotonic(), self.config, self._connection, control.stepper, control.output, sensor_doubted=doubted
         )
+        return found.replaced(busy=True) if self._calibrations.is_awaited(self._serial_number()) else found
 
     def is_busy(self) -> bool:
         """Tell whether the device homes or opens, or has been asked to."""
@@ -485,8 +502,8 @@ class TelemetryLoop:
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:
         """Return the reports that take most of a status' time, by the names of its fields.
 
-        They are `link`, `profile`, `setpoints`, `peers`, `rates`, `phases_us`, `late_ticks_by`, `way` and `black_box`.
-        They are made anew every TELL_S, after a command, and when the state of the link changes.
+        They are `link`, `profile`, `calibration`, `setpoints`, `peers`, `rates`, `phases_us`, `late_ticks_by`, `way`
+        and `black_box`. They are made anew every TELL_S, after a command, and when the state of the link changes.
         """
         if now_s - self._reported_s >= TELL_S or self._connection.state is not self._reported_state:
             self._reported_s, self._reported_state = now_s, self._connection.state
@@ -495,6 +512,7 @@ class TelemetryLoop:
             self._reports = {
                 "link": link,
                 "profile": self._profiles.report(),
+                "calibration": self._calibrations.report(),
                 "setpoints": self._endpoint.inbox.report(now_s),
                 "peers": self._endpoint.report(),
                 "rates": {group.name: group.report() for group in self._groups},

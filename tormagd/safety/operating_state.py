@@ -70,7 +70,7 @@ class Conditions(Value):
     connected         the device runs and is measured
     fresh             its State, Sense and Status are recent
     homed             the positions of its carriages are known
-    busy              it homes or opens, or was asked to
+    busy              it homes or opens, or was asked to; or its calibration is not in force yet
     device_latched    it holds a fault of its own
     sensor_doubted    the force sensor is not believed
     remedy            what to do about `cause`; empty where there is no advice
@@ -195,7 +195,7 @@ def _latched(state: SafetyState, present: Conditions) -> str:
 
 
 def _busy(state: SafetyState, present: Conditions) -> str:
-    return "the device is homing or opening" if present.busy else ""
+    return "the device homes or opens, or is not ready" if present.busy else ""
 
 
 def _lost(state: SafetyState, present: Conditions) -> str:
@@ -242,7 +242,12 @@ def _because(present: Conditions) -> str:
 
 ARM: Final = "tormagctl arm"
 CONNECTED = Guard("not_connected", "the device is connected", _not_connected, "check port, cable and supply")
-NOT_BUSY = Guard("busy", "the device neither homes nor opens", _busy, "wait until is_busy is false")
+NOT_BUSY = Guard(
+    "busy",
+    "the device neither homes nor opens, and its calibration is in force",
+    _busy,
+    "wait until is_busy is false",
+)
 NOT_LATCHED = Guard("device_latched", "the device has latched nothing", _latched, ARM)
 READY: tuple[Guard, ...] = (
     CONNECTED,

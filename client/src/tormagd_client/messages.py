@@ -378,6 +378,14 @@ class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
     folder: str = ""
 
 
+class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The device's calibration: the file in force, why none is, and the folder; each is empty where there is none."""
+
+    file: str = ""
+    refusal: str = ""
+    folder: str = ""
+
+
 class BlackBoxReport(msgspec.Struct, frozen=True, kw_only=True):
     """Folder of the black boxes, the newest of this run, why there is none, and how many parts were lost on the way."""
 
@@ -494,6 +502,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     following: FollowingReport | None = None
     arm: ArmReport | None = None
     scene_change: SceneReport | None = None
+    calibration: CalibrationReport = CalibrationReport()
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):

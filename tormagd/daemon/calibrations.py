@@ -1,0 +1,97 @@
+"""The calibration of the device that answers: read by its serial number, and the core is built anew with it."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from tormagd.assembly.build import Core, build_core
+from tormagd.config import Config, load_calibration
+from tormagd_client.endpoints import ConfigError
+from tormagd_client.messages import CalibrationReport
+
+log = logging.getLogger(__name__)
+
+
+class Made(NamedTuple):
+    """What a device is to run by: the configuration with its calibration, and the core; None: the one that runs."""
+
+    config: Config
+    core: Core | None
+    file: str
+    "The calibration's; empty without one."
+    refusal: str
+
+
+class Calibrations:
+    """Puts the calibration of each device that answers into force, from `folder`; None: none is read.
+
+    `configured` is the configuration without any. `take` puts a core in the place of the running one.
+    """
+
+    def __init__(self, folder: Path | None, configured: Config, take: Callable[[Config, Core], None]) -> None:
+        self.configured = configured
+        self._folder, self._take = folder, take
+        self._of: int | None = None
+        self._making: tuple[int, asyncio.Future[Made]] | None = None
+        self._file = self._refusal = ""
+
+    def is_awaited(self, serial_number: int | None) -> bool:
+        """Tell whether the device with this serial number may not be driven yet: its calibration is not in force."""
+        return self._folder is not None and serial_number not in (None, self._of)
+
+    def look(self, serial_number: int | None, running: Config, *, is_idle: bool) -> None:
+        """Go on with the calibration of the connected device, None where it is not known, while it `is_idle`.
+
+        Reads the file and builds a core in another thread, and takes it at a later look. `running` is the configuration
+        in force: the same one needs no new core. A calibration that is refused is logged, and the device runs by the
+        configuration alone. Where a scene does not run by that, the device is awaited on.
+        """
+        if not is_idle or serial_number is None or self._folder is None or serial_number == self._of:
+            return
+        if self._making is None or self._making[0] != serial_number:
+            path = self._folder / f"{serial_number:08x}.toml"
+            work = asyncio.get_running_loop().run_in_executor(
+                None, _make, path, serial_number, self.configured, running
+            )
+            self._making = serial_number, work
+        elif self._making[1].done():
+            self._note(serial_number, self._making[1])
+
+    def read_again(self) -> None:
+        """Read the device's calibration again, and run by it once the device is idle."""
+        self._of = self._making = None
+
+    def report(self) -> CalibrationReport:
+        """Return the file in force, why none is, and the folder; empty without."""
+        return CalibrationReport(file=self._file, refusal=self._refusal, folder=str(self._folder or ""))
+
+    def _note(self, serial_number: int, making: "asyncio.Future[Made]") -> None:
+        """Take what was made into force, and log it."""
+        refusal_before = self._refusal
+        try:
+            made = making.result()
+        except ConfigError as error:
+            self._refusal = f"the scene does not run without the last device's calibration: {error}"
+        else:
+            self._of, self._making, self._file, self._refusal = serial_number, None, made.file, made.refusal
+            if made.core is not None:
+                self._take(made.config, made.core)
+            if made.file:
+                log.info("the device's calibration is in force: %s", made.file)
+        if self._refusal and self._refusal != refusal_before:
+            log.warning("the device's calibration is not used: %s; next: tormagctl commission", self._refusal)
+
+
+def _make(path: Path, serial_number: int, configured: Config, running: Config) -> Made:
+    """Return what the device `serial_number` runs by. Raises ConfigError where no core is built without a calibration.
+
+    One that is refused, or with which no core is built, is left out, and the reason told. A missing file is none.
+    """
+    try:
+        config = load_calibration(path, configured, serial_number)
+        return Made(config, None if config == running else build_core(config), str(path), "")
+    except ConfigError as error:
+        refusal = "" if isinstance(error.__cause__, FileNotFoundError) else str(error)
+    return Made(configured, None if configured == running else build_core(configured), "", refusal)
