@@ -9,7 +9,7 @@ import pytest
 from firmware_protocol.codec import Message
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
-from tormagd.commission.course import COLUMNS, Course, Found, Heard, drive
+from tormagd.commission.course import COLUMNS, PREVIEW_STEP_S, Asked, Course, Found, Heard, drive
 from tormagd.commission.finding import Finding
 from tormagd.commission.known import Known
 from tormagd.commission.sequence import STEPS, Step, Stopped, sequence
@@ -83,11 +83,16 @@ class Bench:
             if name != "disable":
                 raise
 
-    def exchange(self, force_N: float | None) -> Heard:
+    def exchange(self, asked: Asked) -> Heard:
         """Five ticks with one setpoint."""
         if self.loop.now_s >= self.ends_s:
             raise KeyboardInterrupt
-        setpoint = None if force_N is None else TimedSetpoint(force_N, self.loop.now_s, 0.25)
+        setpoint = None
+        if asked.force_N is not None:
+            step_s = PREVIEW_STEP_S if asked.preview_N else 0.0
+            setpoint = TimedSetpoint(
+                asked.force_N, self.loop.now_s, 0.25, preview_N=asked.preview_N, preview_dt_s=step_s
+            )
         rows = []
         for number in range(5):
             for _ in range(self._stall_ticks if number == 0 else 0):

@@ -7,12 +7,17 @@ import pytest
 from rendering.device_draws import drawn_device
 
 from firmware_protocol.codec import Sense, State
+from tormagd.assembly.build import build_core
+from tormagd.commission.calibration import calibration
 from tormagd.commission.page import page_of
 from tormagd.commission.report import Report, begun
 from tormagd.commission.sequence import STEPS, Stopped
+from tormagd.config import Config, Rates, load_calibration
+from tormagd.control.move.motor import margins
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant, with_insert
 
+CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
 SAMPLE = load_plant("sample_1")
 AT_REST = ("link and host", "homing")
 
@@ -30,8 +35,9 @@ def red(found):
     return [each.name for row in found.values() for each in row if not each.is_fine]
 
 
-def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench):
-    found, stopped = bench(drawn_device(44)).commission()
+def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench, tmp_path):
+    device, run = drawn_device(44), bench(drawn_device(44))
+    found, stopped = run.commission()
     report = msgspec.structs.replace(begun(None, 7, 0, None), findings=found, stopped=stopped)
     assert (red(found), stopped, report.is_sound) == ([], None, True)
     page = page_of(report)
@@ -43,6 +49,19 @@ def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench):
     assert "<td>+0</td>" in page_of(msgspec.structs.replace(after, findings=found))
     # one that found nothing is no last one
     assert begun(after, 7, 8, None).last_ns == after.last_ns == 5
+    # what a pulse would teach of the lag; fast sines teach three times as much
+    assert run.loop.planner.believe.carriages.lag_s < 0.008
+    # the daemon begins from it, and a core can be built: gains for the motor as it is
+    file = tmp_path / "00000007.toml"
+    file.write_text(calibration(report, CONFIG))
+    config = build_core(load_calibration(file, CONFIG, 7)).config
+    truly = {"resistance_ohm": device.motor.resistance_Ohm, "back_emf_V_s": device.motor.back_emf_V_s_rad}
+    assert {name: getattr(config.motor, name) for name in truly} == pytest.approx(truly, rel=0.1)
+    motor = msgspec.structs.replace(config.motor, **truly, inertia_kg_m2=device.motor.inertia_kg_m2)
+    assert margins(motor, config.position, 1e-3).gain_margin_dB > 6.0
+    assert config.position != CONFIG.position
+    strength = report.values["force over the model's: magnets, insert, or sensor's gain"]
+    assert config.trim.least < 0.75 * strength < 1.4 * strength < config.trim.most
 
 
 def slipping():
@@ -83,6 +102,11 @@ NOISE = random.Random(1)
         (("sensor",), {"alters": sensing(lambda force_N: force_N + NOISE.gauss(0.0, 0.06))}, "sensor's noise"),
         (("sensor",), {"alters": sensing(lambda force_N: 0.05 * round(force_N / 0.05))}, "sensor's resolution"),
         (("carriages",), {"plant": with_part("screw", friction_coefficient=0.7)}, "left friction over the configured"),
+        (
+            ("carriages",),
+            {"plant": load_plant("sample_2")},
+            "left carriage's bandwidth, of 24 Hz tried",
+        ),
         (
             ("memory",),
             {"plant": with_part("relaxation", fractions=(0.2, 0.16, 0.16))},

@@ -50,15 +50,21 @@ COLUMNS = (*NUMBERS, *WORDS)
 "Columns of the control ticks that a course is sent."
 PLACES = {name: place for place, name in enumerate(COLUMNS)}
 
+PREVIEW_STEP_S, PREVIEW_STEPS = 0.02, 15
+"Spacing, and length, of the forces that are told ahead."
 MOVING_MM_S = 5.0
 HANDLE_PATIENCE_S = 30.0
 
 
 class Asked(NamedTuple):
-    """What a course asks for: a force, N (None: no setpoint), and a command, given once ("": none)."""
+    """What a course asks for: a force, N (None: no setpoint), and a command, given once ("": none).
+
+    `preview_N` are the forces that follow, PREVIEW_STEP_S apart; empty where none are told.
+    """
 
     force_N: float | None = None
     command: str = ""
+    preview_N: tuple[float, ...] = ()
 
 
 class Heard(NamedTuple):
@@ -90,8 +96,8 @@ class Device(Protocol):
     def command(self, name: str) -> object:
         """Give one operator's command. Raises where it is refused."""
 
-    def exchange(self, force_N: float | None) -> Heard:
-        """Ask for a force, N (None: nothing is published), and return what was heard until the next is due."""
+    def exchange(self, asked: Asked) -> Heard:
+        """Publish the force that is `asked`, if any, and return what was heard until the next is due."""
 
 
 def drive(course: Course[Found], device: Device) -> Found:
@@ -104,7 +110,7 @@ def drive(course: Course[Found], device: Device) -> Found:
         while True:
             if asked.command:
                 device.command(asked.command)
-            asked = course.send(device.exchange(asked.force_N))
+            asked = course.send(device.exchange(asked))
     except StopIteration as end:
         found: Found = end.value
         return found
@@ -126,16 +132,23 @@ def columns_of(rows: Iterable[Row]) -> Columns:
 
 
 def watch(
-    lasts_s: float, force_N: Callable[[float], float] | None = None, states: Sequence[str] = ("ENABLED",)
+    lasts_s: float,
+    force_N: Callable[[float], float] | None = None,
+    states: Sequence[str] = ("ENABLED",),
+    *,
+    is_told_ahead: bool = False,
 ) -> Course[Columns]:
     """Ask for a force over the time, s, for `lasts_s`, and return all ticks; None publishes nothing.
 
-    Raises StoppedError for a tick in another operating state than `states`.
+    `is_told_ahead` also tells the forces that follow. Raises StoppedError for a tick in another operating state than
+    `states`.
     """
     rows: list[Row] = []
+    ahead_s = [PREVIEW_STEP_S * number for number in range(1, 1 + PREVIEW_STEPS)] if is_told_ahead else []
     begun_s, t_s = math.nan, 0.0
     while t_s < lasts_s:
-        now_s, fresh = yield Asked(None if force_N is None else force_N(t_s))
+        asked = Asked() if force_N is None else Asked(force_N(t_s), "", tuple(force_N(t_s + it) for it in ahead_s))
+        now_s, fresh = yield asked
         try:
             _require_state(fresh, states)
         except StoppedError as error:

@@ -1,5 +1,6 @@
 """What the motion shows: how both carriages answer jumps and sines, and from that their motors and the loop's gains."""
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -23,12 +24,16 @@ SLOW_S = 6.0
 SMOOTH_S, SLOWEST_MM_S = 0.2, 0.5
 FRICTION = (0.7, 1.16)
 "Most of it is the gearbox's: a screw that runs dry adds a fifth."
-SINES_HZ = (1.0, 2.0, 4.0, 8.0)
+SINES_HZ = (24.0, 16.0, 8.0, 4.0, 2.0, 1.0)
+"The slow ones last: what they teach of the carriages' lag stays, and forces of a scene are slow."
 SINE_S = 3.0
-SWING_N_S = 1.6
-"Greatest slope of the sines: within the speed of the gap."
+SWING_N_S, SWING_N_S2 = 1.6, 100.0
+"Greatest slope of the sines, and of the slope: within speed and acceleration of the gap."
 AT_HZ = 4.0
 "The sine by which gain and lag are judged."
+MIN_RATIO, MAX_BEHIND = 0.707, math.radians(45.0)
+"A carriage follows a sine with at least so much of its swing, and at most so far behind."
+MIN_BANDWIDTH_HZ = 12.0
 SIDES = ("left", "right")
 WINDOW_S = 0.021
 MOVING_M_S = 2e-3
@@ -57,15 +62,13 @@ def carriages(known: Known) -> Course[list[Finding]]:
     times_s, forces_N = (0.0, SLOW_S, 2.0 * SLOW_S), (levels_N[0], known.most_N, levels_N[0])
     slow = yield from watch(times_s[-1], lambda t_s: float(np.interp(t_s, times_s, forces_N)))
     jumps = yield from watch(JUMP_S * len(levels_N), lambda t_s: levels_N[min(int(t_s / JUMP_S), len(levels_N) - 1)])
-    found: list[Finding] = []
-    swings: list[Columns] = []
+    swings: dict[float, Columns] = {}
     for at_Hz in SINES_HZ:
-        swing_N = min(SWING_N_S / (math.tau * at_Hz), 0.25 * (known.most_N - levels_N[0]))
-        sine = yield from watch(SINE_S, _sine(levels_N[-1], swing_N, at_Hz))
-        swings.append(sine)
-        if at_Hz == AT_HZ:
-            found = [each for side in SIDES for each in _answers(sine, side)]
-    ticks = {name: np.concatenate([each[name] for each in (jumps, *swings)]) for name in jumps}
+        rad_s = math.tau * at_Hz
+        swing_N = min(SWING_N_S / rad_s, SWING_N_S2 / rad_s**2, 0.25 * (known.most_N - levels_N[0]))
+        swings[at_Hz] = yield from watch(SINE_S, _sine(levels_N[-1], swing_N, at_Hz), is_told_ahead=True)
+    found = [each for side in SIDES for each in _answers(swings, side)]
+    ticks = {name: np.concatenate([each[name] for each in (jumps, *swings.values())]) for name in jumps}
     driven = [_driven(known, ticks, side) for side in SIDES]
     for side, motor in zip(SIDES, driven, strict=True):
         found += [*_motor_findings(known, side, motor), _friction(known, slow, side, motor)]
@@ -77,21 +80,54 @@ def _sine(middle_N: float, swing_N: float, at_Hz: float) -> Callable[[float], fl
     return lambda t_s: middle_N + swing_N * math.sin(math.tau * at_Hz * t_s)
 
 
-def _answers(ticks: Columns, side: str) -> list[Finding]:
-    """Return how one carriage answers the sine at AT_HZ: its gain and lag against half of the gap's reference."""
+def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
+    """Return how one carriage answers the sines: its gain and lag at AT_HZ, and up to which frequency it follows."""
+    ratios = {at_Hz: _ratio(sine, side, at_Hz) for at_Hz, sine in swings.items()}
+    lag_s = -cmath.phase(ratios[AT_HZ]) / (math.tau * AT_HZ)
+    most_Hz = max(SINES_HZ)
+    return [
+        finding(f"{side} carriage's gain at {AT_HZ:g} Hz", abs(ratios[AT_HZ]), "", (0.9, 1.1), WEAK),
+        finding(f"{side} carriage's lag at {AT_HZ:g} Hz", lag_s, "ms", (0.0, 12.0), WEAK, 1e3),
+        finding(
+            f"{side} carriage's bandwidth, of {most_Hz:g} Hz tried",
+            _bandwidth_Hz(ratios),
+            "Hz",
+            (MIN_BANDWIDTH_HZ, most_Hz),
+            WEAK,
+        ),
+    ]
+
+
+def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
+    """Return up to which frequency a carriage follows, by its ratio at each; the highest tried where it follows all.
+
+    In between, what it lacks counts as linear over the logarithm of the frequency. 0 where it follows none.
+    """
+    lacks = [
+        (at_Hz, max(MIN_RATIO / max(abs(it), 1e-9), abs(cmath.phase(it)) / MAX_BEHIND))
+        for at_Hz, it in sorted(ratios.items())
+    ]
+    low_Hz, before = 0.0, 0.0
+    for at_Hz, lack in lacks:
+        if not lack <= 1.0:
+            return low_Hz * (at_Hz / low_Hz) ** ((1.0 - before) / (lack - before)) if low_Hz else 0.0
+        low_Hz, before = at_Hz, lack
+    return low_Hz
+
+
+def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
+    """Return how a carriage swings at `at_Hz` over half of the gap's reference, by both Fourier coefficients.
+
+    Of the whole turns after the first. NaN where the reference stands.
+    """
     times_s = ticks["monotonic_s"] - ticks["monotonic_s"][0]
-    whole = (times_s >= 1.0 / AT_HZ) & (times_s < math.floor(SINE_S * AT_HZ) / AT_HZ)
-    turning = np.exp(-2j * math.pi * AT_HZ * times_s[whole])
+    whole = (times_s >= 1.0 / at_Hz) & (times_s < math.floor(SINE_S * at_Hz) / at_Hz)
+    turning = np.exp(-2j * math.pi * at_Hz * times_s[whole])
 
     def swing(values: Array) -> complex:
         return complex(np.mean((values[whole] - values[whole].mean()) * turning))
 
-    ratio = swing(ticks[f"{side}_mm"]) / (swing(ticks["reference_gap_mm"]) / 2.0 or math.nan)
-    lag_s = -math.atan2(ratio.imag, ratio.real) / (math.tau * AT_HZ)
-    return [
-        finding(f"{side} carriage's gain at {AT_HZ:g} Hz", abs(ratio), "", (0.9, 1.1), WEAK),
-        finding(f"{side} carriage's lag at {AT_HZ:g} Hz", lag_s, "ms", (0.0, 12.0), WEAK, 1e3),
-    ]
+    return swing(ticks[f"{side}_mm"]) / (swing(ticks["reference_gap_mm"]) / 2.0 or math.nan)
 
 
 def _driven(known: Known, ticks: Columns, side: str) -> Driven:

@@ -36,7 +36,7 @@ STEPS = (
     Step("sensor", 12.0, HANDLE, sensor),
     Step("force over gap", 30.0, HANDLE, force_over_gap),
     Step("steps", 14.0, HANDLE, steps),
-    Step("carriages", 34.0, HANDLE, carriages),
+    Step("carriages", 40.0, HANDLE, carriages),
     Step("memory", 13.0, HANDLE, memory),
     Step("way back", 4.0, "let go of the handle", way_back, always=True),
 )

@@ -9,7 +9,20 @@ from typing import NamedTuple
 
 import zmq
 
-from tormagd.commission.course import COLUMNS, Columns, Course, Device, Found, Heard, Row, StoppedError, drive, watch
+from tormagd.commission.course import (
+    COLUMNS,
+    PREVIEW_STEP_S,
+    Asked,
+    Columns,
+    Course,
+    Device,
+    Found,
+    Heard,
+    Row,
+    StoppedError,
+    drive,
+    watch,
+)
 from tormagd.commission.known import Known
 from tormagd.commission.of_force import enabled
 from tormagd.config import Config
@@ -138,8 +151,8 @@ class Run(Device):
         else:
             self._client.request(name)
 
-    def exchange(self, force_N: float | None) -> Heard:
-        """Publish one force, valid for VALID_FOR_MS, and return the ticks until the next is due, 1/RATE_HZ later.
+    def exchange(self, asked: Asked) -> Heard:
+        """Publish the force, valid for VALID_FOR_MS, and return the ticks until the next is due, 1/RATE_HZ later.
 
         A tick is a row by COLUMNS. None publishes nothing. There may be no tick: they come every 20 ms. Raises as
         `follow`.
@@ -147,8 +160,9 @@ class Run(Device):
         if self._is_interrupted():
             raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
-        if force_N is not None:
-            self._client.publish(force_N, VALID_FOR_MS)
+        if asked.force_N is not None:
+            ahead = {"preview_N": asked.preview_N, "preview_dt_ms": 1e3 * PREVIEW_STEP_S} if asked.preview_N else {}
+            self._client.publish(asked.force_N, VALID_FOR_MS, **ahead)
         self.progress.show()
         rows: list[Row] = []
         # what waits is read even where this program came late
