@@ -8,7 +8,15 @@ import msgspec
 import pytest
 from hypothesis import example, given, strategies as st
 
-from tormagd.assembly.profile import MAX_BYTES, ZERO_LASTS_S, Profile, ProfileError, profile_of, read_profile
+from tormagd.assembly.profile import (
+    MAX_BYTES,
+    ZERO_LASTS_S,
+    Profile,
+    ProfileError,
+    gains_of,
+    profile_of,
+    read_profile,
+)
 from tormagd.config import Config
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
@@ -34,6 +42,13 @@ def test_an_old_zero_is_forgotten() -> None:
     # a clock that was set back says nothing of the age
     for now_ns in (10**18 + round(1.01 * ZERO_LASTS_S * 1e9), 0):
         assert again(KEPT).learned(now_ns).sensor_zero_N == 0.0
+
+
+def test_how_late_carriages_come_is_not_known_with_other_gains() -> None:
+    stiffer = msgspec.structs.replace(Config().position, proportional_per_mm=5.0)
+    gains, others = gains_of(Config()), gains_of(msgspec.structs.replace(Config(), position=stiffer))
+    kept = again(msgspec.structs.replace(KEPT, gains=gains))
+    assert [kept.learned(10**18, it).lag_s for it in (gains, others, "")] == [KNOWN.lag_s, 0.0, 0.0]
 
 
 OTHERS = {"serial_number": 8, "insert": "MRE-00-50", "model": "cd" * 32}

@@ -4,12 +4,14 @@ The learned scale lasts from day to day, but for the warmth of the room. The ela
 sensor's zero do not last. So a profile is less sure when it is read again than when it was written.
 """
 
+import hashlib
 import math
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
+from tormagd.config import Config
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
 from tormagd.control.believe.sensor_zero import MAX_ZERO_N
@@ -34,8 +36,9 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """What is known of a device, by its serial number, with an insert and a model, by its fingerprint.
 
     `saved_ns` is CLOCK_REALTIME. The other fields are those of `Learned`, with a standard deviation for the variance.
-    Old profiles have no `lag_s`: it is 0, nothing known of the carriages' lag. Bounds are checked where a file is read,
-    not where one is made.
+    Old profiles have no `lag_s`: it is 0, nothing known of the carriages' lag. `gains` is the fingerprint of the
+    configuration's [motor] and [position] with which that was learned; empty in old ones. Bounds are checked where a
+    file is read, not where one is made.
     """
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
@@ -50,25 +53,34 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     slow_learned: Annotated[float, Meta(ge=0.0, le=1.0)]
     sensor_zero_N: Annotated[float, Meta(ge=-MAX_ZERO_N, le=MAX_ZERO_N)]
     lag_s: Annotated[float, Meta(ge=0.0, le=MAX_LAG_S)] = 0.0
+    gains: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")] = ""
 
-    def learned(self, now_ns: int) -> Learned:
-        """Return what is still known of the device at CLOCK_REALTIME `now_ns`.
+    def learned(self, now_ns: int, gains: str = "") -> Learned:
+        """Return what is still known of the device at CLOCK_REALTIME `now_ns`, driven with these `gains`.
 
         Scale and offset become as uncertain as a day makes them, even a second after; without covariance. A sensor's
-        zero saved ZERO_LASTS_S or more from `now_ns`, before or after, is 0. The factor at a creep and the carriages'
-        lag stay.
+        zero saved ZERO_LASTS_S or more from `now_ns`, before or after, is 0. The factor at a creep stays, and with the
+        same `gains` the carriages' lag; else it is 0.
         """
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
         is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
         zero_N = self.sensor_zero_N if is_recent else 0.0
-        return Learned(device, self.slow_factor, self.slow_learned, zero_N, self.lag_s)
+        lag_s = self.lag_s if self.gains == gains else 0.0
+        return Learned(device, self.slow_factor, self.slow_learned, zero_N, lag_s)
 
 
-def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
+def gains_of(config: Config) -> str:
+    """Return the fingerprint of what the carriages are driven with: SHA-256 of [motor] and [position]."""
+    return hashlib.sha256(msgspec.json.encode((config.motor, config.position))).hexdigest()
+
+
+def profile_of(
+    learned: Learned, *, serial_number: int, insert: str, model: str, saved_ns: int, gains: str = ""
+) -> Profile:
     """Return the profile that keeps `learned` of the device `serial_number` with the insert `insert`.
 
-    `model` is the model's fingerprint, SHA-256 in hexadecimal. `saved_ns` is the time of saving, CLOCK_REALTIME. A
+    `model` and `gains` are fingerprints, SHA-256 in hexadecimal. `saved_ns` is the time of saving, CLOCK_REALTIME. A
     scale less certain than an unseen device's is kept as certain as that. Nothing is checked, and no file is written.
     """
     return Profile(
@@ -84,6 +96,7 @@ def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str,
         slow_learned=learned.slow_learned,
         sensor_zero_N=learned.sensor_zero_N,
         lag_s=learned.lag_s,
+        gains=gains,
     )
 
 

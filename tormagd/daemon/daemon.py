@@ -12,6 +12,7 @@ from functools import partial
 import msgspec
 
 from tormagd.assembly.build import Core, build_core
+from tormagd.assembly.profile import gains_of
 from tormagd.config import Config
 from tormagd.control.believe.strength import device_bounds
 from tormagd.daemon.beat import Beat, Phases
@@ -140,7 +141,8 @@ class Daemon:
     def _profiles_of(self, core: Core) -> Profiles:
         """Return the profiles for a core's insert and model; without a folder they keep nothing."""
         folder, bounds = state_folder(core.config.device.profiles, "profiles"), device_bounds(core.config.trim)
-        of_insert = None if folder is None else ProfileFolder(folder, core.scene.insert.name, core.model, bounds)
+        known = core.scene.insert.name, core.model, bounds, gains_of(core.config)
+        of_insert = None if folder is None else ProfileFolder(folder, *known)
         return Profiles(of_insert, self._inference.planner.believe, self._inference.teach)
 
     async def run(self) -> None:

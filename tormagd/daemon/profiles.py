@@ -32,10 +32,13 @@ def state_folder(configured: str, name: str) -> Path | None:
 
 
 class ProfileFolder:
-    """The profile files of one scene's insert and model: one file for each device, by its serial number."""
+    """The profile files of one scene's insert and model: one file for each device, by its serial number.
 
-    def __init__(self, folder: Path, insert: str, model: str, bounds: DeviceBounds) -> None:
-        self.folder, self.insert, self.model, self._bounds = folder, insert, model, bounds
+    `gains` is the fingerprint of what the carriages are driven with.
+    """
+
+    def __init__(self, folder: Path, insert: str, model: str, bounds: DeviceBounds, gains: str = "") -> None:
+        self.folder, self.insert, self.model, self.gains, self._bounds = folder, insert, model, gains, bounds
 
     def path(self, serial_number: int) -> Path:
         """Return the path of a device's profile: serial number in eight hexadecimal digits, and insert. The file need
@@ -135,6 +138,7 @@ class Profiles:
             insert=self._folder.insert,
             model=self._folder.model,
             saved_ns=now_ns,
+            gains=self._folder.gains,
         )
         self._saved_ns, self._on_disk = now_ns, learned
         self._writing = asyncio.get_running_loop().run_in_executor(None, self._folder.write, profile)
@@ -179,8 +183,9 @@ class Profiles:
         # another device is connected by now, or this one has shown itself meanwhile
         if profile is None or profile.serial_number != self._serial_number or self._believe.strength.fit is not UNSEEN:
             return
+        assert self._folder is not None, "it was read from one"
         now_ns = time.time_ns()
-        learned = profile.learned(now_ns)
+        learned = profile.learned(now_ns, self._folder.gains)
         self._teach(learned)
         self.digest = hashlib.sha256(msgspec.json.encode(profile)).hexdigest()
         self._saved_ns, self._on_disk, self._is_used = profile.saved_ns, learned, True
