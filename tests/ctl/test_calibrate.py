@@ -434,6 +434,11 @@ def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon,
     page = Path(result["page"]).read_text(encoding="utf-8")
     assert [words for words in ("Stopped in step steps", "turn it", "<td>reset</td>") if words not in page] == []
     assert ctl(*command, "--resume").ended(1).result["conformance"] == result["conformance"]
+    described = fake_daemon.answers["describe"]()["result"]
+    other = {"configuration": {"rates": {"control_hz": 1_000}, "motor": {"resistance_ohm": 2.5}}}
+    fake_daemon.answers["describe"] = lambda: {"ok": True, "result": described | other}
+    assert "[motor] has changed" in ctl(*command, "--resume").ended(2).error["message"]
+    fake_daemon.answers["describe"] = lambda: {"ok": True, "result": described}
     ctl(*command[:-1]).ended(2)  # nobody agreed: the last findings stay
     assert Path(result["page"]).read_text(encoding="utf-8") == page
     kit.write_text("[]")

@@ -7,6 +7,7 @@ from msgspec import Meta
 
 from tormagd.commission.finding import Finding
 from tormagd.commission.sequence import STEPS, Stopped
+from tormagd.config import Motor
 
 MAX_BYTES = 200_000
 VERSION = 1
@@ -17,6 +18,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     `last` has the values of the one before, by name, and `last_ns` when that began. `conformance` are the lines of the
     kit's report that did not pass; None: no report was given. `weight_N` is the weight that was hung up, None without.
+    `motor` was in force: shares of a motor are of that.
     """
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)] = VERSION
@@ -28,6 +30,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     conformance: list[tuple[str, str, str]] | None = None
     last: dict[str, float] = {}
     last_ns: int = 0
+    motor: Motor = msgspec.field(default_factory=Motor)
 
     @property
     def is_whole(self) -> bool:

@@ -161,8 +161,9 @@ class Run(Device):
             raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
         if asked.force_N is not None:
-            ahead = {"preview_N": asked.preview_N, "preview_dt_ms": 1e3 * PREVIEW_STEP_S} if asked.preview_N else {}
-            self._client.publish(asked.force_N, VALID_FOR_MS, **ahead)
+            ahead_N = asked.preview_N or None
+            step_ms = 1e3 * PREVIEW_STEP_S if ahead_N else None
+            self._client.publish(asked.force_N, VALID_FOR_MS, preview_N=ahead_N, preview_dt_ms=step_ms)
         self.progress.show()
         rows: list[Row] = []
         # what waits is read even where this program came late

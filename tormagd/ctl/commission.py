@@ -83,11 +83,14 @@ def commission(
         if is_resumed and before is None:
             raise usage_error(f"{path}: there is nothing to resume", "leave --resume out")
         if is_resumed and before:
+            if before.motor != config.motor:  # a calibration came into force: what was found is of another motor
+                raise usage_error(f"{path}: [motor] has changed since, in the daemon", "leave --resume out")
             report = before.resumed(weight_N)
         else:
             report = begun(before, serial_number, time.time_ns(), weight_N)
         if not is_agreed:
             agree()
+        report = msgspec.structs.replace(report, motor=config.motor)
         kept = Kept(path, report if checks is None else msgspec.structs.replace(report, conformance=checks))
         with connected(endpoints, client) as run:
             kept.follow(run, known)
