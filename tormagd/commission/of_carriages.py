@@ -11,7 +11,7 @@ import numpy as np
 from tormagd.commission.course import Columns, Course, watch
 from tormagd.commission.finding import Array, Finding, finding
 from tormagd.commission.known import Known
-from tormagd.commission.of_force import ready
+from tormagd.commission.of_force import GAINS, ready
 from tormagd.commission.regression import fitted
 from tormagd.config import Motor
 from tormagd.control.move.motor import PULL_DEPTH_MM, margins
@@ -40,7 +40,6 @@ WINDOW_S = 0.021
 MOVING_M_S = 2e-3
 "A slower carriage may stand: its friction is then whatever it has to be."
 THINNED = 20
-GAINS = "put the gains of this commissioning into the configuration"
 WEAK = "look at supply, motor, gearbox and screw; then at the gains"
 PLUG = "look at the motor's plugs, wires and brushes"
 SCALE = "compare motor, gear ratio, screw lead and the encoder's counts with [motor]: one of them is another"

@@ -42,6 +42,7 @@ FAST_MM_S = 40.0
 WORN = "compare the insert with the scene's; replace one that is worn or swollen"
 STRENGTH = (0.6, 1.5)
 "From what `[trim]` takes for the weakest device by default; of 60 healthy draws the weakest has 0.63."
+GAINS = "let the daemon run by the calibration that this commissioning writes (device.calibrations)"
 SENSOR = "tare the sensor, look at its cable, shielding and supply"
 ELEMENT = (
     "hang up a weight (--weight-N): it tells the sensor's gain from magnets and insert. Compare both with the scene"
@@ -149,12 +150,11 @@ def steps(known: Known) -> Course[list[Finding]]:
         overshoots.append(beyond_mm / abs(way_mm) if abs(way_mm) > 2.0 else 0.0)
     apart_mm = np.abs(ticks["left_mm"] - ticks["right_mm"])
     limit_mm = known.config.limits.skew_warning_mm
-    tune = "put the gains of this commissioning into the configuration"
     return [
         finding("steps, off the asked force in the mean", np.array(errors_N).mean(), "mN", (-60.0, 60.0), SENSOR, 1e3),
         finding("steps, at worst", np.abs(errors_N).max(), "mN", (0.0, 100.0), SENSOR, 1e3),
-        finding("carriages overshoot", max(0.0, *overshoots), "%", (0.0, 5.0), tune, 100.0),
-        finding("carriages apart, of 99 % of the time", np.percentile(apart_mm, 99), "mm", (0.0, limit_mm), tune),
+        finding("carriages overshoot", max(0.0, *overshoots), "%", (0.0, 5.0), GAINS, 100.0),
+        finding("carriages apart, of 99 % of the time", np.percentile(apart_mm, 99), "mm", (0.0, limit_mm), GAINS),
     ]
 
 
