@@ -169,11 +169,11 @@ class Stepper:
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
         """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties.
 
-        A device that is not driven gets duties of 0 in mode OFF. A paused one is driven to hold its gap. While the loop
-        is blind, or after a leap of the encoders, a driven one gets 0 in mode RUN: friction holds the gap.
-        `measurement` is None when the link is lost: mode OFF, and a driven device gives the fault LINK_LOST. A
-        measurement with a number that is not finite gives the fault NOT_FINITE, and measuring and driving begin anew.
-        Raises DomainError where `now_s` is not finite; nothing has changed then.
+        A device that is not driven gets duties of 0 in mode OFF. A paused one is driven to hold its gap, and opens it
+        for a force over the ceiling. While the loop is blind, or after a leap of the encoders, a driven one gets 0 in
+        mode RUN: friction holds the gap. `measurement` is None when the link is lost: mode OFF, and a driven device
+        gives the fault LINK_LOST. A measurement with a number that is not finite gives the fault NOT_FINITE, and
+        measuring and driving begin anew. Raises DomainError where `now_s` is not finite; nothing has changed then.
         """
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:

@@ -65,14 +65,14 @@ class IdealCarriages(Actuator):
         duties of 0.
 
         It goes no further than the top speed reaches in `dt_s`, above 0; where that falls short, the result has the
-        limit RATE. `plan` None holds the gap within its ends. With a plan the gap opens while `is_over`, a force over
-        the ceiling. What was measured plays no part.
+        limit RATE. `plan` None holds the gap within its ends. With or without one it opens while `is_over`, a force
+        over the ceiling. What was measured plays no part.
         """
         before_mm = self._plant.gap_mm
-        wanted_mm = min(max(before_mm, self._closed_mm), self._open_mm)
-        if plan is not None:
+        wanted_mm = self._open_mm if is_over else min(max(before_mm, self._closed_mm), self._open_mm)
+        if plan is not None and not is_over:
             floor_mm = max(self._closed_mm, plan.min_gap_mm)
-            wanted_mm = self._open_mm if is_over else target_of(plan, now_s, 0.0, floor_mm, self._open_mm).gap_mm
+            wanted_mm = target_of(plan, now_s, 0.0, floor_mm, self._open_mm).gap_mm
         reach_mm = self._top_speed_mm_s * dt_s
         gap_mm = min(max(wanted_mm, before_mm - reach_mm), before_mm + reach_mm)
         put_gap(self._plant, gap_mm)

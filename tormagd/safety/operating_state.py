@@ -27,7 +27,7 @@ class OperatingState(StrEnum):
     ENABLED = "ENABLED"
     "The force follows the setpoint."
     PAUSED = "PAUSED"
-    "The gap is held where it is."
+    "The gap is held where it is; a force over the ceiling opens it."
     FAULT = "FAULT"
     "As DISABLED, with one fault or more latched."
 

@@ -228,7 +228,10 @@ def test_a_carriage_that_goes_the_other_way_into_its_stop_is_named(running) -> N
     assert running.faults[0] is Fault.WRONG_DIRECTION
 
 
-def test_too_much_force_opens_and_is_then_a_fault(running) -> None:
+@pytest.mark.parametrize("given", [(), ("pause",)])
+def test_too_much_force_opens_and_is_then_a_fault(running, given: tuple[str, ...]) -> None:
+    for command in given:
+        running.command(command)
     limits = [running.step(force_N=3.0, **running.there).limits for _ in range(95)]
     assert Limit.OVER_FORCE not in limits[25]
     assert Limit.OVER_FORCE in limits[35]

@@ -81,9 +81,9 @@ class Actuator:
     ) -> Drive:
         """Return the duties of one tick, `dt_s` > 0 after the last. Call `begin` first, and again after `stop`.
 
-        `measurement` is the device's newest, `measured` what is made of it. `plan` None holds the gap. With a plan the
-        gap opens while the force is over the ceiling, `is_over`. The gap is never to be closer than the plan's least.
-        Raises DomainError for a duty that is not finite: call `forget` then.
+        `measurement` is the device's newest, `measured` what is made of it. `plan` None holds the gap. With or without
+        one it opens while the force is over the ceiling, `is_over`. The gap is never to be closer than the plan's
+        least. Raises DomainError for a duty that is not finite: call `forget` then.
         """
         raise NotImplementedError
 

@@ -102,9 +102,10 @@ class Carriages(Actuator):
     ) -> Drive:
         """Return the duties of one tick, `dt_s` > 0 after the last, and take both position loops one tick on.
 
-        `plan` None holds the gap. With a plan the gap opens while the force is over the ceiling, `is_over`. The limits
-        OVER_FORCE, RATE and SATURATED may show. Updates reference, expected gap, integrals and counts, and may learn
-        `acceleration_scale`. Call `begin` first. Raises DomainError for a duty that is not finite: call `forget` then.
+        `plan` None holds the gap. With or without one it opens while the force is over the ceiling, `is_over`. The
+        limits OVER_FORCE, RATE and SATURATED may show. Updates reference, expected gap, integrals and counts, and may
+        learn `acceleration_scale`. Call `begin` first. Raises DomainError for a duty that is not finite: call `forget`
+        then.
         """
         assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
@@ -145,17 +146,17 @@ class Carriages(Actuator):
     ) -> tuple[Reference, bool]:
         """Return the reference `dt_s` later, and whether the limit of its acceleration held it back.
 
-        With `plan` None the reference stops. With a plan, `is_over` (a force over the ceiling) sends it open, and what
-        holds the gap back is added to `limits`. Counts one more tick in `acted.rate` where speed limits the reference,
-        and in `acted.slew` where acceleration does.
+        With `plan` None the reference stops. A force over the ceiling (`is_over`) sends it open. What holds the gap
+        back is added to `limits`, RATE only with a plan. Counts one more tick in `acted.rate` where speed limits the
+        reference, and in `acted.slew` where acceleration does.
         """
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
             target = target_of(plan, now_s, self._lag_s, floor_mm, self._open_mm)
-            if is_over:
-                target = Reference(self._open_mm)
-                limits.append(Limit.OVER_FORCE)
+        if is_over:
+            target = Reference(self._open_mm)
+            limits.append(Limit.OVER_FORCE)
         max_mm_s2 = self.acceleration_scale * self._gap_acceleration_mm_s2
         reference, is_limited, is_slewed = follow(max_mm_s2, reference, target, dt_s, speeds, floor_mm)
         if plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
