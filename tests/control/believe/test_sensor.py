@@ -8,7 +8,7 @@ import pytest
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.freshness import FROZEN_S
 from tormagd.control.believe.handle import HandleWatch
-from tormagd.control.believe.sensor import AGREES_S, MOVED_N, RISES_N_S, TRUSTED_AGAIN_S, WRONG_S
+from tormagd.control.believe.sensor import AGREES_S, MOVED_N, RELAXED, RISES_N_S, TRUSTED_AGAIN_S, WRONG_S
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle
 from tormagd.model.displacement import MOBILISED_MM, Turn
@@ -125,15 +125,18 @@ def test_what_has_changed_around_the_device_may_explain_a_leap(
     assert hear(known, 0.3, moving(**{"force_N": here_N + off_N, **changes})).believe.sensor.is_disputed is is_disputed
 
 
-def test_what_relaxes_is_followed_and_what_goes_on_falling_is_not(known, hear, moving) -> None:
-    """A fall by 1% of the force a second is an elastomer's; a tenth of the force later it is none any more."""
-    fallen_N = 0.0
+@pytest.mark.parametrize("share", [0.7, 1.0, 1.5])
+def test_what_relaxes_is_followed_and_what_goes_on_falling_is_not(planner, hear, moving, share: float) -> None:
+    """A fall by 1% of the device's own force a second is its elastomer's; 12% of that force later it is none any
+    more."""
+    own_N, fallen_N = share * MODEL_N, 0.0
+    hear(planner, 2.0, moving(force_N=own_N))
     for _ in range(100):
-        fallen_N += 0.01 * MODEL_N
-        hear(known, 1.0, moving(force_N=MODEL_N - fallen_N))
-        if known.believe.sensor.is_disputed:
+        fallen_N += 0.01 * own_N
+        hear(planner, 1.0, moving(force_N=own_N - fallen_N))
+        if planner.believe.sensor.is_disputed:
             break
-    assert 0.1 < fallen_N / MODEL_N < 0.3
+    assert fallen_N == pytest.approx(MOVED_N + RELAXED * own_N, abs=0.025)
 
 
 def test_a_sensor_that_stands_still_is_wrong_only_where_it_should_not(known, hear, moving) -> None:

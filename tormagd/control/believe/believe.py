@@ -351,9 +351,10 @@ class Believe:
             self.is_prior, self.is_contradicted = False, True
             self.strength.forget()
         self.strength.update(model_N, reading_N, dt_s)
-        self.sensor.fit_moved(self.strength.fit.force_N(model_N) - before_N, model_N, dt_s)
+        after_N = self.strength.fit.force_N(model_N)
+        self.sensor.fit_moved(after_N - before_N, after_N, dt_s)
         # the force at a creep stays while scale and offset are learned
-        self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
+        self.slow.rescale(before_N, after_N)
         if self.strength.is_held:
             self.limits = (Limit.TRIM, *self.limits)
 

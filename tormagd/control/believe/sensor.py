@@ -136,8 +136,8 @@ class SensorTrust:
         self._update_slack(fit, model_N, rate_mm_s, direction, zero_sd_N, dt_s)
         self._judge(self.measured_N - fit.force_N(model_N), self._is_strange(model_N, zero_sd_N), dt_s)
 
-    def fit_moved(self, learned_N: float, model_N: float, dt_s: float) -> None:
-        """Take the change `learned_N` that one reading made to the fit's force, where the model's force is `model_N`.
+    def fit_moved(self, learned_N: float, force_N: float, dt_s: float) -> None:
+        """Take the change `learned_N` that one reading made to the fit's force, which now is `force_N`.
 
         Begins a dispute when the changes of late exceed what a device changes by itself. Nothing happens before
         LEARNS_S of sliding.
@@ -148,7 +148,7 @@ class SensorTrust:
         if abs(self.moved_N) > MOVED_N + self.slack_N:
             self._begin(self.moved_N)
         else:
-            self._fade_moved(model_N, dt_s)
+            self._fade_moved(max(force_N, 0.0), dt_s)
 
     def compare(self, fit: DeviceFit, model_N: float) -> None:
         """Begin a dispute where the mean of the last readings has left `fit`, unless the device has slid for under
@@ -248,20 +248,20 @@ class SensorTrust:
         self.lead_N, self.began_way = max(over_N, 0.0), self.direction
         self.back_N, self.moved_N = -self.moved_N, 0.0
 
-    def _fade_moved(self, model_N: float, dt_s: float) -> None:
-        """Bring `moved_N` towards 0 by what a device changes by itself in `dt_s`; `model_N` is the model's force.
+    def _fade_moved(self, force_N: float, dt_s: float) -> None:
+        """Bring `moved_N` towards 0 by what a device changes by itself in `dt_s`; `force_N` >= 0 is its force.
 
         A loss of force may be relaxing: it adds to `relaxed_N`, until RELAXED is used up. A gain does not.
         """
         self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
         by_itself_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
-        relaxes_N = min(RELAXES_1_S * model_N * dt_s, max(RELAXED * model_N - self.relaxed_N, 0.0))
+        relaxes_N = min(RELAXES_1_S * force_N * dt_s, max(RELAXED * force_N - self.relaxed_N, 0.0))
         if self.moved_N < 0.0:
             used_N = min(max(-self.moved_N - by_itself_N, 0.0), relaxes_N)
             self.relaxed_N += used_N
             self.moved_N = min(self.moved_N + by_itself_N + used_N, 0.0)
         else:
-            self.moved_N = max(self.moved_N - by_itself_N - RELAXES_1_S * model_N * dt_s, 0.0)
+            self.moved_N = max(self.moved_N - by_itself_N - RELAXES_1_S * force_N * dt_s, 0.0)
 
     def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
         """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices.
