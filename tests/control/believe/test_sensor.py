@@ -139,6 +139,13 @@ def test_what_relaxes_is_followed_and_what_goes_on_falling_is_not(planner, hear,
     assert fallen_N == pytest.approx(MOVED_N + RELAXED * own_N, abs=0.025)
 
 
+def test_a_fit_that_swings_is_the_same_device_still(known, hear, moving) -> None:
+    """As with a handle's rate: what is lost is gained again, so no relaxing adds up."""
+    for swing in range(12):
+        hear(known, 2.5, moving(force_N=MODEL_N + 0.07 * (-1) ** swing))
+        assert not known.believe.sensor.is_disputed
+
+
 def test_a_sensor_that_stands_still_is_wrong_only_where_it_should_not(known, hear, moving) -> None:
     """One whose noise is resolved never does; any other shows another value once the force has moved."""
     assert Limit.SENSOR in hear(known, 2.0 * FROZEN_S, moving(), 0.0).planned.limits

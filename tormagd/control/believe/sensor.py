@@ -251,7 +251,7 @@ class SensorTrust:
     def _fade_moved(self, force_N: float, dt_s: float) -> None:
         """Bring `moved_N` towards 0 by what a device changes by itself in `dt_s`; `force_N` >= 0 is its force.
 
-        A loss of force may be relaxing: it adds to `relaxed_N`, until RELAXED is used up. A gain does not.
+        A loss of force may be relaxing: it adds to `relaxed_N`, until RELAXED is used up. A gain gives back as much.
         """
         self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
         by_itself_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
@@ -261,7 +261,10 @@ class SensorTrust:
             self.relaxed_N += used_N
             self.moved_N = min(self.moved_N + by_itself_N + used_N, 0.0)
         else:
-            self.moved_N = max(self.moved_N - by_itself_N - RELAXES_1_S * force_N * dt_s, 0.0)
+            won_N = min(max(self.moved_N - by_itself_N, 0.0), RELAXES_1_S * force_N * dt_s)
+            # a fit that swings with the handle's rate loses and gains in turn: what counts is the sum
+            self.relaxed_N = max(self.relaxed_N - won_N, 0.0)
+            self.moved_N = max(self.moved_N - by_itself_N - won_N, 0.0)
 
     def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
         """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices.
