@@ -87,6 +87,7 @@ mutation: $(VENV)/.dev
 	rm -rf build/mutation && git clone --quiet . build/mutation
 	cd build/mutation && export PATH='$(CURDIR)/$(BIN)':"$$PATH" PYTHONPATH=. TORMAG_COMPILED=0 && \
 	    cosmic-ray init tools/mutation.toml mutants.sqlite && \
+    cr-filter-operators mutants.sqlite tools/mutation.toml && \
 	    python tools/mutation_sample.py mutants.sqlite $(MUTANTS) $(SEED) && \
 	    cosmic-ray exec tools/mutation.toml mutants.sqlite && \
 	    cr-report --surviving-only --show-diff mutants.sqlite
