@@ -27,7 +27,7 @@ from tormagd.control.ask.forecast import (
     TAPS,
     Forecast,
 )
-from tormagd.control.ask.skill import DOUBT_N, Skill
+from tormagd.control.ask.skill import DOUBT_N, FORGIVEN_N, Skill
 from tormagd.exact import plain, restore
 
 Array = npt.NDArray[np.float64]
@@ -199,6 +199,17 @@ def test_after_a_jump_nothing_is_forecast_and_trust_has_to_be_earned_again(learn
     assert learned.trust < 0.03 < trust
     # as if it had missed all that the slope met, and by no more than what the first judgement counts
     assert (LOST.score, LOST.apart) == (pytest.approx(-1.0, abs=0.03), pytest.approx(DOUBT_N**2))
+
+
+@pytest.mark.parametrize(
+    ("long", "short", "trust"),
+    [(0.6, -0.5, 0.3), (0.6, 0.5, 0.6), (3.0, 0.0, 1.0), (-0.1, 0.0, 0.0), (0.6, -1.5, 0.0), (-0.6, -1.5, 0.0)],
+)
+def test_trust_is_the_product_of_two_scores_each_held_within_0_and_1(
+    learned: Forecast, long: float, short: float, trust: float
+) -> None:
+    learned.long, learned.short = Skill(long, 1.0 - FORGIVEN_N**2), Skill(short, 1.0 - FORGIVEN_N**2)
+    assert learned.trust == pytest.approx(trust)
 
 
 @pytest.mark.parametrize("step_s", [MAX_STEP_S + 1e-6, -1.1 * GRID_S, -9.0])
