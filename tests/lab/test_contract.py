@@ -92,6 +92,11 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
             ("1,1\n2,1\n", ("--plant", "sample_9"), "sample_9"),
         )
     ),
+    (("twin", "absent.mcap"), "", "absent.mcap: No such file"),
+    (("twin", "given"), "no recording", "given: not an intact MCAP file"),
+    (("twin", "given", "--prior", "sample_9"), "no recording", "sample_9"),
+    (("twin", "given", "--plot", "x.mp3"), "no recording", "allowed is a name that ends with .png"),
+    (("twin", *["given"] * 11), "no recording", "11 recordings: allowed are 10"),
     (("identify-motor", "absent"), "", "absent: cannot be read"),
     (("identify-motor", "given"), "t_s,input_V\n0,1\n", "position_mm"),
     *(

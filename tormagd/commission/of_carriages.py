@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from tormagd.commission.course import Columns, Course, watch
 from tormagd.commission.finding import Array, Finding, finding
@@ -137,19 +138,8 @@ def _driven(known: Known, ticks: Columns, side: str) -> Driven:
     i = m a + sign(v) c + p(x) + d v, where p is as the magnets' pull over the gap.
     """
     motor, period_s = known.config.motor, known.period_s
-    window = max(round(WINDOW_S / period_s), 1) | 1
-    kernel = np.convolve(np.full(window, 1.0 / window), np.full(window, 1.0 / window))
-
-    def smooth(values: Array) -> Array:
-        return np.convolve(values, kernel, "same")
-
-    # a tick's duty acts until the next tick's measurement
-    volts, current_A = smooth(np.roll(ticks[f"{side}_duty"], 1) * ticks["supply_V"]), smooth(ticks[f"{side}_current_A"])
-    speed_m_s = np.gradient(smooth(ticks[f"{side}_mm"])) * 1e-3 / period_s
-    pull = smooth((ticks["left_mm"] + ticks["right_mm"] + PULL_DEPTH_MM) ** -4.0)
-    slope_A_s, acceleration = np.gradient(current_A) / period_s, np.gradient(speed_m_s) / period_s
-    moves = (np.abs(speed_m_s) > MOVING_M_S) & np.isfinite(volts + current_A + speed_m_s)
-    moves &= np.abs(smooth(np.sign(speed_m_s))) > 0.98
+    volts, current_A, slope_A_s, speed_m_s, acceleration, moves, window = smoothed(period_s, ticks, side)
+    pull = smooth((ticks["left_mm"] + ticks["right_mm"] + PULL_DEPTH_MM) ** -4.0, window)
     kept = np.flatnonzero(moves)[window:-window:THINNED]
     blocks = np.floor(ticks["monotonic_s"][kept])
     ones = np.ones_like(volts)
@@ -164,6 +154,40 @@ def _driven(known: Known, ticks: Columns, side: str) -> Driven:
         (float(emf * advance_m_rad), float(emf_width * advance_m_rad)),
         (float(mass * inertia), float(mass_width * inertia)),
     )
+
+
+class Smoothed(NamedTuple):
+    """One carriage's columns (n) without the encoder's steps, all smoothed alike; `window` ticks blur both ends.
+
+    `moves` is where the carriage has gone one way all the time. Opening is positive.
+    """
+
+    volts: Array
+    current_A: Array
+    slope_A_s: Array
+    speed_m_s: Array
+    acceleration_m_s2: Array
+    moves: npt.NDArray[np.bool_]
+    window: int
+
+
+def smoothed(period_s: float, ticks: Columns, side: str) -> Smoothed:
+    """Return how a carriage moved, and by which voltage and current, from control ticks that are `period_s` apart."""
+    window = max(round(WINDOW_S / period_s), 1) | 1
+    # a tick's duty acts until the next tick's measurement
+    volts = smooth(np.roll(ticks[f"{side}_duty"], 1) * ticks["supply_V"], window)
+    current_A = smooth(ticks[f"{side}_current_A"], window)
+    speed_m_s = np.gradient(smooth(ticks[f"{side}_mm"], window)) * 1e-3 / period_s
+    slope_A_s, acceleration = np.gradient(current_A) / period_s, np.gradient(speed_m_s) / period_s
+    moves = (np.abs(speed_m_s) > MOVING_M_S) & np.isfinite(volts + current_A + speed_m_s)
+    moves &= np.abs(smooth(np.sign(speed_m_s), window)) > 0.98
+    return Smoothed(volts, current_A, slope_A_s, speed_m_s, acceleration, moves, window)
+
+
+def smooth(values: Array, window: int) -> Array:
+    """Return values (n) after two running means over `window` of them; both ends fall off."""
+    kernel = np.convolve(np.full(window, 1.0 / window), np.full(window, 1.0 / window))
+    return np.convolve(values, kernel, "same")
 
 
 def _motor_findings(known: Known, side: str, driven: Driven) -> list[Finding]:

@@ -45,6 +45,7 @@ COMMANDS = {
     "import-data": ("training.import_data", "training data from measured CSV files of any columns, units and signs"),
     "train-model": ("training.train_model", "a model file from training data"),
     "tactile-model": ("tactile.shipped", "a model file of a simulated pad"),
+    "twin": ("twin.command", "a plant file of one device from its recordings"),
     "identify-motor": ("motor.command", "a motor and its screw from a log"),
     "tune-position": ("tune_position", "the gains of the position loop for a motor"),
     "wire-log": ("wire_log", "a session between host and device as a CAN log"),

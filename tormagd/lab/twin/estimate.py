@@ -1,0 +1,108 @@
+"""Least squares about a prior: the plant that fits, and 95 % intervals of whatever the data tell of it."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from tormagd.commission.regression import sandwich
+from tormagd.lab.arrays import Array
+from tormagd.simulation.parameters import PlantParameters
+
+TOLD = 0.5
+"An interval of at most this share of the prior's is a value; a wider one is unknown."
+ROUNDS = 12
+STEP = 1e-3
+"Of a derivative, in widths of the prior."
+
+Values = dict[str, float]
+PlantOf = Callable[[Values], PlantParameters]
+
+
+class Prior(NamedTuple):
+    """What is known of a number before: its key, its value, and half the width of its interval.
+
+    A key without a dot is no key of the plant file.
+    """
+
+    key: str
+    value: float
+    half_width: float
+    least: float = -np.inf
+    "No value under this makes sense."
+    floor: float = 0.0
+    "By how much the way of fitting alone may be off."
+
+
+class Estimate(NamedTuple):
+    """Values (p) of some priors and their covariance (p x p), what they leave (n), and the plant that they make.
+
+    `deviations` make an interval of 95 %.
+    """
+
+    priors: Sequence[Prior]
+    values: Array
+    covariance: Array
+    deviations: float
+    residual: Array
+    plant_of: PlantOf
+
+    @property
+    def plant(self) -> PlantParameters:
+        """Return the plant that fits."""
+        return self.plant_of(named(self.priors, self.values))
+
+    def width_of(self, key: str) -> float:
+        """Return half the width of the 95 % interval of the values at a key, told or not: the widest."""
+        places = [place for place, each in enumerate(self.priors) if each.key == key]
+        return self.deviations * math.sqrt(float(np.diag(self.covariance)[places].max()))
+
+    def half_width(self, function: Callable[[PlantParameters], float]) -> float:
+        """Return half the width of the 95 % interval of a number of the plant; NaN where the data do not tell it."""
+        widths = np.array([each.half_width for each in self.priors])
+
+        def at(values: Array) -> float:
+            return function(self.plant_of(named(self.priors, values)))
+
+        slope = np.array([at(self.values + step) - at(self.values - step) for step in STEP * np.diag(widths)])
+        slope /= 2.0 * STEP * widths
+        variance = self.deviations**2 * slope @ self.covariance @ slope
+        found = math.sqrt(variance + np.sum((slope * [each.floor for each in self.priors]) ** 2))
+        return found if 0.0 < found <= TOLD * float(np.linalg.norm(slope * widths)) else math.nan
+
+
+def named(priors: Sequence[Prior], values: Array) -> Values:
+    """Return values (p) by the keys of their priors (p)."""
+    return {each.key: value for each, value in zip(priors, values.tolist(), strict=True)}
+
+
+def estimated(
+    residuals: Callable[[Array], Array], priors: Sequence[Prior], blocks: Array, noise: float, plant_of: PlantOf
+) -> Estimate:
+    """Return the values that make `residuals` (n, of the values) small beside `noise`, and stay near their priors.
+
+    Residuals of one number in `blocks` (n) may be correlated in any way. `plant_of` makes a plant of values by key.
+    """
+    middle, widths = (np.array([getattr(each, name) for each in priors]) for name in ("value", "half_width"))
+    least = (np.array([each.least for each in priors]) - middle) / widths
+
+    def off(shares: Array) -> Array:
+        return np.concatenate([residuals(middle + widths * shares) / noise, shares])
+
+    start = np.maximum(np.zeros(len(priors)), least + STEP)
+    found = least_squares(off, start, bounds=(least, np.inf), xtol=1e-3, ftol=1e-4, max_nfev=ROUNDS)
+    numbers = np.concatenate([blocks, blocks.max() + 1.0 + np.arange(len(priors))])
+    bread = np.linalg.inv(found.jac.T @ found.jac)
+    # what a prior leaves open is open, however well its middle fits
+    spread = sandwich(found.jac, found.fun, numbers) + bread @ bread
+    return Estimate(
+        priors,
+        middle + widths * found.x,
+        spread * np.outer(widths, widths),
+        float(student.ppf(0.975, max(len(np.unique(blocks)) - len(priors), 2))),
+        noise * found.fun[: -len(priors)],
+        plant_of,
+    )

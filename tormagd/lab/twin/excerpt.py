@@ -1,0 +1,278 @@
+"""What a twin takes from a recording, in one pass: the force a hundred times a second, and how the carriages move.
+
+Of each half minute only that stays in memory, about 5 kB for a second of recording.
+"""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from tormagd.commission.of_carriages import SIDES, smooth, smoothed
+from tormagd.lab.arrays import Array
+from tormagd.lab.errors import LabError
+from tormagd.recording.reader import RecordingError, Seen, read_recording
+
+GRID_HZ = 100.0
+"Rows of the force: each is the mean of a hundredth of a second."
+CHUNK_S = 30.0
+LONGEST_S = 4.0 * 3600.0
+MIN_S, MIN_HZ = 20.0, 200.0
+"A shorter recording shows no memory; a thinned one no motor."
+EVERY_TICK = 0.9
+"Changes of the reading for each tick, above which the sensor is as fast as the ticks, or faster."
+MIN_TICKS = 1000
+"A shorter end of a recording is not smoothed for its carriages."
+MOVING_EVERY_S = 0.02
+"Time between two rows of a carriage."
+MIDDLE, MIDDLE_SD = np.linspace(0.3, 0.7, 41), 0.6868
+"Quantiles of how far a value is off, the mean of which steps of the sensor hardly move; and that of a normal one."
+IDLE_A = 0.2
+"About the current of an idling gearbox; the laws are linear about it."
+
+
+class Tick(msgspec.Struct, frozen=True, gc=False):
+    """What is read of a control tick; NaN is not known."""
+
+    monotonic_s: float = math.nan
+    measurement: float = math.nan
+    left_mm: float = math.nan
+    right_mm: float = math.nan
+    device_handle_mm: float = math.nan
+    device_force_N: float = math.nan
+    device_temperature_C: float = math.nan
+    left_current_A: float = math.nan
+    right_current_A: float = math.nan
+    supply_V: float = math.nan
+    left_duty: float = math.nan
+    right_duty: float = math.nan
+    device_clock_drift: float = math.nan
+    device_mode: str = ""
+
+
+NUMBERS = Tick.__struct_fields__[:-1]
+
+
+class Moves(NamedTuple):
+    """Rows (n) of one carriage in motion; opening is positive. `block` numbers half a second each."""
+
+    block: Array
+    volts: Array
+    volts_s: Array
+    current_A: Array
+    current_A_s: Array
+    speed_m_s: Array
+    acceleration_m_s2: Array
+    gap_mm: Array
+    over_A: Array
+    "Mean of what the current is over IDLE_A, either way: it ripples, and the mesh loses a share of each peak."
+    over_share: Array
+    "Share of the time for which it is."
+
+
+class Excerpt(NamedTuple):
+    """What one recording says: rows (n) at GRID_HZ, without a gap in time, and the moving carriages.
+
+    `force_N` is as the sensor says it, NaN where the daemon had no new one. `readings` counts the changes of the
+    reading in each row, `ticks` its control ticks. `noise_N` has a sensor's noise by chunk, one sample's.
+    """
+
+    name: str
+    gap_mm: Array
+    handle_mm: Array
+    force_N: Array
+    temperature_C: Array
+    readings: Array
+    ticks: Array
+    noise_N: Array
+    supply_V: float
+    clock_ppm: float
+    moves: dict[str, Moves]
+
+    @property
+    def sensor_noise_N(self) -> float:
+        """Return the noise of one reading of the force sensor, N."""
+        return float(np.median(self.noise_N))
+
+    def first(self, lasts_s: float) -> "Excerpt":
+        """Return the excerpt of so many seconds, or of all, without its carriages."""
+        rows = {name: getattr(self, name)[: round(lasts_s * GRID_HZ)] for name in ROWS}
+        return self._replace(**rows, moves={})
+
+    @property
+    def time_s(self) -> Array:
+        """Times of the rows (n) from the first, s."""
+        return np.arange(len(self.gap_mm)) / GRID_HZ
+
+    @property
+    def minute(self) -> Array:
+        """Times of the rows (n) from the middle, minutes."""
+        return np.asarray((self.time_s - self.time_s[-1] / 2.0) / 60.0)
+
+
+ROWS = ("gap_mm", "handle_mm", "force_N", "temperature_C", "readings", "ticks")
+"Fields of an excerpt that have a value for each row."
+
+
+def excerpt_of(path: Path) -> Excerpt:
+    """Read the recording in `path`. Raises LabError where it is none, or of another length or rate than is allowed."""
+    taking = Taking(str(path))
+    try:
+        read_recording(path, Tick, taking.see)
+    except RecordingError as error:
+        raise LabError(str(error)) from error
+    return taking.done()
+
+
+class Taking:
+    """Takes control ticks one by one, in the order of time, and gives the `Excerpt` of all of them."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._refusal = ""
+        self._rows: list[tuple[float, ...]] = []
+        self._first_s = math.nan
+        self._reading_N = math.nan
+        self._grids: list[Array] = []
+        self._noise_N: list[float] = []
+        self._others: list[tuple[float, float]] = []
+        self._moves: dict[str, list[Array]] = {side: [] for side in SIDES}
+
+    def see(self, seen: Seen) -> None:
+        """Take a message of a recording; snapshots are passed over."""
+        if seen.is_tick:
+            tick = seen.message
+            *numbers, mode = msgspec.structs.astuple(tick)
+            self.take((*numbers, float(mode == "RUN")))
+
+    def take(self, row: tuple[float, ...]) -> None:
+        """Take a tick: a value for each of NUMBERS, and 1 where the device runs by the duties, else 0."""
+        now_s = row[0]
+        if self._refusal or math.isnan(now_s):
+            return
+        if math.isnan(self._first_s):
+            self._first_s = now_s
+        if self._rows and not now_s >= self._rows[-1][0]:
+            self._refusal = f"monotonic_s = {now_s} after {self._rows[-1][0]}: allowed is time that rises"
+        elif now_s - self._first_s > LONGEST_S:
+            self._refusal = f"{now_s - self._first_s:.0f} s of recording: allowed are {LONGEST_S:g} s"
+        elif self._rows and (now_s - self._first_s) // CHUNK_S > (self._rows[-1][0] - self._first_s) // CHUNK_S:
+            self._end_chunk()
+        self._rows.append(row)
+
+    def done(self) -> Excerpt:
+        """Return what all ticks said. Raises LabError, which names the recording, where they do not serve."""
+        if self._rows:
+            self._end_chunk()
+        grid = np.concatenate(self._grids, axis=1) if self._grids else np.zeros((6, 1))
+        gap_mm, handle_mm, force_N, temperature_C, readings, ticks = grid
+        others = np.array(self._others or [(math.nan, math.nan)])
+        lasts_s, rate_Hz = len(ticks) / GRID_HZ, float(np.median(ticks)) * GRID_HZ
+        refusals = (
+            (bool(self._refusal), self._refusal),
+            (lasts_s < MIN_S, f"{lasts_s:.1f} s of control ticks: allowed are at least {MIN_S:g} s"),
+            (rate_Hz < MIN_HZ, f"{rate_Hz:.0f} control ticks a second: allowed are at least {MIN_HZ:g}, all of them"),
+            (
+                not (np.isfinite(grid[:4]).all(axis=0).any() and np.isfinite(others).any(axis=0).all()),
+                "never all of gap, handle, force, temperature, supply and clock in it: allowed is a homed device",
+            ),
+        )
+        for is_so, reason in refusals:
+            if is_so:
+                raise LabError(f"{self._name}: {reason}")
+        supply_V, clock = np.nanmedian(others, axis=0)
+        return Excerpt(
+            self._name,
+            _held(gap_mm),
+            _held(handle_mm),
+            np.where(np.isfinite(gap_mm + handle_mm), force_N, np.nan),
+            _held(temperature_C),
+            readings,
+            ticks,
+            np.array(self._noise_N),
+            float(supply_V),
+            1e6 * float(clock),
+            {side: Moves(*np.concatenate(rows, axis=1)) for side, rows in self._moves.items()},
+        )
+
+    def _end_chunk(self) -> None:
+        """Reduce the waiting ticks to their rows, and drop them."""
+        columns = dict(zip((*NUMBERS, "runs"), np.array(self._rows).T, strict=True))
+        columns["gap_mm"] = columns["left_mm"] + columns["right_mm"]
+        self._rows = []
+        times_s = columns["monotonic_s"] - self._first_s
+        begin = sum(each.shape[1] for each in self._grids)
+        place = np.floor(times_s * GRID_HZ + 1e-6).astype(np.int64) - begin
+        rows = int(place[-1]) + 1
+        ticks = np.bincount(place, minlength=rows).astype(np.float64)
+
+        def mean(values: Array) -> Array:
+            known = np.isfinite(values)
+            counts = np.bincount(place[known], minlength=rows)
+            sums = np.bincount(place[known], values[known], minlength=rows)
+            return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+        force_N = columns["device_force_N"]
+        changes = np.diff(force_N, prepend=self._reading_N) != 0.0
+        self._reading_N = float(force_N[-1])
+        means = [
+            mean(columns[name]) for name in ("gap_mm", "device_handle_mm", "device_force_N", "device_temperature_C")
+        ]
+        self._grids.append(np.array([*means, np.bincount(place, changes, minlength=rows), ticks]))
+        # a sensor that reads in every tick at times reads the same twice
+        told = changes | (changes.mean() > EVERY_TICK)
+        fresh_N = force_N[told & np.isfinite(force_N)]
+        # a reversal is no noise: what is in the middle passes it over
+        bends_N = np.abs(fresh_N[2:] - 2.0 * fresh_N[1:-1] + fresh_N[:-2])
+        middle_N = float(np.quantile(bends_N, MIDDLE).mean()) if bends_N.size else 0.0
+        self._noise_N.append(middle_N / MIDDLE_SD / math.sqrt(6.0))
+        self._others.append((float(np.median(columns["supply_V"])), float(columns["device_clock_drift"][-1])))
+        if len(times_s) < MIN_TICKS:
+            return
+        period_s = float(np.median(np.diff(times_s)))
+        for side in SIDES:
+            self._moves[side].append(_moving(columns, side, times_s, period_s))
+
+
+def _moving(columns: dict[str, Array], side: str, times_s: Array, period_s: float) -> Array:
+    """Return the rows of `Moves` of a chunk (10 x n) while the duties drive this carriage."""
+    seen = smoothed(period_s, columns, side)
+    margin = 2 * seen.window
+    even = np.ones(len(times_s))
+    # what is smoothed over a gap in time, or over another mode, is no motion by these duties
+    even[1:] = np.abs(np.diff(times_s) - period_s) < 0.5 * period_s
+    steady = np.convolve(1.0 - even * columns["runs"], np.ones(2 * margin + 1), "same") < 0.5
+    steady[:margin] = steady[-margin:] = False
+    kept = np.flatnonzero(seen.moves & steady)
+    kept = kept[:: max(round(MOVING_EVERY_S / period_s), 1)]
+    volts_s = np.gradient(seen.volts) / period_s
+    told_A = columns[f"{side}_current_A"]
+    # of a current that rises to what it is told as, the mean is about half way
+    over_A = np.abs(0.5 * (told_A + np.roll(told_A, 1))) - IDLE_A
+    return np.array(
+        [
+            np.floor(2.0 * times_s[kept]),
+            *(
+                values[kept]
+                for values in (
+                    seen.volts,
+                    volts_s,
+                    seen.current_A,
+                    seen.slope_A_s,
+                    seen.speed_m_s,
+                    seen.acceleration_m_s2,
+                    columns["gap_mm"],
+                    smooth(np.maximum(over_A, 0.0), seen.window),
+                    smooth(np.where(over_A > 0.0, 1.0, 0.0), seen.window),
+                )
+            ),
+        ]
+    )
+
+
+def _held(values: Array) -> Array:
+    """Return values where each that is not known is the last known one, or before the first that one."""
+    known = np.flatnonzero(np.isfinite(values))
+    return values[known[np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)]]

@@ -1,0 +1,181 @@
+"""What the force sensor says of the element: strength, shape over the gap, memory, friction over the rate."""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from tormagd.lab.arrays import Array, Mask, rms
+from tormagd.lab.errors import LabError
+from tormagd.lab.twin.estimate import Estimate, Prior, Values, estimated, named
+from tormagd.lab.twin.excerpt import GRID_HZ, Excerpt
+from tormagd.lab.twin.law import PIVOT_MM, along, fresh_along, strength_N, value_at, with_values
+from tormagd.simulation.parameters import Elastomer, Field, PlantParameters, Thermal
+
+STRENGTH, EXPONENT = "elastomer.kinetic_friction", "field.exponent"
+BURN_S = 5.0
+"Until then hysteresis and bristles have forgotten what was before the recording."
+BLOCK_S = 10.0
+FIT_N = 0.03
+"Size of a row's error in the fit: some noise, and more of what neighbouring rows share."
+FROZEN_S, FROZEN_N = 0.3, 0.1
+"A reading that stays for so long while the law moves by this much is no reading."
+GRID_RATIO = 0.003
+"By how much rows of a hundredth of a second blur the friction of a handle that stops."
+DRIFT_MN_MIN = 5.0
+"Of the plant card's sensors, at most."
+MOST_LOST = 0.3
+MOST_DRIFT_MN_MIN, MOST_ZERO_MN = 10.0, 150.0
+"A sensor whose zero moves more, or is further off at one time, is refused."
+WANDER_S = 30.0
+
+
+class Fitted(NamedTuple):
+    """The element's estimate, what was cut out of the recordings, and the sensor's zero in each.
+
+    `zeros` has `zero_mN` in the recording's middle, and `drift_mN_min`. `error_N` is what the law leaves, RMS, without
+    the sensor's own noise.
+    """
+
+    estimate: Estimate
+    cut_out: list[str]
+    zeros: list[dict[str, float]]
+    memory_N: list[float]
+    "Of the first recording, as `along` takes it."
+    error_N: float
+
+
+def made(prior: PlantParameters, values: Values) -> PlantParameters:
+    """Return the plant with values at keys of the element.
+
+    The strength is that of the prior times how much its kinetic friction grows, whatever else changes: the exponent
+    turns the field about PIVOT_MM, and magnets, modulus and friction share what is left.
+    """
+    field, own_N = prior.field, strength_N(prior)
+    exponent = values.get(EXPONENT, field.exponent)
+    turned = {"field.coefficient": field.coefficient * PIVOT_MM ** (field.exponent - exponent)}
+    shaped = with_values(prior, {key: value for key, value in values.items() if key != STRENGTH} | turned)
+    friction = values.get(STRENGTH, prior.elastomer.kinetic_friction)
+    return with_values(shaped, {STRENGTH: friction * own_N / strength_N(shaped)})
+
+
+def priors_of(plant: PlantParameters) -> list[Prior]:
+    """Return what is believed of an element before, about `plant`: the spread of the plant card's devices."""
+
+    def about(key: str, share: float = 0.0, plain: float = 0.0, least: float = 0.0, floor: float = 0.0) -> Prior:
+        value = value_at(plant, key)
+        return Prior(key, value, abs(share * value) + plain, least, floor)
+
+    return [
+        about(STRENGTH, 0.3, least=1e-3),
+        about("elastomer.shear_modulus_kPa", 0.12, least=1.0),
+        *([about(EXPONENT, plain=0.04, least=-3.0)] if plant.field.law == "power" else []),
+        about("field.hysteresis_percent", plain=0.75),
+        *(about(f"relaxation.fractions.{place}", 0.6) for place in range(len(plant.relaxation.fractions))),
+        about("friction.static_to_kinetic", plain=0.1, least=1.0, floor=GRID_RATIO),
+        about("friction.stribeck_speed_mm_s", 0.5, least=0.5),
+        about("friction.presliding_stiffness_N_mm", 0.5, least=0.5),
+        about("friction.viscous_N_s_mm", plain=5e-4),
+        about("thermal.force_percent_K", plain=0.25, least=-5.0),
+        about("force_sensor.delay_ms", plain=3.0, floor=1.0),
+    ]
+
+
+def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Fitted:
+    """Fit the element, under the field law of `prior`, to the forces along `ways`.
+
+    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Raises LabError for a sensor that
+    stands still or drifts.
+    """
+    shared = [each for each in priors_of(prior) if only is None or each.key in only]
+    branches = [Prior(f"memory_{place}", 0.0, 0.5) for place in range(len(prior.relaxation.fractions))]
+    sensor = [Prior("zero_N", 0.0, 0.06), Prior("drift_N_min", 0.0, 0.02), *branches]
+    kept, cut_out = _believed(prior, ways)
+
+    def plant_of(values: Values) -> PlantParameters:
+        return made(prior, {key: value for key, value in values.items() if "." in key})
+
+    # most of the derivatives leave these tables alone
+    @lru_cache(maxsize=4 * len(ways))
+    def fresh(number: int, elastomer: Elastomer, field: Field, thermal: Thermal) -> Array:
+        plant = msgspec.structs.replace(prior, elastomer=elastomer, field=field, thermal=thermal)
+        return fresh_along(plant, ways[number])
+
+    def off(values: Array) -> Array:
+        plant = plant_of(named(shared, values[: len(shared)]))
+        parts = zip(range(len(ways)), kept, values[len(shared) :].reshape(len(ways), -1).tolist(), strict=True)
+        return np.concatenate(
+            [
+                (
+                    ways[number].force_N
+                    - along(plant, ways[number], memory_N, fresh(number, plant.elastomer, plant.field, plant.thermal))
+                    - zero_N
+                    - drift_N_min * ways[number].minute
+                )[mask]
+                for number, mask, (zero_N, drift_N_min, *memory_N) in parts
+            ]
+        )
+
+    blocks = [1e6 * number + np.floor(way.time_s / BLOCK_S) for number, way in enumerate(ways)]
+    counted = np.concatenate([block[mask] for block, mask in zip(blocks, kept, strict=True)])
+    found = estimated(off, [*shared, *(sensor * len(ways))], counted, FIT_N, plant_of)
+    zeros = []
+    each_off = np.split(found.residual, np.cumsum([np.count_nonzero(mask) for mask in kept])[:-1])
+    each_own = found.values[len(shared) :].reshape(len(ways), -1)[:, :2] * 1e3
+    for way, mask, own, residual in zip(ways, kept, each_own.tolist(), each_off, strict=True):
+        zeros.append(dict(zip(("zero_mN", "drift_mN_min"), own, strict=True)))
+        _require_steady(way, own[0], own[1], 1e3 * found.width_of("drift_N_min"), residual, way.time_s[mask])
+    memory_N = found.values[len(shared) + 2 : len(shared) + 2 + len(branches)].tolist()
+    noise_N = rms(
+        np.concatenate(
+            [
+                way.sensor_noise_N / np.sqrt(np.maximum(way.readings[mask], 1.0))
+                for way, mask in zip(ways, kept, strict=True)
+            ]
+        )
+    )
+    return Fitted(found, cut_out, zeros, memory_N, math.sqrt(max(rms(found.residual) ** 2 - noise_N**2, 0.0)))
+
+
+def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mask], list[str]]:
+    """Return which rows of each way count, and a sentence for each stretch in which the sensor stands still.
+
+    Raises LabError where too much of a way has no force.
+    """
+    kept, cut_out = [], []
+    for way in ways:
+        known = np.isfinite(way.force_N)
+        expected_N = along(prior, way, [0.0] * len(prior.relaxation.fractions), fresh_along(prior, way))
+        stands = np.concatenate([[0], (way.readings == 0.0).astype(np.int64), [0]])
+        edges = np.flatnonzero(np.diff(stands)).reshape(-1, 2)
+        for begin, end in edges[np.diff(edges)[:, 0] >= FROZEN_S * GRID_HZ].tolist():
+            if np.ptp(expected_N[begin:end]) > FROZEN_N:
+                known[begin:end] = False
+                cut_out.append(
+                    f"{way.name}: the force sensor stood still from {begin / GRID_HZ:.1f} to {end / GRID_HZ:.1f} s"
+                )
+        lost = 1.0 - float(known.mean())
+        if lost > MOST_LOST:
+            raise LabError(
+                f"{way.name}: the force sensor says nothing in {lost:.0%} of it: allowed are {MOST_LOST:.0%}"
+            )
+        known[: round(BURN_S * GRID_HZ)] = False
+        kept.append(known)
+    return kept, cut_out
+
+
+def _require_steady(
+    way: Excerpt, zero_mN: float, drift_mN_min: float, width_mN_min: float, residual_N: Array, time_s: Array
+) -> None:
+    """Raise LabError for a sensor whose zero surely drifts, or jumps, by more than one does that may be believed."""
+    part = np.floor(time_s / WANDER_S).astype(np.int64)
+    sums, counts = np.bincount(part, residual_N), np.bincount(part)
+    wander_mN = 1e3 * float(np.ptp(sums[counts > 0] / counts[counts > 0]))
+    if abs(drift_mN_min) > MOST_DRIFT_MN_MIN + width_mN_min or abs(zero_mN) + wander_mN > MOST_ZERO_MN:
+        raise LabError(
+            f"{way.name}: the force sensor's zero is {zero_mN:.0f} mN, drifts by {drift_mN_min:.1f} mN a minute and "
+            f"wanders by {wander_mN:.0f} mN: allowed are {MOST_DRIFT_MN_MIN:g} mN a minute, {MOST_ZERO_MN:g} mN else"
+        )

@@ -1,0 +1,130 @@
+"""The laws of the torque element along a recorded way of gap and handle: what a plant would have let the sensor feel.
+
+They are those of `tormagd.simulation.element`, at the rows of an excerpt in place of each millisecond.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy.signal import lfilter
+
+from tormagd.lab.arrays import Array
+from tormagd.lab.twin.excerpt import GRID_HZ, Excerpt
+from tormagd.physics.force import TORMAG, Elastomer, reduced
+from tormagd.physics.friction import Friction
+from tormagd.physics.relaxation import PronySeries
+from tormagd.simulation.gap_field import SMALLEST_GAP_MM
+from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.static_laws import radial_moment_Tm
+
+PARTS = PlantParameters.__struct_fields__[: PlantParameters.__struct_fields__.index("assumed")]
+"Tables of the plant card."
+PIVOT_MM = 67.0
+"Gap at which the strength is said, and about which the field's exponent turns: the middle of what is used."
+
+
+def value_at(plant: PlantParameters, key: str) -> float:
+    """Return the number at a key of the plant file, as `motor.resistance_Ohm`; `.0` is the first of a list."""
+    found: Any = plant
+    for name in key.split("."):
+        found = found[int(name)] if name.isdigit() else getattr(found, name)
+    return float(found)
+
+
+def keys_of(plant: PlantParameters) -> list[str]:
+    """Return the keys of all numbers in a plant file, as `value_at` takes them; not of what is assumed."""
+    tables = msgspec.to_builtins(plant)
+    named = ((f"{title}.{name}", value) for title in PARTS for name, value in tables[title].items())
+    listed = (
+        [f"{key}.{place}" for place in range(len(value))] if isinstance(value, list | tuple) else [key]
+        for key, value in named
+        if not isinstance(value, str)
+    )
+    return [key for keys in listed for key in keys]
+
+
+def with_values(plant: PlantParameters, values: Mapping[str, float]) -> PlantParameters:
+    """Return the plant with other numbers at some keys, unchecked."""
+    for key, value in values.items():
+        table, name, *index = key.split(".")
+        part = getattr(plant, table)
+        new: Any = value
+        if index:
+            listed = list(getattr(part, name))
+            listed[int(index[0])] = value
+            new = tuple(listed)
+        plant = msgspec.structs.replace(plant, **{table: msgspec.structs.replace(part, **{name: new})})
+    return plant
+
+
+def fresh_N(plant: PlantParameters, moment_Tm: Array) -> Array:
+    """Return the kinetic friction of the fresh, cool insert (n), N, at radial moments (n), T m."""
+    mre = plant.elastomer
+    law = reduced(Elastomer(mre.shear_modulus_kPa * 1e3, mre.relative_permeability, mre.kinetic_friction), TORMAG)
+    return np.asarray(law.force(moment_Tm))
+
+
+def moments_Tm(plant: PlantParameters, gap_mm: Array) -> Array:
+    """Return the radial moments (n), T m, at gaps (n), without hysteresis."""
+    return np.asarray(radial_moment_Tm(gap_mm, plant), dtype=np.float64)
+
+
+def strength_N(plant: PlantParameters, gap_mm: float = PIVOT_MM) -> float:
+    """Return the kinetic friction of the fresh, cool insert at a gap, N."""
+    return float(fresh_N(plant, moments_Tm(plant, np.array([gap_mm])))[0])
+
+
+def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
+    """Return the fresh insert's kinetic friction (n) along the way, N, as warm as it is."""
+    moment_Tm = moments_Tm(plant, way.gap_mm)
+    warmer_K = way.temperature_C - plant.assumed.ambient_C
+    fresh = fresh_N(plant, moment_Tm + _lag_Tm(plant, moment_Tm))
+    return fresh * (1.0 + plant.thermal.force_percent_K / 100.0 * warmer_K)
+
+
+def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh: Array) -> Array:
+    """Return the friction (n), N, with the sign of the handle's motion, as the sensor shows it after its delay.
+
+    `memory_N` is what each branch of the elastomer still remembers at the first row, N; 0 after a long rest. `fresh` is
+    `fresh_along`.
+    """
+    series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
+    step = series.discretise(1.0 / GRID_HZ)
+    changes = np.diff(fresh, prepend=fresh[0])
+    kinetic = step.equilibrium_fraction * fresh
+    for share, decay, gain, left_N in zip(step.fractions, step.decays, step.gains, memory_N, strict=True):
+        branch, _ = lfilter([gain], [1.0, -decay], changes, zi=[decay * left_N])
+        kinetic = kinetic + share * branch
+    force = _felt(plant, np.maximum(kinetic, 0.0), np.diff(way.handle_mm, prepend=way.handle_mm[0]) * GRID_HZ)
+    return np.interp(way.time_s - 1e-3 * plant.force_sensor.delay_ms, way.time_s, force)
+
+
+def _lag_Tm(plant: PlantParameters, moment_Tm: Array) -> Array:
+    """Return what hysteresis adds to the moments (n), T m, as `GapField` has it."""
+    largest_Tm = float(moments_Tm(plant, np.array([SMALLEST_GAP_MM]))[0])
+    branch_Tm = plant.field.hysteresis_percent / 100.0 * largest_Tm
+    changes = np.diff(moment_Tm, prepend=moment_Tm[0])
+    kept = np.exp(-np.abs(changes) / (plant.assumed.hysteresis_scale * largest_Tm))
+    lag, lags = 0.0, []
+    for share, added in zip(kept.tolist(), (-np.sign(changes) * branch_Tm * (1.0 - kept)).tolist(), strict=True):
+        lag = share * lag + added
+        lags.append(lag)
+    return np.array(lags)
+
+
+def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
+    """Return the friction at the roller (n), N, for kinetic levels (n) and handle speeds (n)."""
+    said = plant.friction
+    friction = Friction(
+        presliding_stiffness_N_mm=said.presliding_stiffness_N_mm,
+        viscous_N_s_mm=said.viscous_N_s_mm,
+        static_ratio=said.static_to_kinetic,
+        stribeck_speed_mm_s=said.stribeck_speed_mm_s,
+    )
+    bristles_mm, forces = 0.0, []
+    for speed, level_N in zip(speed_mm_s.tolist(), kinetic_N.tolist(), strict=True):
+        force_N, bristles_mm = friction.advance(bristles_mm, speed, level_N, 1.0 / GRID_HZ)
+        forces.append(force_N)
+    return np.array(forces)
