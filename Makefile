@@ -10,6 +10,7 @@ GOAL ?= test
 SEARCHES ?= 5
 MUTANTS ?= 60
 SEED ?= 1
+PLANT ?= sample_1
 SECONDS ?= 12
 MATRICES ?= 10 30 50
 
@@ -39,7 +40,7 @@ PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgra
 .PHONY: install uninstall deb wheels run test compiled live yielding interpreted fuzz coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
-	$(BIN)/python tools/demo.py
+	$(BIN)/python tools/demo.py --plant '$(PLANT)'
 
 test: $(VENV)/.dev
 	$(MAKE) --no-print-directory compiled

@@ -41,6 +41,7 @@ from rendering.touching import Touch
 from tormagd.config import Config
 from tormagd.lab.arrays import Array, Json
 from tormagd.scenes.scene import Scene, load_scene
+from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd_client.endpoints import ConfigError
 
 SHOWS = 3
@@ -74,7 +75,15 @@ class Verdict(IntEnum):
 
 def main() -> int:
     """Runs the demonstration; 0: what the scene states was met, 1: missed, 3: the host left too little to say."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plant", default="sample_1", help="plant file or sample that plays the pulse (sample_1)")
+    plant = parser.parse_args().plant
+    try:
+        load_plant(plant)
+    except PlantError as error:
+        parser.error(str(error))
+    # the show runs in a folder of its own
+    plant = str(Path(plant).absolute()) if Path(plant).exists() else plant
     started_s = time.monotonic()
     times_s, forces_N = profile()
     config = Config(scene="pulse")
@@ -85,7 +94,7 @@ def main() -> int:
     print("", *touch_told(scene, touched)[1], "", sep="\n")
     print("A measured human pulse (photoplethysmogram, heartpy) as a force, through the daemon and a simulated device.")
     for number in range(1, SHOWS + 1):
-        shown = show(times_s, forces_N)
+        shown = show(times_s, forces_N, plant=plant)
         verdict, sentence = judge(scene, shown)
         if verdict is not Verdict.HOST or number == SHOWS:
             break
@@ -291,7 +300,7 @@ def force_table(shown: Shown | Aborted, rehearsals: Rehearsals) -> list[str]:
     """How well the forces were rendered: a heading, and a line for each case."""
     rows = {}
     if isinstance(shown, Shown):
-        rows["real time, plant sample 1"] = numbers(scored(shown.time_s, shown.asked_N, shown.rendered_N))
+        rows[f"real time, plant {shown.plant}"] = numbers(scored(shown.time_s, shown.asked_N, shown.rendered_N))
     for case, found in rehearsals.items():
         is_steady = case.hand == "steady"
         line = numbers(found.since(PULSE_START_S)) if is_steady else "  (a brake: see the picture)"

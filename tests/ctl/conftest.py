@@ -306,6 +306,7 @@ def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
         return said.getvalue()
 
     monkeypatch.setattr("tormagd.ctl.scene.answer_of", answer_of)
+    monkeypatch.setattr("tormagd.ctl.scene_plant.answer_of", answer_of)
 
 
 @pytest.fixture

@@ -229,12 +229,12 @@ def test_a_force_may_be_held_until_the_next() -> None:
     assert held.figures(0.55)["no_delay_rms_N"] <= 1e-3
 
 
-def test_the_command_prints_the_three_figures(capsys, tmp_path) -> None:
+def test_the_command_prints_its_figures(capsys, tmp_path) -> None:
     path = tmp_path / "force.csv"
     path.write_text("t_s,force_N\n0,1.0\n0.2,1.0\n0.21,1.4\n0.5,1.4\n")
     assert main(["bound", str(path), "--plant", "sample_3", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert set(result) == {"sd_N", "no_delay_rms_N", "foresight_rms_N"}
+    assert set(result) == {"sd_N", "no_delay_rms_N", "foresight_rms_N", "least_N", "most_N"}
     assert 0.0 < result["foresight_rms_N"] < result["no_delay_rms_N"]
     assert main(["bound", str(path)]) == 0
     assert re.search(r"^no_delay_rms_N +0\.1713$", capsys.readouterr().out, re.MULTILINE)

@@ -125,6 +125,7 @@ class Shown(NamedTuple):
     host: Host
     core_share: float
     "Processor time of the daemon and what it has begun, over the time shown."
+    plant: str = "sample 1"
 
 
 class Aborted(NamedTuple):
@@ -262,6 +263,7 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
         worst_stall_ms=float(spacings_s.max()) * 1e3,
         host=watched.between(start_s, end_s),
         core_share=core_share,
+        plant=Path(plant).stem.replace("_", " "),
     )
 
 

@@ -395,6 +395,9 @@ COMMANDS = {
                 help="check: the cheapest way whose RMS error, N, is at most this. new: the RMS error to state",
             ),
             option("--out", "-o", type=Path, metavar="FILE.toml", help="check: write the scene served so, a new file"),
+            option(
+                "--plant", metavar="P", help="check, new: this simulated device has to give it, as tormag-lab twin's"
+            ),
         ),
     ),
     "keys": Command(

@@ -29,13 +29,15 @@ def scene(
     config_file: Path | None,
     endpoints: Endpoints,
     wait_s: float,
+    plant: str | None = None,
     **recorded: Any,
 ) -> Outcome:
     """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new.
 
-    `share`, `tolerance_N` or `out` choose how the scene is served, for check only. `new` writes the file `name`, from
-    `recorded`, which with `tolerance_N` is a `Recorded`, or from answers. Raises CommandError (USAGE) for `new` without
-    a name, and for what is recorded without it. Raises as the six do.
+    `plant`, for check and new, also has to give the scene. `share`, `tolerance_N` or `out` choose how the scene is
+    served, for check only. `new` writes the file `name`, from `recorded`, which with `tolerance_N` is a `Recorded`,
+    or from answers. Raises CommandError (USAGE) for `new` without a name, and for what is recorded without it. Raises
+    as the six do.
     """
     named = name or config.scene
     if action == "new":
@@ -43,7 +45,9 @@ def scene(
             raise usage_error("scene new: the file to write is missing", "tormagctl scene new FILE.toml")
         from tormagd.ctl.scene_new import Recorded, new_scene
 
-        return new_scene(Path(name), Recorded(**recorded, tolerance_N=tolerance_N), config_file)
+        return new_scene(Path(name), Recorded(**recorded, tolerance_N=tolerance_N), config_file, plant)
+    if plant is not None and action != "check":
+        raise usage_error("--plant: allowed only for scene check and new", "tormagctl scene check NAME --plant FILE")
     if unused := [key for key, value in recorded.items() if value is not None]:
         raise usage_error(
             f"--{unused[0].removesuffix('_N')}: allowed only for scene new", "tormagctl scene new FILE.toml"
@@ -58,7 +62,7 @@ def scene(
         case "show":
             return show_scene(named)
         case "check":
-            return check_scene(named, config_file)
+            return check_scene(named, config_file, plant)
         case "explain":
             return explain_scene(named, config_file)
     from tormagd_client.blocking import Client
@@ -136,13 +140,14 @@ def _line(key: str, value: object) -> str:
     return f"{key} = {msgspec.json.encode(value).decode()}"
 
 
-def check_scene(name: str, config: Path | None) -> Outcome:
+def check_scene(name: str, config: Path | None, plant: str | None = None) -> Outcome:
     """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost.
 
-    `config` None means the defaults. The outcome has `scene`, `core_share_allowed`, what `_derived` gives, and the cost
-    as `core_share`. That is known, and held against `budget.core_share`, only where that way of serving was measured;
-    else it is None. Raises CommandError: REFUSED where the daemon refuses the scene, or it costs more than its budget;
-    USAGE for a faulty scene.
+    `config` None means the defaults. With `plant`, a simulated device also has to give it. The outcome has `scene`,
+    `core_share_allowed`, what `_derived` gives, and the cost as `core_share`. That is known, and held against
+    `budget.core_share`, only where that way of serving was measured; else it is None. Raises CommandError: REFUSED
+    where the daemon refuses the scene, the plant does not give it, or it costs more than its budget. USAGE is for a
+    faulty scene or plant.
     """
     scene = loaded(name)
     derived = _derived(name, config)
@@ -156,6 +161,11 @@ def check_scene(name: str, config: Path | None) -> Outcome:
             f"budget.core_share = {scene.budget.core_share:g}",
             "tormagctl scene explain says what other rates and searches take",
         )
+    given = {}
+    if plant is not None:
+        from tormagd.ctl.scene_plant import on_plant
+
+        given = on_plant(scene, name, plant)
     force, signal, least_N = scene.force, scene.signal, derived["least_N"]
     lines = [
         f"{scene.name}: taken",
@@ -177,6 +187,14 @@ def check_scene(name: str, config: Path | None) -> Outcome:
             else []
         ),
         *_waiting(force, derived["approaches_s"]),
+        *(
+            [
+                f"plant      {given['plant']} gives {given['least_N']:.2f}..{given['most_N']:.2f} N; its carriages "
+                f"at best miss {1e3 * given['foresight_rms_N']:.1f} mN"
+            ]
+            if given
+            else []
+        ),
         f"served     {way_of(derived)}",
         "cost       not measured of these rates, search and terms"
         if share is None
@@ -186,6 +204,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
         "scene": scene.name,
         "core_share": share and share.daemon,
         "core_share_allowed": scene.budget.core_share,
+        "on_plant": given or None,
     } | derived
     return Outcome(result, folded("\n".join(lines)))
 

@@ -50,28 +50,30 @@ class Recorded(NamedTuple):
     tolerance_N: float | None = None
 
 
-def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
+def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | None = None) -> Outcome:
     """Write the new scene file `out` from a recorded force, or without one from a person's answers.
 
-    `config` is the configuration to check it by; None means the defaults. Where column, scale or offset are stated, the
-    forces are written beside `out`, as CSV. What only a weak device does not give stands in the file's first lines, and
-    as `unmet_if_weak` in the result. A scene that no insert renders is written all the same. Its first lines say what
-    is not met, and so does `unmet`; the exit code is REFUSED. Raises CommandError (USAGE) for files and answers that
-    cannot be used, or nobody to ask. Raises it for an unknown insert, and where the check does not come to an end. Then
-    there is no file.
+    `config` is the configuration to check it by; None means the defaults. `plant` also has to give it; None: no plant
+    is asked. Where column, scale or offset are stated, the forces are written beside `out`, as CSV. What only a weak
+    device does not give stands in the file's first lines, and as `unmet_if_weak` in the result. A scene that no insert
+    renders is written all the same. Its first lines say what is not met, and so does `unmet`; the exit code is REFUSED.
+    Raises CommandError (USAGE) for files and answers that cannot be used, or nobody to ask. Raises it for an unknown
+    insert or plant, and where the check does not come to an end. Then there is no file.
     """
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
     force_file = _forces_of(out, recorded)
     try:
-        return _proposed(out, force_file, recorded, config)
+        return _proposed(out, force_file, recorded, config, plant)
     except CommandError:
         if force_file is not None and force_file != recorded.force:
             force_file.unlink()
         raise
 
 
-def _proposed(out: Path, force_file: Path | None, recorded: Recorded, config: Path | None) -> Outcome:
+def _proposed(
+    out: Path, force_file: Path | None, recorded: Recorded, config: Path | None, plant: str | None
+) -> Outcome:
     """Write the scene file `out` for the forces in `force_file`. Raises CommandError, as `new_scene`."""
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
     if recorded.tolerance_N is not None:
@@ -81,7 +83,7 @@ def _proposed(out: Path, force_file: Path | None, recorded: Recorded, config: Pa
         msgspec.convert(_with(tables, inserts[0]), Scene)
     except msgspec.ValidationError as error:
         raise usage_error(f"no scene can be made of this: {error}", "docs/scenes.md says what each key asks") from error
-    insert, checked, unmet = _softest(out, tables, inserts, config)
+    insert, checked, unmet = _softest(out, tables, inserts, config, plant)
     found = {"file": str(out), "insert": insert, "unmet": unmet, "unmet_if_weak": []}
     if checked is None:
         said = f"{out} is written, with insert {insert}, and is NOT MET:\n" + "\n".join(unmet)
@@ -132,7 +134,7 @@ def _forces_of(out: Path, recorded: Recorded) -> Path | None:
 
 
 def _softest(
-    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None
+    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None, plant: str | None
 ) -> tuple[str, Outcome | None, list[str]]:
     """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all.
 
@@ -145,7 +147,7 @@ def _softest(
     for insert in inserts:
         _write(out, tables, insert)
         try:
-            taken[insert] = check_scene(str(out), config)
+            taken[insert] = check_scene(str(out), config, plant)
         except CommandError as error:
             reason = error.message.removeprefix(f"scene {tables['name']}: ")
             # a machine too busy to say, or an insert or model that there is not

@@ -35,7 +35,7 @@ from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
 from tormagd.simulation.gap_field import SMALLEST_GAP_MM
-from tormagd.simulation.parameters import PlantParameters, SecondParameters, load_plant
+from tormagd.simulation.parameters import PLANTS_INSERT, PlantParameters, SecondParameters, load_plant, with_insert
 from tormagd.simulation.second_element import fresh_N, rate_factor, shaft_field_mT
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 
@@ -459,6 +459,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `tormag-lab bound`."""
     parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
+    parser.add_argument("--insert", default=PLANTS_INSERT, help=f"insert in it ({PLANTS_INSERT})")
 
 
 def run(options: argparse.Namespace) -> Found:
@@ -466,12 +467,17 @@ def run(options: argparse.Namespace) -> Found:
     `options.plant`.
 
     The figures are the standard deviation of the force asked for, and the RMS errors without delay and with foresight,
-    N. Raises DomainError, ForceFileError and PlantError for what is refused, and LabError where no optimum was found.
+    N. With them come the plant's least and greatest force. Raises DomainError, ForceFileError and
+    PlantError for what is refused, and LabError where no optimum was found.
     """
     table = read_forces(options.force)
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
+    plant = with_insert(plant, options.insert)
+    brake = brake_of(plant)
+    most_N = brake.sliding_N(brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.branch_Tm), TURNED_MM_S)
     try:
-        return Found(bound(plant, time_s, force_N).figures())
+        figures = bound(plant, time_s, force_N).figures()
+        return Found({**figures, "least_N": brake.open_N(TURNED_MM_S), "most_N": most_N})
     except RuntimeError as error:
         raise LabError(str(error)) from error
 
