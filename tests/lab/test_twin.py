@@ -105,7 +105,8 @@ def test_a_sensor_of_another_gain_is_never_silently_a_weak_device(way):
 def test_a_sensor_that_stands_still_is_cut_out_by_name(way):
     stuck = slice(1500, 1700)
     force_N, readings = way.force_N.copy(), way.readings.copy()
-    force_N[stuck], readings[stuck] = force_N[1500], 0.0
+    force_N[stuck], readings[stuck] = -force_N[1500], 0.0
+    readings[[1500, 1699]] = 1.0
     twin = twin_of(PRIOR, [way._replace(force_N=force_N, readings=readings)])
     assert twin.force.cut_out == [f"{way.name}: the force sensor stood still from 15.0 to 17.0 s"]
     assert twin.is_explained

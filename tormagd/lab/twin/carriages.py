@@ -14,15 +14,15 @@ from tormagd.commission.of_carriages import SIDES
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.errors import LabError
 from tormagd.lab.twin.estimate import Estimate, Prior, Values, estimated, named
-from tormagd.lab.twin.excerpt import IDLE_A, Excerpt, Moves
+from tormagd.lab.twin.excerpt import GRID_HZ, IDLE_A, Excerpt, Moves
 from tormagd.lab.twin.law import value_at, with_values
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import pull_of_magnets_N
 
 VOLTS, AMPS = 0.5, 0.3
 "Sizes of the errors of both laws in the fit."
-RIPPLE = 0.02
-"Share by which a current that ripples within a millisecond, and is told once in it, may be off in its mean."
+RIPPLE_MS = 0.02
+"For each ms of a control tick: share by which a current that ripples within it, and is told once, may be off."
 SUPPLY_STEP_V = 0.1
 "In which a Status tells the supply."
 
@@ -44,15 +44,16 @@ def lag_s(plant: PlantParameters) -> float:
     return motor.inertia_kg_m2 * motor.resistance_Ohm / motor.back_emf_V_s_rad**2
 
 
-def priors_of(plant: PlantParameters, supply_V: float) -> list[Prior]:
+def priors_of(plant: PlantParameters, supply_V: float, tick_ms: float) -> list[Prior]:
     """Return what is believed of carriages before, about `plant`: the spread of the plant card's devices."""
+    ripple = RIPPLE_MS * tick_ms
     shares = {
         "motor.resistance_Ohm": (0.15, 0.0),
         "motor.back_emf_V_s_rad": (0.08, 0.0),
         "motor.inductance_mH": (0.4, 0.1),
-        "motor.inertia_kg_m2": (0.5, RIPPLE),
-        "gear.efficiency": (0.1, 3.0 * RIPPLE),
-        "gear.output_friction_Nm": (0.3, 3.0 * RIPPLE),
+        "motor.inertia_kg_m2": (0.5, ripple),
+        "gear.efficiency": (0.1, 3.0 * ripple),
+        "gear.output_friction_Nm": (0.3, 3.0 * ripple),
         "screw.friction_coefficient": (0.25, 0.0),
         "screw.drag_left_N": (0.5, 0.0),
         "screw.drag_right_N": (0.5, 0.0),
@@ -72,8 +73,11 @@ def fit_carriages(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequenc
     Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Raises LabError where the carriages
     hardly moved.
     """
+    tick_ms = 1e3 / GRID_HZ / float(np.median(ways[0].ticks))
     priors = [
-        each for each in priors_of(prior, ways[0].supply_V) if only is None or each.key in only or "." not in each.key
+        each
+        for each in priors_of(prior, ways[0].supply_V, tick_ms)
+        if only is None or each.key in only or "." not in each.key
     ]
     rows = {side: Moves(*np.concatenate([np.array(way.moves[side]) for way in ways], axis=1)) for side in SIDES}
     pulls = {side: np.asarray(pull_of_magnets_N(seen.gap_mm, prior), dtype=np.float64) for side, seen in rows.items()}

@@ -51,8 +51,8 @@ class Fitted(NamedTuple):
 def made(prior: PlantParameters, values: Values) -> PlantParameters:
     """Return the plant with values at keys of the element.
 
-    The strength is that of the prior times how much its kinetic friction grows, whatever else changes: the exponent
-    turns the field about PIVOT_MM, and magnets, modulus and friction share what is left.
+    The strength is that of the prior times how much its kinetic friction grows, whatever else changes. The exponent
+    turns the field about PIVOT_MM. Magnets, modulus and friction share what is left.
     """
     field, own_N = prior.field, strength_N(prior)
     exponent = values.get(EXPONENT, field.exponent)
@@ -153,7 +153,8 @@ def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mas
         edges = np.flatnonzero(np.diff(stands)).reshape(-1, 2)
         for begin, end in edges[np.diff(edges)[:, 0] >= FROZEN_S * GRID_HZ].tolist():
             if np.ptp(expected_N[begin:end]) > FROZEN_N:
-                known[begin:end] = False
+                # in the rows before and after it stood for a part
+                known[max(begin - 1, 0) : end + 1] = False
                 cut_out.append(
                     f"{way.name}: the force sensor stood still from {begin / GRID_HZ:.1f} to {end / GRID_HZ:.1f} s"
                 )
