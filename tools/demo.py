@@ -24,8 +24,8 @@ import msgspec
 from rendering.following import Case, Rehearsals, Tracking, rehearse
 from rendering.live_touch import FELT_N, PUSH_MM_S, ROUND_TRIP_MS, Wall, felt, figures, lateness
 from rendering.show import (
-    LEAST_N,
     MAX_N,
+    MIN_N,
     PULSE_START_S,
     RECORDING,
     RUN_DIR,
@@ -292,7 +292,7 @@ def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:
     """What was asked, and the forces as a table."""
     deviations_mN = [found.since(PULSE_START_S).reference_sd_N * 1e3 for found in rehearsals.values()]
     deviation = f" (sd {deviations_mN[-1]:.0f} mN)" if deviations_mN else ""
-    print(f"\nforce asked {LEAST_N}..{MAX_N} N{deviation}, rendered by the plant:")
+    print(f"\nforce asked {MIN_N}..{MAX_N} N{deviation}, rendered by the plant:")
     print("\n".join(force_table(shown, rehearsals)))
 
 

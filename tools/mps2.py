@@ -30,7 +30,7 @@ from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
 PULSE_S = 20.0
-MOST_N = 1e-3
+MAX_N = 1e-3
 "The pulses may differ by so much."
 DRIVE = "Drive taken, State and Sense sent"
 
@@ -61,7 +61,7 @@ class Counted(EmulatedFirmware):
 
 def main() -> int:
     """Prints the figures; returns 1 where the kit fails the program, a frame was dropped, or the pulses differ by more
-    than MOST_N."""
+    than MAX_N."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pulses", type=int, choices=range(1, 181), default=1, metavar="N", help="of 20 s each")
     parser.add_argument("--kit", action="store_true", help="the conformance kit's checks instead")
@@ -112,7 +112,7 @@ def is_followed(boot: FirmwareKind, pulses: int) -> bool:
     )
     worst_N = float(np.abs(there_N - here_N).max())
     print(f"pulse of {times_s[-1]:.0f} s: {worst_N * 1e3:.2g} mN at most from the host library's")
-    return worst_N <= MOST_N
+    return worst_N <= MAX_N
 
 
 def instructions(name: str, counted: list[int]) -> dict[str, object]:

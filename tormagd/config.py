@@ -19,7 +19,7 @@ MAX_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
 CALIBRATED = ("motor", "position", "trim")
 "Tables of which a device's calibration may state keys."
-MOST_PLAYOUT_MS = 200.0
+MAX_PLAYOUT_MS = 200.0
 "Half of what the whole way from sensor to force may take."
 
 
@@ -55,7 +55,7 @@ class Sources(Strict, frozen=True):
 
     priority: tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...] = ()
     "Names of sources. Each takes the brake over from those after it, and from all that are not listed."
-    playout_ms: Annotated[float, Meta(ge=0.0, le=MOST_PLAYOUT_MS)] = 0.0
+    playout_ms: Annotated[float, Meta(ge=0.0, le=MAX_PLAYOUT_MS)] = 0.0
     "Setpoints are followed so long after their stamps, as evenly as they were stamped. 0: as soon as they come."
 
     def __post_init__(self) -> None:

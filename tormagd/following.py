@@ -13,11 +13,11 @@ from tormagd_client.messages import MAX_DISPLACEMENT_MM, FollowingReport
 
 PERIOD_S: Final = 0.02
 "Time between two looks, unless another is stated."
-MOST_DELAY_S: Final = 0.4
+MAX_DELAY_S: Final = 0.4
 "Greatest delay that is taken out: the budget of the whole way."
 NEAR_N: Final = 0.1
 "The way to the first force ends this near to it."
-LEAST_S: Final = 1.0
+MIN_S: Final = 1.0
 "No figure is told of fewer looks than fill this time."
 SLIDES_MM_S: Final = 1.0
 SLID_MM: Final = MAX_DISPLACEMENT_MM
@@ -29,7 +29,7 @@ NOT_FOLLOWED: Final = frozenset({"RANGE", "STANDBY", "F_MIN", "F_MAX", "TAKEOVER
 class Following:
     """Measures how well the force is followed: RMS error, and the delay that explains most of it.
 
-    Looks every `period_s`. Keeps the forces asked for in the last MOST_DELAY_S, and a sum of squared errors for each
+    Looks every `period_s`. Keeps the forces asked for in the last MAX_DELAY_S, and a sum of squared errors for each
     delay.
     """
 
@@ -37,7 +37,7 @@ class Following:
         """Begin without figures. After `forgets_s` an error counts a third (1/e); infinite: all count alike."""
         self._period_s = period_s
         self._kept = math.exp(-period_s / forgets_s)
-        count = round(MOST_DELAY_S / period_s) + 1
+        count = round(MAX_DELAY_S / period_s) + 1
         self._asked_N: deque[float] = deque(maxlen=count)
         self._squares, self._weight = [0.0] * count, 0.0
         self._has_arrived = False
@@ -59,7 +59,7 @@ class Following:
     ) -> None:
         """Look once, and add the error for each delay where it counts.
 
-        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED, after MOST_DELAY_S of
+        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED, after MAX_DELAY_S of
         setpoints. A state of None counts as ENABLED, a handle without place or rate (None) as sliding. Out of ENABLED
         or without a setpoint (`asked_N` None), the way begins anew. With a finite `forgets_s` earlier errors fade at
         each look.
@@ -103,9 +103,9 @@ class Following:
     def report(self) -> FollowingReport | None:
         """Return the RMS error, N, the RMS error with the best delay taken out, N, and that delay, ms.
 
-        None where fewer looks count than fill LEAST_S: at first, and where they are forgotten.
+        None where fewer looks count than fill MIN_S: at first, and where they are forgotten.
         """
-        if self.counted_s < LEAST_S:
+        if self.counted_s < MIN_S:
             return None
         least = min(self._squares)
         return FollowingReport(

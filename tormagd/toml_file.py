@@ -18,7 +18,7 @@ from tormagd.named_file import did_you_mean
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import in_short
 
-MOST_BYTES = 65_536
+MAX_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
 LONGEST_LINE = 8_192
 "Characters in a line: the parser's time grows as the square of a key's parts, to a minute."
@@ -49,12 +49,12 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def toml_text(path: Path) -> str:
-    """Read a text file of at most MOST_BYTES, in UTF-8, and return its text.
+    """Read a text file of at most MAX_BYTES, in UTF-8, and return its text.
 
     Raises OSError, whose `strerror` says why it cannot be read, and TomlError for bytes that are not UTF-8.
     """
     try:
-        return read_bounded(path, MOST_BYTES).decode("utf-8-sig")  # editors on Windows put a byte order mark first
+        return read_bounded(path, MAX_BYTES).decode("utf-8-sig")  # editors on Windows put a byte order mark first
     except UnicodeDecodeError as error:
         raise TomlError(f"not UTF-8 text (byte {error.start})") from error
 

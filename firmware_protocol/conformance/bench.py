@@ -15,7 +15,7 @@ from firmware_protocol.conformance.host import (
     positions,
     shown,
 )
-from firmware_protocol.conformance.opening import LEAST_SHARE
+from firmware_protocol.conformance.opening import MIN_SHARE
 from firmware_protocol.conformance.running import refuses_run
 
 PAGE: Final = "Reset"
@@ -44,7 +44,7 @@ def _is_new(host: Host, how: str) -> str:
     host.obeyed(Retract)
     host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S)
     seen.append(f"opens in {host.now_s - start_s:.1f} s from {positions(start)}")
-    limit_s = FAR_INSIDE_MM / (LEAST_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
+    limit_s = FAR_INSIDE_MM / (MIN_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
     is_late = host.now_s - start_s > limit_s
     host.shows(DeviceMode.IDLE, homed=False, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=is_late)
     host.obeyed(Home)
@@ -57,7 +57,7 @@ def _is_new(host: Host, how: str) -> str:
 
 LIKE_NEW: Final = (
     f"nonce 0, IDLE, not HOMED, no fault, drives off; opens {FAR_INSIDE_MM:g} mm at over "
-    f"{LEAST_SHARE * UNHOMED_SHARE:g} of the device's speed and {TO_TURN_S:g} s; runs after Home and Hello, not before"
+    f"{MIN_SHARE * UNHOMED_SHARE:g} of the device's speed and {TO_TURN_S:g} s; runs after Home and Hello, not before"
 )
 
 

@@ -48,7 +48,7 @@ OPENED_S: Final = 10.0
 HOMED_S: Final = 12.0
 "What the daemon allows a homing."
 HELLO_NONCE: Final = 255
-MOST_NONCE: Final = 254
+MAX_NONCE: Final = 254
 INSIDE_MM: Final = 2.0
 "How far a carriage is brought from its open switch where a check needs room."
 DUTY_PER_MM: Final = 3.0
@@ -203,9 +203,9 @@ class Host:
 
     def new_nonce(self) -> int:
         """Return a nonce that the device has not accepted last: 1 to 254, counting on."""
-        self._nonce = self._nonce % MOST_NONCE + 1
+        self._nonce = self._nonce % MAX_NONCE + 1
         if self._nonce == self._shown_nonce():
-            self._nonce = self._nonce % MOST_NONCE + 1
+            self._nonce = self._nonce % MAX_NONCE + 1
         return self._nonce
 
     def command(self, kind: Command, beat: Beat = Beat.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:

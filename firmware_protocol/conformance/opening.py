@@ -23,21 +23,21 @@ from firmware_protocol.conformance.host import (
 PAGE: Final = "Opening"
 NEARLY_MM: Final = 1.25
 "Before the closed switch: here an opening from the whole stroke begins."
-LEAST_SHARE: Final = 0.6
-MOST_SHARE: Final = 1.15
+MIN_SHARE: Final = 0.6
+MAX_SHARE: Final = 1.15
 """Of the device's speed of opening: what a carriage has as a mean but for both ends, and at most."""
 ENDS_MM: Final = 3.0
 CLOSING_DUTY: Final = -0.5
 WINDOW: Final = 50
 """States over which a speed is taken."""
-FULLY: Final = f"all the way at {LEAST_SHARE:g} to {MOST_SHARE:g} of the device's speed; "
+FULLY: Final = f"all the way at {MIN_SHARE:g} to {MAX_SHARE:g} of the device's speed; "
 NEARLY: Final = f"in RUN, {NEARLY_MM:g} mm from the closed switches, "
 
 
 def opens_fully(host: Host, fault: DeviceFault, beat: Beat = Beat.OFF) -> str:
     """Watch a device open that has begun, and judge each carriage's speed on the device's clock.
 
-    Raises Unmet where the mean is under LEAST_SHARE or a window over MOST_SHARE of the device's speed. Raises it, too,
+    Raises Unmet where the mean is under MIN_SHARE or a window over MAX_SHARE of the device's speed. Raises it, too,
     unless it ends at rest at both open switches with just this fault.
     """
     host.forget()
@@ -52,7 +52,7 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = Beat.OFF) -> str:
     speeds = [_speeds(rows, side, starts_mm[side]) for side in (0, 1)]
     means, mosts = [mean for mean, _ in speeds], [most for _, most in speeds]
     seen = f"{min(means):.1f} mm/s on the way, {max(mosts):.1f} at most"
-    is_wrong = min(means) < LEAST_SHARE * host.opening_mm_s or max(mosts) > MOST_SHARE * host.opening_mm_s
+    is_wrong = min(means) < MIN_SHARE * host.opening_mm_s or max(mosts) > MAX_SHARE * host.opening_mm_s
     mode = DeviceMode.LATCHED if fault else DeviceMode.IDLE
     return host.shows(mode, beat, homed=not fault, opened=True, fault=fault, besides=seen, wrong=is_wrong)
 

@@ -37,7 +37,7 @@ TAKES: Final = "What each mode takes"
 MET: Final = "Who says what when, 1"
 OPENING: Final = "Opening"
 RAMP_PER_S: Final = 1.0
-MOST_DUTY: Final = 0.5
+MAX_DUTY: Final = 0.5
 REFUSED_DUTY: Final = -0.4
 "A motor in RUN would go in by over REFUSED_MM with it, in SEEN_S."
 REFUSED_MM: Final = 0.1
@@ -71,7 +71,7 @@ def run_is_entered(host: Host) -> str:
 @check(
     Hazard.CLOSES,
     "Drive",
-    f"in RUN, a left duty that falls from 0 to -{MOST_DUTY:g} at most, right 0",
+    f"in RUN, a left duty that falls from 0 to -{MAX_DUTY:g} at most, right 0",
     f"the left carriage goes in by {MOVED_MM:g} mm, the right one stays; the left motor draws more",
     moves=True,
     is_gate=True,
@@ -84,7 +84,7 @@ def left_duty(host: Host) -> str:
 @check(
     Hazard.CLOSES,
     "Drive",
-    f"in RUN, a right duty that falls from 0 to -{MOST_DUTY:g} at most, left 0",
+    f"in RUN, a right duty that falls from 0 to -{MAX_DUTY:g} at most, left 0",
     f"the right carriage goes in by {MOVED_MM:g} mm, the left one stays; the right motor draws more",
     moves=True,
     is_gate=True,
@@ -98,7 +98,7 @@ def _duty_moves(host: Host, *, is_left: bool) -> str:
     """Lower one duty slowly. Raises Unmet unless its carriage goes in by MOVED_MM while the other one stays."""
     host.running()
     start = host.last(State)
-    for step in range(round(MOST_DUTY / RAMP_PER_S / PERIOD_S)):
+    for step in range(round(MAX_DUTY / RAMP_PER_S / PERIOD_S)):
         duty = -RAMP_PER_S * PERIOD_S * step
         host.beat(Beat.RUN, duty if is_left else 0.0, 0.0 if is_left else duty)
         left_mm, right_mm = _moved_mm(host, start)

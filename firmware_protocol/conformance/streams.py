@@ -31,8 +31,8 @@ WINDOW = 300
 ENDS = 50
 """States at either end of a window; the least delayed of them counts."""
 STATUS_TOLERANCE = 0.03
-MOST_DRIFT = 0.01
-MOST_ANSWER_S = 3e-3
+MAX_DRIFT = 0.01
+MAX_ANSWER_S = 3e-3
 """The device's own millisecond, and the way there and back by any adapter."""
 HANDLE_MM = 1.0
 """A handle at 0.3 m/s goes a third of this in a millisecond; one of swapped bytes leaps by 2 mm a step."""
@@ -132,7 +132,7 @@ def no_answer_without_drive(host: Host) -> str:
     Hazard.CLOSES,
     ANSWERS,
     "Drive OFF every 1 ms",
-    f"State within {MOST_ANSWER_S * 1e3:g} ms as a rule, at once on the device",
+    f"State within {MAX_ANSWER_S * 1e3:g} ms as a rule, at once on the device",
 )
 def answer_time(host: Host) -> str:
     """Check that State comes as soon as the position loop needs it, the adapter's delay included."""
@@ -146,7 +146,7 @@ def answer_time(host: Host) -> str:
     if not delays_s:
         raise Unmet("no State ever came")
     seen = f"{usual(delays_s) * 1e3:.2f} ms as a rule, {max(delays_s) * 1e3:.1f} ms at most"
-    return unless(usual(delays_s) > MOST_ANSWER_S, seen)
+    return unless(usual(delays_s) > MAX_ANSWER_S, seen)
 
 
 @check(Hazard.MISLED, "State", "Drive OFF every 1 ms for 0.6 s", "State's counter is one more each time, modulo 256")
@@ -184,7 +184,7 @@ def device_clock(host: Host) -> str:
         raise Unmet(f"{len(states)} State in {CLOCKED_S:g} s")
     drift = usual(drifts)
     seen = f"{1.0 + drift:.4f} s in a second, {drift:+.2%}"
-    return unless(abs(drift) > MOST_DRIFT, seen)
+    return unless(abs(drift) > MAX_DRIFT, seen)
 
 
 @check(Hazard.MISLED, "State", f"{TIMES} Drive OFF, one every 1.13 ms", "device_time_s in steps of 10 us")

@@ -37,7 +37,7 @@ DUTIES: Final = (0.4, 0.6, 0.8, 1.0)
 MIDDLE_MM: Final = 10.0
 PULSE_S: Final = 0.3
 SETTLED_S: Final = 0.15
-LEAST_GAIN: Final = 0.6
+MIN_GAIN: Final = 0.6
 STARTED_S: Final = 0.02
 STARTED_MM: Final = 0.05
 STARTING_A: Final = (0.5, 10.0)
@@ -94,7 +94,7 @@ def _edges_mm(host: Host, side: int, switch: Switches) -> list[float]:
     Hazard.MISLED,
     "Drive",
     f"in RUN, {MIDDLE_MM:g} mm in, duties of -{DUTIES[0]:g}, +{DUTIES[0]:g} .. -1, +1 for {PULSE_S:g} s each",
-    f"each step of {DUTIES[1] - DUTIES[0]:.1f} adds {LEAST_GAIN:g} of its share of the speed; Status goes on",
+    f"each step of {DUTIES[1] - DUTIES[0]:.1f} adds {MIN_GAIN:g} of its share of the speed; Status goes on",
     moves=True,
 )
 def duty_makes_speed(host: Host) -> str:
@@ -109,7 +109,7 @@ def duty_makes_speed(host: Host) -> str:
             speeds.append(_speed_mm_s(host, sign * duty))
         gains = [after - before for before, after in pairwise(speeds)]
         seen.append(f"{'out' if sign > 0.0 else 'in'} " + ", ".join(f"{speed:.1f}" for speed in speeds) + " mm/s")
-        if host.status.mode is not DeviceMode.RUN or min(gains) < LEAST_GAIN * speeds[-1] * (DUTIES[1] - DUTIES[0]):
+        if host.status.mode is not DeviceMode.RUN or min(gains) < MIN_GAIN * speeds[-1] * (DUTIES[1] - DUTIES[0]):
             raise Unmet(f"{'; '.join(seen)}; {shown(host.status)}")
     return "; ".join(seen)
 

@@ -168,7 +168,7 @@ def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, ctl):
     [
         # the same as a full disk to a program, with another errno
         (100_000, "", "File too large", False),
-        (10**9, "writer.LEAST_FREE_BYTES = 1 << 60; ", "No space left on device", True),
+        (10**9, "writer.MIN_FREE_BYTES = 1 << 60; ", "No space left on device", True),
     ],
     ids=["without a warning", "nearly full"],
 )

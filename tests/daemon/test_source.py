@@ -14,7 +14,7 @@ from tormagd.daemon.source_clock import (
     AHEAD_S,
     DRIFT,
     FORGOTTEN_S,
-    MOST_WAY_S,
+    MAX_WAY_S,
     SETTLED_S,
     SourceClock,
 )
@@ -262,9 +262,9 @@ def test_a_backlog_at_first_contact_is_not_taken_for_a_clock(behind_s: float) ->
 
 
 def test_a_constant_way_is_believed_while_a_way_may_be_so_long() -> None:
-    for way_s, believed_s in ((0.0, 0.0), (0.08, 0.08), (MOST_WAY_S, MOST_WAY_S), (0.5, 0.0)):
+    for way_s, believed_s in ((0.0, 0.0), (0.08, 0.08), (MAX_WAY_S, MAX_WAY_S), (0.5, 0.0)):
         clock, heard = listen(lambda t: t, lambda t, way_s=way_s: way_s, 60.0)  # type: ignore[misc]
-        assert (heard[-1].believed_s, clock.is_wrong) == (pytest.approx(believed_s, abs=1e-5), way_s > MOST_WAY_S)
+        assert (heard[-1].believed_s, clock.is_wrong) == (pytest.approx(believed_s, abs=1e-5), way_s > MAX_WAY_S)
 
 
 def test_until_it_is_settled_a_message_is_as_old_as_it_says() -> None:
@@ -324,5 +324,5 @@ def test_any_clock_any_jitter_any_losses(
     gap_s = max(b.sent_s + b.way_s - a.sent_s - a.way_s for a, b in pairwise(heard))
     # a step back that is shorter than the pause in which it falls cannot be told from a longer way
     # the rest: a plausible lateness at the start that was the clock's is kept as way
-    bound_s = longest_s + MOST_WAY_S + (1.0 + len(steps)) * (longest_s + gap_s + 0.005)
+    bound_s = longest_s + MAX_WAY_S + (1.0 + len(steps)) * (longest_s + gap_s + 0.005)
     assert worst_error_s(settled, 0.0) <= bound_s

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.recording.black_box import read_black_box
-from tormagd.recording.keeper import DIED, KEPT_S, MOST_BYTES, MOST_DUE, MOST_FILES, Ring
+from tormagd.recording.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring
 
 PATIENCE_S = 60.0
 HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}
@@ -36,8 +36,8 @@ def test_the_ring_holds_no_more_bytes_than_it_may() -> None:
     ring = Ring()
     for number in range(300):
         ring.put(part(0.001 * number, 1_000_000))
-    assert MOST_BYTES - 1_000_000 < ring.bytes <= MOST_BYTES
-    ring.put(part(1.0, MOST_BYTES + 1))
+    assert MAX_BYTES - 1_000_000 < ring.bytes <= MAX_BYTES
+    ring.put(part(1.0, MAX_BYTES + 1))
     assert [each.time_s for each in ring.parts()] == [1.0]  # the newest is always there
 
 
@@ -91,7 +91,7 @@ def ticks(first: int, count: int) -> Part:
 def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process, tmp_path: Path) -> None:
     folder = tmp_path / "boxes"
     folder.mkdir()
-    for number in range(MOST_FILES + 3):
+    for number in range(MAX_FILES + 3):
         (folder / f"20200101T0000{number:02d}.000Z-OLD.mcap").touch()
     process.say(Begin(str(folder), HEADER), ticks(1, 20), ticks(21, 20))
     process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {"firmware": "1.2"}))
@@ -99,7 +99,7 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     box = read_black_box(folder / "20300101T000000.000Z-SKEW.mcap")
     assert (box.header["reason"], box.header["firmware"], box.is_complete) == ("SKEW", "1.2", True)
     assert [entry[0] for entry in box.entries if entry != "step"] == list(range(1, 41))
-    assert len(list(folder.iterdir())) == MOST_FILES
+    assert len(list(folder.iterdir())) == MAX_FILES
     # a name that is taken, or a folder that is none, says so
     process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {}))
     assert "exists" in process.heard().refusal
@@ -119,11 +119,11 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
 
 def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Process, tmp_path: Path) -> None:
     process.say(Begin(str(tmp_path), HEADER), ticks(1, 20))
-    process.say(*(Write(f"{number}Z-X.mcap", "X", 3_600.0, {}) for number in range(MOST_DUE + 1)))
+    process.say(*(Write(f"{number}Z-X.mcap", "X", 3_600.0, {}) for number in range(MAX_DUE + 1)))
     assert "others are still to be written" in process.heard().refusal
     process.say(End())
     assert process.child.wait(PATIENCE_S) == 0
-    assert len(list(tmp_path.iterdir())) == MOST_DUE
+    assert len(list(tmp_path.iterdir())) == MAX_DUE
 
 
 def test_a_daemon_that_did_not_get_so_far_leaves_nothing(process: Process, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from sent import START_NS, back, batch, telemetry
 
-from tormagd.recording.overview import MOST_STRETCHES, Codes, Curves, Glance, Overview, OverviewBuilder, unpacked
+from tormagd.recording.overview import MAX_STRETCHES, Codes, Curves, Glance, Overview, OverviewBuilder, unpacked
 from tormagd.recording.plot import figure
 from tormagd.recording.reader import RecordingFile
 from tormagd.recording.seal import State
@@ -55,7 +55,7 @@ def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path:
     overview = known.overview
     assert (overview.ticks, overview.snapshots, [mark.text for mark in overview.marks]) == (30_000, 1_500, ["here"])
     force = overview.series("measured_cf")
-    assert len(force.t_s) <= MOST_STRETCHES
+    assert len(force.t_s) <= MAX_STRETCHES
     assert (force.low.min(), force.high.max()) == (0.5, pytest.approx(1.8))
     assert overview.spans_s("limits") == {"RATE": [pytest.approx((2.0, 3.0))]}
     assert overview.codes["limits"]["RATE"].held_ns == pytest.approx(1e9)

@@ -29,7 +29,7 @@ from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
 from tormagd_client.messages import VERSION, Setpoint, encode
 
-LEAST_N, GRAIN_N = 1.0, 1e-4
+MIN_N, GRAIN_N = 1.0, 1e-4
 SPACING_S = (0.0015, 0.0025)
 "500 a second, as in `make run`; random, so that they meet every phase of the control period."
 COLUMNS = ("t_ns", "exec_us")
@@ -100,7 +100,7 @@ def publish(address: str, count: int) -> dict[float, int]:
         spacing = random.Random(1)
         for number in range(count):
             time.sleep(spacing.uniform(*SPACING_S))
-            force, stamp_ns = round(LEAST_N + GRAIN_N * (number % 5_000), 6), time.time_ns()
+            force, stamp_ns = round(MIN_N + GRAIN_N * (number % 5_000), 6), time.time_ns()
             setpoint = Setpoint(
                 v=VERSION, source="latency", seq=number, stamp_ns=stamp_ns, servo_cf=force, valid_for_ms=500.0
             )

@@ -54,7 +54,7 @@ fifo_priority = {DAEMON_FIFO}  # each is refused where it is not allowed; then t
 lock_memory = true
 """
 CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--json", "--wait", "60")
-LEAST_N, MAX_N = 1.4, 1.7
+MIN_N, MAX_N = 1.4, 1.7
 PULSE_S = 20.0
 RAMP_S, HOLD_S = 1.0, 3.0
 "Approach to the pulse's first force, and a hold there in which the trim learns this device."
@@ -138,7 +138,7 @@ class Aborted(NamedTuple):
 
 def profile(duration_s: float = PULSE_S) -> tuple[Array, Array]:
     """Times, s, and forces, N, of the pulse behind its approach."""
-    return with_approach(*pulse_profile(duration_s, LEAST_N, MAX_N, RATE_HZ), START_N, RAMP_S, HOLD_S)
+    return with_approach(*pulse_profile(duration_s, MIN_N, MAX_N, RATE_HZ), START_N, RAMP_S, HOLD_S)
 
 
 def scored(time_s: Array, asked_N: Array, rendered_N: Array) -> Tracking:

@@ -18,7 +18,7 @@ from tormagd.config import Config
 from tormagd.control.aim.aim import Element
 from tormagd.control.aim.floors import CEILING
 from tormagd.control.aim.portrait import LawOfField, Portrait, PortraitSearch, law_beside, portrait
-from tormagd.control.contact import PRESSED, Contact, Pressing, Sliding
+from tormagd.control.contact import PRESSED, ElementContact, Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.move.motor import Margins, margins, pull_V
@@ -182,7 +182,7 @@ def platform_name() -> str:
     return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
-def _brake(scene: Scene) -> tuple[Contact, FieldOfGap, float]:
+def _brake(scene: Scene) -> tuple[ElementContact, FieldOfGap, float]:
     """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent.
 
     Raises DomainError for an unknown insert, and as `Insert.elastomer` and `FieldOfGap`.
@@ -192,7 +192,7 @@ def _brake(scene: Scene) -> tuple[Contact, FieldOfGap, float]:
     return Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction
 
 
-def _pad(finger: Finger, model: ForceModel) -> tuple[Contact, FieldOfGap, float]:
+def _pad(finger: Finger, model: ForceModel) -> tuple[ElementContact, FieldOfGap, float]:
     """Return a tactile pad's contact, the mean field in the pad over the gap, and its share of iron, percent.
 
     The share of iron is the least that the model was trained on; the scene's insert is not looked at.
@@ -219,7 +219,7 @@ def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
 
 
 def _known_fields_mT(
-    scene: Scene, model: ForceModel, contact: Contact, field: FieldOfGap
+    scene: Scene, model: ForceModel, contact: ElementContact, field: FieldOfGap
 ) -> tuple[tuple[float, float], bool]:
     """Return the range of fields, mT, that the scene's gaps give and the model knows, and whether its force rises.
 

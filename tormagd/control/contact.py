@@ -15,7 +15,7 @@ PRESSED: Final = 0.9
 "A finger less deep than this share of the scene's depth is on its way in or out."
 
 
-class Contact:
+class ElementContact:
     """Kind of contact between hand and element, which states the motion that the model is asked for.
 
     The methods raise NotImplementedError; each kind of contact gives its own.
@@ -50,7 +50,7 @@ class Contact:
 
 
 @final
-class Sliding(Contact):
+class Sliding(ElementContact):
     """The sliding handle of a brake, which plans take as moving and with its friction mobilised.
 
     There the field decides the force. Before break-away the hand chooses the force, and the inverse is ill-posed.
@@ -95,7 +95,7 @@ class Sliding(Contact):
 
 
 @final
-class Pressing(Contact):
+class Pressing(ElementContact):
     """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest.
 
     `depth_mm` > 0 is the scene's; it is not checked.

@@ -2,7 +2,7 @@
 
 from typing import Final, final
 
-from tormagd.control.contact import Contact
+from tormagd.control.contact import ElementContact
 from tormagd.control.records import Measured, Outside, TimedSetpoint
 from tormagd.model.features import FEATURES
 from tormagd.model.force_curve import ForceCurve, within
@@ -18,7 +18,7 @@ class Nominal:
     model's range. Raises DomainError for one that is not finite.
     """
 
-    def __init__(self, model: ForceModel, contact: Contact, cip_percent: float, has_rate: bool) -> None:
+    def __init__(self, model: ForceModel, contact: ElementContact, cip_percent: float, has_rate: bool) -> None:
         self._network: Final = model.network
         self.contact: Final = contact
         self._cip_percent: Final = cip_percent

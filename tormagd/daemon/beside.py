@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 
-MOST_PACKET = 65_536
+MAX_PACKET = 65_536
 "Bytes in one packet that is received, at most."
 
 
@@ -52,12 +52,12 @@ class Beside:
     def receive(self, wait_s: float = 0.0) -> bytes | None:
         """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process has ended.
 
-        The end of the process sets `is_gone`. Of a packet over MOST_PACKET bytes the rest is lost.
+        The end of the process sets `is_gone`. Of a packet over MAX_PACKET bytes the rest is lost.
         """
         try:
             if wait_s:
                 select.select([self.socket], [], [], wait_s)
-            data = self.socket.recv(MOST_PACKET)
+            data = self.socket.recv(MAX_PACKET)
         except BlockingIOError:
             return None
         except OSError:

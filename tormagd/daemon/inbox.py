@@ -36,7 +36,7 @@ LONGEST_REFUSAL = 200
 "Characters kept of the last refusal."
 REPORTED = 6
 "Sources that are reported in full, the newest ones: an answer has to stay under its limit."
-MOST_DRIFT_PPM = 100.0
+MAX_DRIFT_PPM = 100.0
 "A clock that drifts faster than quartz does is named."
 NEVER_SET_NS = 946_684_800 * 10**9
 "The year 2000, in which nobody publishes: a clock that begins in 1970 has not been set."
@@ -436,7 +436,7 @@ def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: 
     """Raise MessageError where the source's stamps do not count ns, or where this is not known yet.
 
     A stamp within a day of our clock, `realtime_ns`, counts ns at once. Others are refused until LOOKED_AT messages,
-    over LEAST_S or more, show what they count. Also where it raises, it notes the stamp for this judgement, and that
+    over MIN_S or more, show what they count. Also where it raises, it notes the stamp for this judgement, and that
     the source was heard at `now_s`.
     """
     unit = source.unit
@@ -455,7 +455,7 @@ def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: 
     """Return what is wrong with a publisher's clock, and the remedy; two empty texts where nothing is.
 
     Told are an offset that is not known yet, one beyond AHEAD_S, and a clock that was never set. So are a clock set
-    within STEP_NAMED_S, and a drift surely over MOST_DRIFT_PPM. `fit` is the clock's line, None without one. `stamp_ns`
+    within STEP_NAMED_S, and a drift surely over MAX_DRIFT_PPM. `fit` is the clock's line, None without one. `stamp_ns`
     is its newest stamp.
     """
     if not clock.is_settled:
@@ -473,7 +473,7 @@ def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: 
     if fit is not None and fit.windows >= SURE_WINDOWS:
         # standard deviation of the slope, ppm, of a line through evenly spaced points
         sd_ppm = fit.residual_us * math.sqrt(12.0 / fit.windows) / (fit.windows * WINDOW_S)
-        if abs(fit.drift_ppm) - 3.0 * sd_ppm > MOST_DRIFT_PPM:
+        if abs(fit.drift_ppm) - 3.0 * sd_ppm > MAX_DRIFT_PPM:
             causes.append(f"it runs {abs(fit.drift_ppm):.0f} ppm {'fast' if fit.drift_ppm > 0.0 else 'slow'}")
     if not causes:
         return "", ""

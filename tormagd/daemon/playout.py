@@ -11,7 +11,7 @@ from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.source_clock import JITTER_SHARE
 from tormagd_client.messages import PlayoutReport
 
-MOST_WAITING = 1_024
+MAX_WAITING = 1_024
 "Setpoints that wait at most, the newest: what one publisher may send in the longest playout."
 
 
@@ -36,7 +36,7 @@ class Playout:
         "How long setpoints waited here."
         self.in_force: Taken | None = None
         "The setpoint to follow; None before the first."
-        self._waiting: deque[Taken] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[Taken] = deque(maxlen=MAX_WAITING)
         self._setpoints = self._late = 0
         self._held_s = self._jitter_s = 0.0
 

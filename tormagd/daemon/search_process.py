@@ -13,7 +13,7 @@ import sys
 import time
 
 from tormagd.assembly.build import Core, build_core
-from tormagd.daemon.beside import MOST_PACKET, Beside
+from tormagd.daemon.beside import MAX_PACKET, Beside
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.inverse.solution import Answer, Question
 from tormagd_client.endpoints import ConfigError
@@ -92,10 +92,10 @@ def main() -> None:
     """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd signals the whole service, and the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:
-        config, scene, models = pickle.loads(asked.recv(MOST_PACKET))
+        config, scene, models = pickle.loads(asked.recv(MAX_PACKET))
         aim = build_core(config, scene, models).planner().aim
         asked.send(b"ready")
-        while data := asked.recv(MOST_PACKET):
+        while data := asked.recv(MAX_PACKET):
             try:
                 found: Answer | ValueError = aim.answer_to(pickle.loads(data))
             except ValueError as error:

@@ -3,7 +3,7 @@
 The lateness of a message, our time less its stamp, is the clock's offset plus the time on the way. Three facts part
 them. No message arrives before it was sent, those of one publisher do not overtake each other, and clocks drift slowly.
 So the least lateness is an envelope: the offset plus the constant part of the way. Lateness above it is delay; what
-moves it is the clock. Without a round trip, a constant offset and a constant way cannot be told apart: up to MOST_WAY_S
+moves it is the clock. Without a round trip, a constant offset and a constant way cannot be told apart: up to MAX_WAY_S
 counts as the way.
 
 No I/O and no clock: times are arguments.
@@ -14,10 +14,10 @@ from typing import final
 
 from tormagd.hardware.link_statistics import DeviceClock
 
-MOST_WAY_S = 0.2
+MAX_WAY_S = 0.2
 """A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take. More is
 the clock."""
-MOST_LATE_S = 1.0
+MAX_LATE_S = 1.0
 """A least lateness between the two may be either: the clock is corrected by it, and the limits of sources count it as
 the way. More is a wrong clock."""
 AHEAD_S = 0.05
@@ -74,7 +74,7 @@ class SourceClock:
     @property
     def hidden_s(self) -> float:
         """Return the part of `offset_s`, s, that may as well be the way; 0 once the clock was seen to be set."""
-        return self.offset_s if 0.0 < self.offset_s < MOST_LATE_S and not self.steps else 0.0
+        return self.offset_s if 0.0 < self.offset_s < MAX_LATE_S and not self.steps else 0.0
 
     def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
         """Take the message that came at `now_s`, and return its delay, s. `lateness_s` is our time less its stamp.
@@ -103,13 +103,13 @@ class SourceClock:
         self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
         self._settles_s = now_s + SETTLED_S
         self.line = DeviceClock()
-        if -AHEAD_S <= lateness_s <= MOST_WAY_S:
+        if -AHEAD_S <= lateness_s <= MAX_WAY_S:
             self._settle()
 
     def _settle(self) -> None:
         """Count the offset as known; one that a way can take becomes the constant part of the way."""
         self._settles_s = None
-        if 0.0 < self.offset_s <= MOST_WAY_S:
+        if 0.0 < self.offset_s <= MAX_WAY_S:
             self.offset_s, self.way_s = 0.0, self.offset_s
 
     def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
@@ -122,7 +122,7 @@ class SourceClock:
         rise_s = lateness_s - self._lateness_s
         if not is_continued or gap_s > FORGOTTEN_S:
             above_s = lateness_s - self.offset_s - self.way_s
-            if not -STEP_S <= above_s <= MOST_WAY_S:
+            if not -STEP_S <= above_s <= MAX_WAY_S:
                 self._begin(now_s, lateness_s)
                 return
         elif rise_s > gap_s + STEP_S:

@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 from msgspec import UNSET
 
-from tormagd.config import MOST_PLAYOUT_MS
+from tormagd.config import MAX_PLAYOUT_MS
 from tormagd.control.ask.governor import AHEAD_S
-from tormagd.daemon.source_clock import MOST_LATE_S
+from tormagd.daemon.source_clock import MAX_LATE_S
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.scenes.scene import Scene
 
-WINDOW_S, LEAST_MESSAGES = 1.0, 4
+WINDOW_S, MIN_MESSAGES = 1.0, 4
 "Least time and least messages that are judged together."
-MOST_LOST = 0.05
+MAX_LOST = 0.05
 SPREAD_S = 0.02
 "By more than this from message to message a delay shows in the force: what the slope carries over is 50 ms."
 SLACK = 1.25
@@ -29,13 +29,13 @@ class Needs(NamedTuple):
     """What the scene wants of a publisher: how many setpoints a second, and how old they may be when they come."""
 
     setpoint_hz: float = 1.0 / AHEAD_S
-    delay_s: float = MOST_LATE_S
+    delay_s: float = MAX_LATE_S
 
 
 def needs_of(scene: Scene) -> Needs:
     """Return what a scene needs of its publisher: setpoints a second, and their greatest delay, s.
 
-    Where the scene states none, setpoints may be as far apart as the slope carries over, and late by MOST_LATE_S.
+    Where the scene states none, setpoints may be as far apart as the slope carries over, and late by MAX_LATE_S.
     """
     stated = UNSET if scene.signal is None else scene.signal.setpoint_hz
     delay_ms = scene.budget.delay_ms
@@ -65,7 +65,7 @@ class Arrival(NamedTuple):
 class SourceManner:
     """Judges how the setpoints of one publisher come, window by window. Give it each message.
 
-    A window is full after WINDOW_S and LEAST_MESSAGES messages. `found` has what was wrong in the newest full window,
+    A window is full after WINDOW_S and MIN_MESSAGES messages. `found` has what was wrong in the newest full window,
     by limit.
     """
 
@@ -74,7 +74,7 @@ class SourceManner:
         "What was wrong in the newest full window."
         self._began_s: float | None = None
         self._lost = self._messages = 0
-        self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
+        self._least_s, self._most_s, self._sum_s = MAX_LATE_S, 0.0, 0.0
 
     def hear(self, now_s: float, arrival: Arrival, needs: Needs) -> None:
         """Take a message that came at `now_s`, and set `found` anew, by `needs`, when it fills the window.
@@ -90,20 +90,20 @@ class SourceManner:
         self._least_s, self._most_s = min(self._least_s, late_s), max(self._most_s, late_s)
         self._sum_s += late_s
         past_s = now_s - self._began_s
-        if past_s >= WINDOW_S and self._messages >= LEAST_MESSAGES:
+        if past_s >= WINDOW_S and self._messages >= MIN_MESSAGES:
             self.found = self._judged(past_s, arrival, needs)
             self._begin(now_s, arrival.lost)
 
     def _begin(self, now_s: float, lost: int) -> None:
         self._began_s, self._lost, self._messages = now_s, lost, 0
-        self._least_s, self._most_s, self._sum_s = MOST_LATE_S, 0.0, 0.0
+        self._least_s, self._most_s, self._sum_s = MAX_LATE_S, 0.0, 0.0
 
     def _judged(self, past_s: float, last: Arrival, needs: Needs) -> dict[Limit, Explanation]:
         """Return what is wrong in a window of `past_s` that `last` has ended; empty where nothing is."""
         lost = last.lost - self._lost
         sent = self._messages + lost
         found = {}
-        if lost > MOST_LOST * sent:
+        if lost > MAX_LOST * sent:
             found[Limit.SOURCE_LOSS] = Explanation(
                 f"{lost / sent:.0%} of its setpoints are lost on the way", "look for the lossy part of the network"
             )
@@ -132,6 +132,6 @@ class SourceManner:
 def _steadied(most_ms: float) -> str:
     """Return the remedy for jitter of up to `most_ms` after the stamp: the playout that takes it out, if one does."""
     playout_ms = math.ceil(most_ms / PLAYOUT_STEP_MS) * PLAYOUT_STEP_MS
-    if playout_ms > MOST_PLAYOUT_MS:
+    if playout_ms > MAX_PLAYOUT_MS:
         return "send a preview_N that is longer than that differs, or take a steadier way"
     return f"set sources.playout_ms = {playout_ms}, which delays every setpoint to that, or take a steadier way"

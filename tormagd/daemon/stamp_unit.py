@@ -8,7 +8,7 @@ FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
 "ns in what publishers send instead."
 FAR_NS = 86_400 * 10**9
 "Stamps of such another unit are years away; nearer ones are of a clock."
-LOOKED_AT, LEAST_S = 8, 0.005
+LOOKED_AT, MIN_S = 8, 0.005
 "Messages, and time, that it takes to see how fast stamps run."
 SLOW = 0.03
 "Share of our clock's rate: no clock runs so slow."
@@ -36,7 +36,7 @@ class StampUnit:
         """Take a message that came at `now_s`; `realtime_ns` is our CLOCK_REALTIME then.
 
         A stamp within FAR_NS of it counts ns, whatever was found before. Stamps further off are judged by how fast they
-        run, after LOOKED_AT messages and LEAST_S. `is_known` and `wrong` then say what was found, and stay until the
+        run, after LOOKED_AT messages and MIN_S. `is_known` and `wrong` then say what was found, and stay until the
         next judgement.
         """
         if abs(realtime_ns - stamp_ns) < FAR_NS:
@@ -46,7 +46,7 @@ class StampUnit:
             self._from, self._messages = (now_s, stamp_ns), 0
         self._messages += 1
         past_s = now_s - self._from[0]
-        if self._messages < LOOKED_AT or past_s < LEAST_S:
+        if self._messages < LOOKED_AT or past_s < MIN_S:
             return
         is_slow = (stamp_ns - self._from[1]) * 1e-9 < SLOW * past_s
         self.wrong = min(FACTORS, key=lambda unit: abs(stamp_ns * FACTORS[unit] - realtime_ns)) if is_slow else ""

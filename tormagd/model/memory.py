@@ -13,7 +13,7 @@ import msgspec
 from tormagd.physics.errors import require, require_that
 from tormagd.physics.relaxation import PronySeries
 
-MOST_TERMS = 8
+MAX_TERMS = 8
 LONGEST_S = 1e5
 
 
@@ -34,7 +34,7 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     def __post_init__(self) -> None:
         for series in (self.free, self.added):  # PronySeries refuses fractions and times that make no series
-            require("memory.times_s, count", len(series.times_s), 0, MOST_TERMS)
+            require("memory.times_s, count", len(series.times_s), 0, MAX_TERMS)
         for time_s in self.times_s:
             require("memory.times_s", time_s, 1e-3, LONGEST_S)
         require_that(

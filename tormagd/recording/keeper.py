@@ -21,13 +21,13 @@ from tormagd.keeping import Begin, End, Part, Said, Write, Written
 from tormagd.output import write_line
 
 KEPT_S = 30.0
-MOST_BYTES = 48_000_000
+MAX_BYTES = 48_000_000
 """The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB. At higher
 rates or with previews the ring reaches less far back."""
-MOST_FILES = 20
+MAX_FILES = 20
 "The oldest file is deleted when there are more."
-MOST_PACKET = 4_000_000
-MOST_DUE = 8
+MAX_PACKET = 4_000_000
+MAX_DUE = 8
 "How many files may wait to be written; more are refused."
 LOOK_S = 0.05
 "Period of looking whether a file is due."
@@ -42,7 +42,7 @@ class Ring:
     `bytes` is the size of their entries.
     """
 
-    def __init__(self, kept_s: float = KEPT_S, most_bytes: int = MOST_BYTES) -> None:
+    def __init__(self, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
         self._kept_s, self._most_bytes = kept_s, most_bytes
         self._parts: deque[Part] = deque()
         self.bytes = 0
@@ -110,7 +110,7 @@ class Keeper:
         if not ready:
             return True
         try:
-            data = self._socket.recv(MOST_PACKET)
+            data = self._socket.recv(MAX_PACKET)
         except OSError:
             data = b""
         if not data:
@@ -125,7 +125,7 @@ class Keeper:
     def _take(self, said: Said) -> None:
         """Take what the daemon said: add a part, begin anew once all that is due is written, or queue a file.
 
-        A file over MOST_DUE is refused by an answer. End changes nothing.
+        A file over MAX_DUE is refused by an answer. End changes nothing.
         """
         match said:
             case Part():
@@ -133,13 +133,13 @@ class Keeper:
             case Begin():
                 self._write_due()  # they are of the scene that ends
                 self._begun, self._ring = said, Ring()
-            case Write() if len(self._due) < MOST_DUE:
+            case Write() if len(self._due) < MAX_DUE:
                 self._due.append((time.monotonic() + said.after_s, said))
             case Write():
-                self._answer(Written(said.name, f"{said.name}: {MOST_DUE} others are still to be written"))
+                self._answer(Written(said.name, f"{said.name}: {MAX_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
-        """Write one black box, delete files beyond MOST_FILES, and answer the daemon.
+        """Write one black box, delete files beyond MAX_FILES, and answer the daemon.
 
         Every failure is logged and answered, also that of deleting an old file once the new one is written. Makes the
         folder where there is none, and makes this thread nicer. Without parts it fails.
@@ -155,7 +155,7 @@ class Keeper:
             folder.mkdir(mode=0o750, parents=True, exist_ok=True)
             details = {**begun.header, **write.details, "reason": write.reason}
             write_black_box(folder / write.name, details, parts, _key(begun.key))
-            for old in sorted(folder.glob("*Z-*.mcap"))[:-MOST_FILES]:
+            for old in sorted(folder.glob("*Z-*.mcap"))[:-MAX_FILES]:
                 old.unlink()
         except (OSError, ValueError, TypeError, KeyError) as error:
             refusal = f"{folder / write.name}: {getattr(error, 'strerror', None) or error!r}"

@@ -32,15 +32,15 @@ BREAK_S = 0.1
 "Between messages further apart than this, nothing is known."
 BREAK_NS = round(BREAK_S * 1e9)
 FIRST_WIDTH_NS = 1_000_000
-MOST_STRETCHES = 1_500
-MOST_SPANS = 1_000
+MAX_STRETCHES = 1_500
+MAX_SPANS = 1_000
 "Bound on the spans of one code: beyond it, those nearest to each other become one."
-MOST_CODES, MOST_MARKS = 200, 1_000
-MOST_BYTES = 2_000_000
+MAX_CODES, MAX_MARKS = 200, 1_000
+MAX_BYTES = 2_000_000
 CODE = re.compile(r"[A-Za-z0-9_.:?-]{1,64}")
 ODD = re.compile(r"[^A-Za-z0-9_.:?-]")
 OTHER = "OTHER"
-"Stands for codes beyond MOST_CODES."
+"Stands for codes beyond MAX_CODES."
 _LOOK_NS = round(PERIOD_S * 1e9)
 LATE_US = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1_000.0, 2_000.0, 5_000.0)
 "Where one bar of the lateness histogram ends and the next begins."
@@ -158,8 +158,8 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
 
 def unpacked(data: bytes) -> Overview:
     """Decode an overview that `Overview.packed` made. Raises ValueError for anything else, or beyond a bound."""
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"an overview of {len(data)} bytes: allowed is {MOST_BYTES}")
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"an overview of {len(data)} bytes: allowed is {MAX_BYTES}")
     try:
         found = msgspec.msgpack.decode(data, type=Overview)
     except (msgspec.MsgspecError, RecursionError) as error:
@@ -171,7 +171,7 @@ def unpacked(data: bytes) -> Overview:
             raise ValueError("its overview: curves of unequal length")
     names = [code for kind in found.codes.values() for code in kind]
     longest = max((len(codes.spans_ns) for kind in found.codes.values() for codes in kind.values()), default=0)
-    bounds = len(names) <= MOST_CODES, longest <= MOST_SPANS, len(found.marks) <= MOST_MARKS
+    bounds = len(names) <= MAX_CODES, longest <= MAX_SPANS, len(found.marks) <= MAX_MARKS
     forms = set(found.codes) == set(KINDS), len(found.late_counts) == len(LATE_US) + 1, found.width_ns > 0
     if not (all(bounds) and all(forms) and all(map(CODE.fullmatch, names))):
         raise ValueError("its overview: there is more in it than any tormagd writes, or other things")
@@ -199,7 +199,7 @@ class OverviewBuilder:
         """Add one message, a control tick or a snapshot, in the order of writing; `t_ns` is since 1970.
 
         `lateness_us` goes into the histogram. A mark counts once, not one set before the recording began, and
-        MOST_MARKS at most.
+        MAX_MARKS at most.
         """
         if self._start_ns is None:
             self._start_ns = self._end_ns = t_ns
@@ -215,7 +215,7 @@ class OverviewBuilder:
             self._late[bisect_right(LATE_US, late_us)] += 1
         mark = message.get("mark")
         # every snapshot tells the newest, also one from before
-        if mark and mark.t_ns >= self._start_ns and len(self._marks) < MOST_MARKS and self._marks[-1:] != [mark]:
+        if mark and mark.t_ns >= self._start_ns and len(self._marks) < MAX_MARKS and self._marks[-1:] != [mark]:
             self._marks.append(mark)
 
     def made(self) -> Overview:
@@ -318,12 +318,12 @@ class _Stretches:
         """Add one value of each of QUANTITIES, in their order, to the stretch of `since_ns`.
 
         None and NaN are passed over. `since_ns` counts from the recording's start. Where time ran back, they go to the
-        last stretch. At MOST_STRETCHES all become twice as wide. Raises ValueError for another number of values.
+        last stretch. At MAX_STRETCHES all become twice as wide. Raises ValueError for another number of values.
         """
         number = since_ns // self.width_ns
         # a clock that was set back does not set the curve back
         if not self._numbers or number > self._numbers[-1]:
-            if len(self._numbers) >= MOST_STRETCHES:
+            if len(self._numbers) >= MAX_STRETCHES:
                 self.widen(2 * self.width_ns)
                 self.add(since_ns, values)
                 return
@@ -384,14 +384,14 @@ class _Held:
         self.ns = 0
 
     def hold(self, from_ns: int, to_ns: int) -> None:
-        """Add a span, or extend the last one, which reaches `from_ns`; beyond MOST_SPANS the nearest are joined."""
+        """Add a span, or extend the last one, which reaches `from_ns`; beyond MAX_SPANS the nearest are joined."""
         if self.spans and from_ns <= self.spans[-1][1] <= to_ns:
             self.ns += to_ns - self.spans[-1][1]
             self.spans[-1][1] = to_ns
             return
         self.ns += to_ns - from_ns
         self.spans.append([from_ns, to_ns])
-        if len(self.spans) > MOST_SPANS:
+        if len(self.spans) > MAX_SPANS:
             self.spans = _joined(self.spans)
 
 
@@ -416,10 +416,10 @@ class _Codes:
         self._now_ns = since_ns
 
     def _hold(self, for_ns: int) -> None:
-        """Let the last message's codes hold so long; new ones beyond a third of MOST_CODES count as OTHER."""
+        """Let the last message's codes hold so long; new ones beyond a third of MAX_CODES count as OTHER."""
         for kind, code in self._now:
             known = self._known[kind]
-            is_kept = code in known or len(known) < MOST_CODES // len(KINDS) - 1
+            is_kept = code in known or len(known) < MAX_CODES // len(KINDS) - 1
             held = known.setdefault(code if is_kept else OTHER, _Held())
             held.hold(self._now_ns, self._now_ns + for_ns)
 

@@ -25,7 +25,7 @@ from tormagd.recording.stream import END, HEAD, MAGIC, MAX_CHUNK_BYTES, SEAL, Re
 SEALED = "tormagd.seal"
 "The metadata record of a sealed file; `by` is PLAIN or KEYED, `follows` the last digest of the segment before."
 PLAIN, KEYED = "blake2b", "keyed blake2b"
-LEAST_KEY, MOST_KEY = 16, 64
+MIN_KEY, MAX_KEY = 16, 64
 KEY_HINT = "[recordings] key in the configuration names the key's file"
 DIGEST_BYTES = 32
 _FOOTER_BYTES = HEAD.size + 20
@@ -35,14 +35,14 @@ _BODY = struct.Struct(f"<B{DIGEST_BYTES}s")
 def read_key(file: str) -> bytes:
     """Read the sealing key from a file, without surrounding white space; empty where `file` is an empty name.
 
-    Raises OSError, also for a file far longer than a key, and ValueError where the key is not of LEAST_KEY..MOST_KEY
+    Raises OSError, also for a file far longer than a key, and ValueError where the key is not of MIN_KEY..MAX_KEY
     bytes.
     """
     if not file:
         return b""
-    key = read_bounded(Path(file), 2 * MOST_KEY).strip()
-    if not LEAST_KEY <= len(key) <= MOST_KEY:
-        raise ValueError(f"{file}: a key of {len(key)} bytes: allowed are {LEAST_KEY}..{MOST_KEY}")
+    key = read_bounded(Path(file), 2 * MAX_KEY).strip()
+    if not MIN_KEY <= len(key) <= MAX_KEY:
+        raise ValueError(f"{file}: a key of {len(key)} bytes: allowed are {MIN_KEY}..{MAX_KEY}")
     return key
 
 

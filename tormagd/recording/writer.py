@@ -42,7 +42,7 @@ NUMBER_COLUMN = "tick"
 CHUNK_BYTES = 1024 * 1024
 CHUNK_NS = 500_000_000
 "Time that one chunk spans, lost where the recorder is killed."
-LEAST_FREE_BYTES = 16_000_000
+MIN_FREE_BYTES = 16_000_000
 "A recording ends before the disk is full: the last chunk needs room, and the index, which grows with the file."
 INDEX_SHARE = 64
 "The index is at most 1/INDEX_SHARE of the file."
@@ -53,7 +53,7 @@ def disk_room(path: Path, needed_bytes: int) -> str:
 
     The file need not exist, its folder must. Raises OSError.
     """
-    free, least = shutil.disk_usage(path.parent).free, LEAST_FREE_BYTES + needed_bytes
+    free, least = shutil.disk_usage(path.parent).free, MIN_FREE_BYTES + needed_bytes
     if free >= least:
         return ""
     return f"No space left on device: {free / 1e6:.1f} MB are free, needed are {least / 1e6:.1f}"

@@ -39,11 +39,11 @@ COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Columns of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the
 roller. Then its rate and the measured force, both positive in the direction of motion."""
 
-LEAST_MOVING_SHARE = 0.3
+MIN_MOVING_SHARE = 0.3
 "Least share of every sweep in motion. Turning to and fro with rests keeps over half of it."
-LEAST_FIELD_SPAN = 0.2
+MIN_FIELD_SPAN = 0.2
 "Least span of the field, as a share of the greatest."
-LEAST_SWEEPS = 3
+MIN_SWEEPS = 3
 JUDGING = (3, 1)
 "Every third sweep, from the second on, is kept from the fit to judge the model."
 VALIDATION_SHARE = 0.3
@@ -55,11 +55,11 @@ NEEDED = ("torch", "tqdm")
 "Packages that a network needs and not every installation has: checked before anybody turns a handle."
 NEEDED_BY_LAW = ("scipy",)
 
-LEAST_R2 = 0.97
+MIN_R2 = 0.97
 "R2 of the thesis's own network, table 4.1."
-MOST_MAE_SHARE = 0.02
+MAX_MAE_SHARE = 0.02
 "As a share of the greatest force: relaxation and temperature, which the model has not, take one to two percent."
-MOST_MAE_OVER_NOISE = 3.0
+MAX_MAE_OVER_NOISE = 3.0
 MEAN_OVER_SIGMA = math.sqrt(2.0 / math.pi)
 "Mean absolute value of Gaussian noise over its standard deviation."
 
@@ -85,10 +85,10 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
     is_moving = rate_mm_s >= MOVING_MM_S
     for number in np.unique(sweep):
         share = float(is_moving[sweep == number].mean())
-        if share < LEAST_MOVING_SHARE:
+        if share < MIN_MOVING_SHARE:
             raise CalibrationError(
                 "handle_still",
-                f"the handle moved for {share:.0%} of sweep {number + 1:.0f}: needed are {LEAST_MOVING_SHARE:.0%} at "
+                f"the handle moved for {share:.0%} of sweep {number + 1:.0f}: needed are {MIN_MOVING_SHARE:.0%} at "
                 f"{MOVING_MM_S:g} mm/s or more at the roller",
                 "turn the handle steadily for as long as the sweep runs",
             )
@@ -140,17 +140,17 @@ def require_usable(data: Dataset) -> None:
     """
     assert data.cycle is not None  # training_rows sets it
     sweeps = len(np.unique(data.cycle))
-    if sweeps < LEAST_SWEEPS:
+    if sweeps < MIN_SWEEPS:
         raise CalibrationError(
-            "few_sweeps", f"{sweeps} sweeps: needed are {LEAST_SWEEPS}, one of them to judge by", "record more sweeps"
+            "few_sweeps", f"{sweeps} sweeps: needed are {MIN_SWEEPS}, one of them to judge by", "record more sweeps"
         )
     field_mT = data.features[:, FIELD]
     low, high = float(field_mT.min()), float(field_mT.max())
-    if high - low < LEAST_FIELD_SPAN * high:
+    if high - low < MIN_FIELD_SPAN * high:
         raise CalibrationError(
             "field_range",
             f"the field ran from {low:.0f} to {high:.0f} mT, {(high - low) / high:.0%} of the greatest: needed are "
-            f"{LEAST_FIELD_SPAN:.0%}",
+            f"{MIN_FIELD_SPAN:.0%}",
             "sweep a wider range of force, with a scene that allows it",
         )
     ends = np.percentile(field_mT, (10.0, 90.0))
@@ -209,12 +209,12 @@ def fit(
     judging = data.subset(is_judging)
     found = fit_metrics(model, judging)
     noise_mae_N = MEAN_OVER_SIGMA * noise_sd_N(data)
-    most_mae_N = max(MOST_MAE_OVER_NOISE * noise_mae_N, MOST_MAE_SHARE * float(np.percentile(data.force_N, 99.0)))
+    most_mae_N = max(MAX_MAE_OVER_NOISE * noise_mae_N, MAX_MAE_SHARE * float(np.percentile(data.force_N, 99.0)))
     r2, mae_N = found.get("r2", -math.inf), found["mae_N"]
-    if not (r2 >= LEAST_R2 and mae_N <= most_mae_N):
+    if not (r2 >= MIN_R2 and mae_N <= most_mae_N):
         raise CalibrationError(
             "poor_fit",
-            f"on sweeps kept from the fit R2 is {r2:.4f} (needed: {LEAST_R2:g}) and the mean error "
+            f"on sweeps kept from the fit R2 is {r2:.4f} (needed: {MIN_R2:g}) and the mean error "
             f"{mae_N * 1e3:.1f} mN (allowed: {most_mae_N * 1e3:.1f} mN; the sensor's noise alone makes "
             f"{noise_mae_N * 1e3:.1f} mN)",
             "nothing was saved; turn the handle more steadily, look for a loose sensor or insert, and sweep again",

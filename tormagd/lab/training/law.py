@@ -34,7 +34,7 @@ from tormagd.physics.inserts import Insert, insert
 MIDDLE_MT = 450.0
 REFERENCE_MM_S, SLOW_MM_S = 42.0, 0.1
 "v_1 and v_0."
-LEAST_N = 1e-6
+MIN_N = 1e-6
 "Least level that the fit tries."
 ROBUST_N = 0.05
 "Errors beyond this count less: rows near a reversal."
@@ -46,7 +46,7 @@ SLIDING = 0.7
 EDGE = 0.05
 "Share of these points at each end of a range."
 
-STEEP, LEAST_WEIGHT, LEAST_TURN_MM_S = 3.0, 1e-2, 3.0
+STEEP, MIN_WEIGHT, MIN_TURN_MM_S = 3.0, 1e-2, 3.0
 "Where the fit of a network begins: the steepness of its units, least weight of the field, least width over the rate."
 
 
@@ -81,7 +81,7 @@ class Law(NamedTuple):
         kinetic_N = np.exp(self.log_m) * scale_N * curve.force(compressed, load) + self.free_N
         over = 1.0 + self.static * np.exp(-np.square(rate_mm_s / np.exp(self.log_stribeck_mm_s)))
         over += self.by_rate * np.log((rate_mm_s + SLOW_MM_S) / (REFERENCE_MM_S + SLOW_MM_S))
-        level_N = np.maximum(kinetic_N * over + self.viscous_N_s_mm * rate_mm_s, LEAST_N)
+        level_N = np.maximum(kinetic_N * over + self.viscous_N_s_mm * rate_mm_s, MIN_N)
         borne_N: Array = level_N * -np.expm1(-np.exp(self.log_stiffness_N_mm) * displacement_mm / level_N)
         return np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
 
@@ -217,10 +217,10 @@ def _first(metadata: ModelMetadata, rows: Array, seed: int) -> Array:
     turns = rows[random.integers(len(rows), size=hidden)]
     width = np.ones((hidden, len(FEATURES)))
     if scaling.input_gain[RATE] > 0.0:
-        width[:, RATE] = np.maximum(turns[:, RATE], LEAST_TURN_MM_S) * scaling.input_gain[RATE]
+        width[:, RATE] = np.maximum(turns[:, RATE], MIN_TURN_MM_S) * scaling.input_gain[RATE]
     direction = random.normal(size=(hidden, len(FEATURES)))
     weight = STEEP * direction / np.linalg.norm(direction, axis=1, keepdims=True) / width
-    weight[:, FIELD] = np.maximum(np.abs(weight[:, FIELD]), LEAST_WEIGHT)
+    weight[:, FIELD] = np.maximum(np.abs(weight[:, FIELD]), MIN_WEIGHT)
     weight *= np.array(scaling.input_gain) != 0.0
     bias = -(weight * scaling.scaled(turns)).sum(axis=1)
     weight[:, FIELD] = np.log(weight[:, FIELD])

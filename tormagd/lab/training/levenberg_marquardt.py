@@ -25,9 +25,9 @@ BATCH_ROWS = 4096
 INITIAL_DAMPING = 1e-3
 DAMPING_DOWN = 0.1
 DAMPING_UP = 10.0
-LEAST_POSITIVE = 1e-3
+MIN_POSITIVE = 1e-3
 "Least start of a weight that has to stay positive."
-LEAST_DAMPING = 1e-15
+MIN_DAMPING = 1e-15
 GREATEST_DAMPING = 1e10
 """Marquardt's schedule with the factors that trainlm made usual; errors are means, so they fit any number of rows."""
 
@@ -121,7 +121,7 @@ def train(
         weights, error = candidate, candidate_error
         check_error = _mean_square(network, check_inputs, check_targets)
         step = Epoch(epoch, to_N * math.sqrt(error), to_N * math.sqrt(check_error))
-        damping = max(damping * DAMPING_DOWN, LEAST_DAMPING)
+        damping = max(damping * DAMPING_DOWN, MIN_DAMPING)
         history.append(step)
         if step.validation_rmse_N < best.validation_rmse_N:
             best, best_weights = step, weights
@@ -146,8 +146,8 @@ def _made_rising(network: ForceNetwork) -> Tensor:
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
     weight.mul_(side[:, None])
     network.hidden_bias.mul_(side)
-    weight[:, FIELD].clamp_(min=LEAST_POSITIVE)
-    output.abs_().clamp_(min=LEAST_POSITIVE)
+    weight[:, FIELD].clamp_(min=MIN_POSITIVE)
+    output.abs_().clamp_(min=MIN_POSITIVE)
     network.output_bias.fill_(-output.sum() / 2)  # in the middle of the forces
     is_positive = [torch.zeros_like(each, dtype=torch.bool) for each in network.parameters()]
     is_positive[0][:, FIELD] = True

@@ -31,7 +31,7 @@ START_FRACTION = 0.03
 DEGREE = 4
 "Degree of the polynomial for the logarithm of D over that of the field."
 FITTED_ROWS = 3000
-LEAST_N = 1e-6
+MIN_N = 1e-6
 "Least force that the fit tries for an insert."
 ROBUST_N = 0.05
 "Errors beyond this count less: rows near a reversal of the field."
@@ -77,7 +77,7 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
 
         def given_N(kinetic_N: Array) -> Array:
             over = 1.0 + static * np.exp(-np.square(rate / speed_mm_s)) + viscous * rate
-            level = np.maximum(kinetic_N * over, LEAST_N)
+            level = np.maximum(kinetic_N * over, MIN_N)
             borne: Array = level * -np.expm1(-stiffness_N_mm * displacement_mm / level)
             return np.where(displacement_mm < MOBILISED_MM, borne, level)
 

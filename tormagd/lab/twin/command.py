@@ -24,7 +24,7 @@ from tormagd.lab.twin.law import along, fresh_along, keys_of, value_at
 from tormagd.lab.twin.plant_file import motion_for, write_plant
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-MOST_FILES = 10
+MAX_FILES = 10
 BELIEVED = 0.4
 "No device of the plant card is further off sample 1's strength."
 
@@ -47,8 +47,8 @@ def run(options: argparse.Namespace) -> Found:
         raise LabError(f"{options.out} exists; allowed is a new file")
     if options.plot is not None and options.plot.suffix != ".png":
         raise LabError(f"--plot {options.plot}: allowed is a name that ends with .png")
-    if len(options.files) > MOST_FILES:
-        raise LabError(f"{len(options.files)} recordings: allowed are {MOST_FILES}")
+    if len(options.files) > MAX_FILES:
+        raise LabError(f"{len(options.files)} recordings: allowed are {MAX_FILES}")
     prior = load_plant(options.prior)
     ways = [excerpt_of(path) for path in options.files]
     twin = twin_of(prior, ways)

@@ -27,8 +27,8 @@ GRID_RATIO = 0.003
 "By how much rows of a hundredth of a second blur the friction of a handle that stops."
 DRIFT_MN_MIN = 5.0
 "Of the plant card's sensors, at most."
-MOST_LOST = 0.3
-MOST_DRIFT_MN_MIN, MOST_ZERO_MN = 10.0, 150.0
+MAX_LOST = 0.3
+MAX_DRIFT_MN_MIN, MAX_ZERO_MN = 10.0, 150.0
 "A sensor whose zero moves more, or is further off at one time, is refused."
 WANDER_S = 30.0
 
@@ -159,10 +159,8 @@ def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mas
                     f"{way.name}: the force sensor stood still from {begin / GRID_HZ:.1f} to {end / GRID_HZ:.1f} s"
                 )
         lost = 1.0 - float(known.mean())
-        if lost > MOST_LOST:
-            raise LabError(
-                f"{way.name}: the force sensor says nothing in {lost:.0%} of it: allowed are {MOST_LOST:.0%}"
-            )
+        if lost > MAX_LOST:
+            raise LabError(f"{way.name}: the force sensor says nothing in {lost:.0%} of it: allowed are {MAX_LOST:.0%}")
         known[: round(BURN_S * GRID_HZ)] = False
         kept.append(known)
     return kept, cut_out
@@ -175,8 +173,8 @@ def _require_steady(
     part = np.floor(time_s / WANDER_S).astype(np.int64)
     sums, counts = np.bincount(part, residual_N), np.bincount(part)
     wander_mN = 1e3 * float(np.ptp(sums[counts > 0] / counts[counts > 0]))
-    if abs(drift_mN_min) > MOST_DRIFT_MN_MIN + width_mN_min or abs(zero_mN) + wander_mN > MOST_ZERO_MN:
+    if abs(drift_mN_min) > MAX_DRIFT_MN_MIN + width_mN_min or abs(zero_mN) + wander_mN > MAX_ZERO_MN:
         raise LabError(
             f"{way.name}: the force sensor's zero is {zero_mN:.0f} mN, drifts by {drift_mN_min:.1f} mN a minute and "
-            f"wanders by {wander_mN:.0f} mN: allowed are {MOST_DRIFT_MN_MIN:g} mN a minute, {MOST_ZERO_MN:g} mN else"
+            f"wanders by {wander_mN:.0f} mN: allowed are {MAX_DRIFT_MN_MIN:g} mN a minute, {MAX_ZERO_MN:g} mN else"
         )
