@@ -168,7 +168,6 @@ def test_the_best_design_is_above_the_bar(
     assert found(problem, problem.lower).coverage >= bar
 
 
-@pytest.mark.usefixtures("few_generations")
 def test_no_design_on_a_grid_is_better_or_as_good_and_smaller(problem: Problem) -> None:
     best = found(problem, problem.lower)
     assert best.coverage >= 0.995
