@@ -72,7 +72,7 @@ def _table_2_4(data: Json) -> str:
         f"## Table 2.4: force ranges\n\nMeasure: {data['measure']}. Thesis: mean "
         f"{percent(data['thesis']['mean_rel_error'])}, most {percent(data['thesis']['max_rel_error'])}. *Left out*: "
         f"the fit to the other eleven predicts each insert. All else here has the friction {friction}, the least "
-        "squares of the same errors. The least mean leaves the device's MRE-50-40 24% short instead of 17%.\n\n"
+        "squares of the same errors, which leaves the device's MRE-50-40 less short.\n\n"
         + table(("fitted", "mean", "max", "left out, mean", "mean with the power field law"), fits)
         + "\n![Force ranges](reproduction/table_2_4.png)\n\n"
         + table(("insert", "measured, N", "thesis, N", "ours, N"), rows)
@@ -84,12 +84,11 @@ def table_2_5(data: Json) -> str:
     low, high = data["implied_gap_resolution_mm"]
     return (
         f"## Table 2.5: inserts for tasks\n\n`tormag-lab reproduce-thesis --table-2-5` prints it alone. {data['note']} "
-        f"Gap steps of {data['gap_resolution_mm']:g} mm; the resolutions that the thesis states are those of "
-        f"{low:.2f}..{high:.2f} mm at the closed gap. Required is 0.1 N for cardiovascular work (thesis), else a tenth "
-        "of the range.\n\n"
+        f"Gap steps of {data['gap_resolution_mm']:g} mm; the thesis's resolutions are those of {low:.2f}..{high:.2f} "
+        "mm at the closed gap. Required is 0.1 N for cardiovascular work (thesis), else a tenth of the range.\n\n"
         + table(COLUMNS, readings(data))
-        + "\nAs the thesis meant it, MRE-30-30 alone is not wide enough. Strictly none serves: the least forces are "
-        "missed, which only a wider gap would give.\n"
+        + "\nAs the thesis meant it, MRE-30-30 alone is not wide enough. Strictly none serves: only a wider gap would "
+        "give the least forces.\n"
     )
 
 
@@ -201,10 +200,11 @@ def _table_3_2(data: Json) -> str:
     return (
         f"## Table 3.2: structural optimisation\n\n{data['note']} Gap speeds, mm/s: {speeds}. Differential evolution, "
         "then COBYQA, beside SLSQP from the same starts, which stays where a start covers nothing. At a fast gap a "
-        "small elastomer covers all; at the thesis's speed the last percent costs ten to twenty times the elastomer. "
-        "The thesis's cost, Eq. 39, does not measure coverage: its own minimum covers "
-        f"{percent(corner[0])} and {percent(corner[1])}. A portrait beyond the required corner costs as much as one "
-        "short of it.\n\n" + table(columns, rows) + "\n![Optimised portraits](reproduction/figure_3_4.png)\n\n"
+        "small elastomer covers all; at the thesis's speed the last percent costs ten to twenty times as much. Minima "
+        f"of the thesis's cost, Eq. 39, cover {percent(corner[0])} and {percent(corner[1])}: beyond the required "
+        "corner costs as much as short of it.\n\n"
+        + table(columns, rows)
+        + "\n![Optimised portraits](reproduction/figure_3_4.png)\n\n"
         "The thesis's designs under the same measures, over its five starts:\n\n"
         + table(("use case", "design", "R_o t s_max, mm", "thesis", "trapezoid", "true", "true, thesis speed"), designs)
     )
@@ -243,8 +243,8 @@ def table_4_1(data: Json) -> str:
         )
     return (
         "## Table 4.1: the force network\n\nSynthetic: the thesis's 69,300 measured tuples are not public; ours are as "
-        "many from a simulated pad of the same moduli and full scales. Network and training are the thesis's. Its "
-        f"error is the assumed sensor's ({data['sensor_noise_N']} N, mean {data['random']['noise_mae_N']:.3f} N), "
-        "and says nothing about the method. On the rows held out ([more](learned_inverse.md)):\n\n"
+        "many from a simulated pad of the same moduli and full scales. Network and training are the thesis's. The "
+        f"error is the assumed sensor's ({data['sensor_noise_N']} N, mean {data['random']['noise_mae_N']:.3f} N), not "
+        "the method's. On the rows held out ([more](learned_inverse.md)):\n\n"
         + table(("class", "thesis MAE, N", "ours", "thesis R2", "ours"), rows)
     )

@@ -124,7 +124,7 @@ def table_2_3() -> Json:
     return {
         "rows": rows,
         "max_error_g": max(row["max_error_g"] for row in rows),
-        "note": "The differences are the rounding of the printed masses. G0 was measured and is taken as printed.",
+        "note": "That is their rounding. G0 is taken as printed.",
     }
 
 
@@ -232,7 +232,7 @@ def figure_2_5() -> Json:
         "thesis_working_point_N": list(FIGURE_2_5_N),
         "measured_earlier_N": list(FIGURE_2_5_MEASURED_N),
         "note": "mu_r 4, G0 277 kPa, mu_d 0.2, 95 and 45 mm. The range grows with mu_r, and falls with G0: a "
-        "softer elastomer is pressed harder. Stiffer inserts brake more by their iron and their friction.",
+        "softer elastomer is pressed harder.",
     }
 
 
@@ -276,8 +276,8 @@ def figure_2_7(tests: list[StepTest]) -> Json:
         "ranges": ranges,
         "rpm": 20.0,
         "note": "Synthetic: the simulated device (plant sample 1 with each insert's values), virtual time, 5 s a step. "
-        "It lies below the force law because its elastomer relaxes and warms; the thesis prints no figures for this "
-        "picture. End gaps 94.5 and 45.5 mm, clear of the end stops.",
+        "Its elastomer relaxes and warms, so it lies below the force law; the thesis prints no figures. End gaps 94.5 "
+        "and 45.5 mm.",
     }
 
 
