@@ -174,6 +174,21 @@ def test_an_operator_commands_and_an_observer_only_looks(rig: Rig) -> None:
     assert drop.address
 
 
+def test_who_was_answered_and_left_before_it_was_seen_was_not_refused(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a fast machine a command has ended before the event of its connection is read."""
+    monkeypatch.setattr(admission, "_address", lambda _descriptor: "")
+    admitted = rig.endpoint.admission._endpoints["control"].admitted
+    for number in range(1, 4):
+        console = rig.peer(zmq.DEALER, "control", rig.pair("console"))
+        console.send(request("status"))
+        rig.until(lambda number=number: len(rig.answered) == number)
+        console.close()
+        rig.until(lambda: not admitted.total(), "gone")
+    assert rig.endpoint.report().refused == 0
+
+
 @pytest.mark.parametrize("name", ["telemetry", "recording"])
 @pytest.mark.parametrize("who", ["viewer", "console"])
 def test_operators_and_observers_see(rig: Rig, name: str, who: str) -> None:

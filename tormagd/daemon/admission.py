@@ -120,6 +120,11 @@ class _Connections:
         self.taken_for_one.append(taken)
         return True
 
+    def gone(self) -> str:
+        """Return an address that was admitted more often than it has connections open; empty where there is none."""
+        still = Counter(self.addresses.values())
+        return next((address for address, count in self.admitted.items() if count > still[address]), "")
+
     def left(self, address: str) -> str | None:
         """Remove a peer whose key was refused from `turned_away`, and return its address; None where there is none.
 
@@ -329,7 +334,8 @@ class Admission:
         """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many.
 
         A refused key that was counted already is not counted again. A publisher that had got in is noted in `left`: it
-        may come back at once. A `descriptor` that is not known counts as a connection of an unknown address.
+        may come back at once. A connection of an unknown address whose handshake did not fail stands for one that was
+        admitted.
         """
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
@@ -341,6 +347,8 @@ class Admission:
             failed = "too many connections"
         if was_asked:
             return  # counted when its key was refused
+        if failed is None and not address:  # a quick one: answered, and gone before its address was read
+            address = known.gone()
         if failed is None and (not known.is_guarded or known.admitted[address]):
             known.admitted -= Counter((address,))
             if known.name == "setpoint" and address:
