@@ -25,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=float,
         nargs=4,
-        metavar=("MIN_N", "LEAST_RATE", "MAX_N", "MOST_RATE"),
+        metavar=("MIN_N", "MIN_RATE", "MAX_N", "MAX_RATE"),
         help="required forces, N, and rates, N/s",
     )
     parser.add_argument("--measure", choices=("true", "trapezoid", "corners"), default="true")
