@@ -36,7 +36,7 @@ CHANGED_TICK = 3_210
 TICKS = 4_000
 ROOT = Path(__file__).parents[2]
 FORMER = (
-    f"format = '4', written by tormagd {__version__!r}: allowed is 9, which tormagd {__version__} writes; "
+    f"format = '4', written by tormagd {__version__!r}: allowed is 10, which tormagd {__version__} writes; "
     "replay it with the version that wrote it"
 )
 NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]

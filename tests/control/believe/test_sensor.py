@@ -8,7 +8,15 @@ import pytest
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.freshness import FROZEN_S
 from tormagd.control.believe.handle import HandleWatch
-from tormagd.control.believe.sensor import AGREES_S, MOVED_N, RELAXED, RISES_N_S, TRUSTED_AGAIN_S, WRONG_S
+from tormagd.control.believe.sensor import (
+    AGREES_S,
+    EXCUSED_N,
+    MOVED_N,
+    RELAXED,
+    RISES_N_S,
+    TRUSTED_AGAIN_S,
+    WRONG_S,
+)
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle
 from tormagd.model.displacement import MOBILISED_MM, Turn
@@ -137,6 +145,25 @@ def test_what_relaxes_is_followed_and_what_goes_on_falling_is_not(planner, hear,
         if planner.believe.sensor.is_disputed:
             break
     assert fallen_N == pytest.approx(MOVED_N + RELAXED * own_N, abs=0.025)
+
+
+def test_a_drift_is_not_hidden_by_a_force_that_steps(core, known, hear, moving) -> None:
+    """10 mN/s down, while the force steps every two seconds: each step explains some of it, and takes it back."""
+    levels = (moving(), MODEL_N), (moving(**CLOSER), core.portrait.force_N_at(70.0))
+    drifted_N = 0.0
+    while not known.believe.sensor.is_disputed and drifted_N < 1.0:
+        for measured, model_N in levels:
+            known.believe.handle = HandleWatch()  # the handle has gone on
+            for _ in range(20):
+                drifted_N += 1e-3
+                hear(known, 0.1, measured.replaced(force_N=model_N - drifted_N))
+    assert drifted_N < MOVED_N + EXCUSED_N + RELAXED * levels[1][1] + 0.05
+
+
+def test_a_step_ends_no_dispute(core, known, hear, moving) -> None:
+    hear(known, 0.3, moving(force_N=MODEL_N - 0.14))
+    known.believe.handle = HandleWatch()  # the handle has gone on
+    assert hear(known, 1.0, moving(force_N=core.portrait.force_N_at(70.0) - 0.14, **CLOSER)).believe.sensor.is_disputed
 
 
 def test_a_fit_that_swings_is_the_same_device_still(known, hear, moving) -> None:

@@ -1,6 +1,7 @@
 """Who is right where the readings leave the believed device: the sensor, or a device that has changed.
 
-    moved    d    what the fit has learned of late, N, where it is now; forgotten as fast as a device changes by itself
+    moved    d    what the fit has learned of late, N, where it is now; forgotten as fast as an elastomer relaxes
+    excused  e    what it has learned because conditions changed, N: no more than the distance from the usual explains
     dispute  |d| > what a device changes by itself: the fit goes back by d, and learns nothing more
     lead     l    by how much the readings are over the fit's force, N: the device is taken for that much stronger
     agreed   the readings come back to the fit: it learns again
@@ -32,7 +33,13 @@ VISCOUS_N_S_MM: Final = 6e-4
 LATELY_S: Final = 1.0
 "Time constant of what counts as of late."
 SLACK_N: Final = 0.05
-"So much slack a gap that hardly moves gives, too: what the fit has learned is not forgotten sooner for it."
+"So much slack a gap that hardly moves gives, too: it excuses nothing."
+USUAL_S: Final = 60.0
+"Time constant of what counts as usual."
+EXCUSED: Final = 0.08
+"A fit may err by this share of the force's distance from the usual: field laws differ in shape."
+EXCUSED_N: Final = 0.05
+"So much may be excused at the usual force, too."
 RELAXES_1_S: Final = 0.012
 "An elastomer may lose, or win back, this share of its force a second beyond what its model remembers."
 RELAXED: Final = 0.12
@@ -73,12 +80,18 @@ class SensorTrust:
     "Mean of the handle's rate over LATELY_S."
     direction: float = 0.0
     "The way the handle goes, 1 or -1; 0 before the first reading."
+    usual_N: float = 0.0
+    "Mean of the model's force over USUAL_S."
     slack_N: float = 0.0
     "What the fit may learn at once, as model force, rate or zero have changed of late."
     moved_N: float = 0.0
     "What the fit has learned of late, and would have to unlearn in a dispute."
+    leaves_s: float = 0.0
+    "For how long `moved_N` has been over half of MOVED_N."
+    excused_N: float = 0.0
+    "What the fit has learned besides, as far as the distance of the force from the usual explains it."
     relaxed_N: float = 0.0
-    "How much of RELAXED is used up."
+    "How much force the device has lost by relaxing, beyond what its model remembers; below 0 where it has gained."
     is_disputed: bool = False
     "Whether sensor and device are in dispute: the fit does not learn."
     disputed_s: float = 0.0
@@ -145,6 +158,7 @@ class SensorTrust:
         if not self.has_slid:
             return
         self.moved_N += learned_N
+        self.leaves_s = self.leaves_s + dt_s if abs(self.moved_N) > 0.5 * MOVED_N else 0.0
         if abs(self.moved_N) > MOVED_N + self.slack_N:
             self._begin(self.moved_N)
         else:
@@ -166,7 +180,7 @@ class SensorTrust:
         """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts the fit, N.
 
         In a dispute that began since the reversal the shift is `found_N` times the handle's `direction`, else 0. The
-        used part of RELAXED, `relaxed_N`, returns to 0.
+        force that has relaxed, `relaxed_N`, counts from 0 again.
         """
         self.relaxed_N = 0.0
         return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
@@ -179,13 +193,13 @@ class SensorTrust:
         """
         if wrong == "device":
             self._settle()
-            self.known_s = 0.0
+            self.known_s = self.excused_N = 0.0
         else:
             self.is_doubted = True
 
     def _hear(self, model_N: float, reading_N: float, dt_s: float) -> None:
         if self.known_s == 0.0:
-            self.measured_N, self.model_N = reading_N, model_N
+            self.measured_N, self.model_N, self.usual_N = reading_N, model_N, model_N
         self.known_s = min(self.known_s + dt_s, LEARNS_S)
         self.measured_N = low_pass(self.measured_N, reading_N, dt_s, FILTER_S)
 
@@ -209,16 +223,18 @@ class SensorTrust:
         self.direction = direction
         self.slack_N = max(low_pass(self.slack_N, 0.0, dt_s, LATELY_S), slack_N)
         self.model_N = low_pass(self.model_N, model_N, dt_s, LATELY_S)
+        self.usual_N = low_pass(self.usual_N, model_N, dt_s, USUAL_S)
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LATELY_S)
 
     def _judge(self, over_N: float, is_strange: bool, dt_s: float) -> None:
         """Judge who is right by how much the readings are over the fit's force, `over_N`.
 
         With `is_strange` no device gives such readings: after WRONG_S of them the sensor is doubted, in a dispute. A
-        dispute ends once readings have agreed for AGREES_S, of a doubted sensor for TRUSTED_AGAIN_S. In one, `lead_N`
-        follows readings above the fit, by RISES_N_S at most; it returns to 0 for others, and for a doubted sensor.
+        dispute ends once readings have agreed for AGREES_S, of a doubted sensor for TRUSTED_AGAIN_S. They have to agree
+        for longer than a reading that drifts on as it did would. In a dispute `lead_N` follows readings above the fit,
+        by RISES_N_S at most; it returns to 0 for others, and for a doubted sensor.
         """
-        agrees = not is_strange and abs(over_N) <= AGREES_N + self.slack_N
+        agrees = not is_strange and abs(over_N) <= AGREES_N
         self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
         if self.wrong_s > WRONG_S and not self.is_doubted:
             if not self.is_disputed:
@@ -233,14 +249,14 @@ class SensorTrust:
         wanted_N = 0.0 if is_strange or self.is_doubted else max(over_N, 0.0)
         change_N = low_pass(self.lead_N, wanted_N, dt_s, LEADS_S) - self.lead_N
         self.lead_N += min(max(change_N, -RISES_N_S * dt_s), RISES_N_S * dt_s)
-        if self.agreed_s > (TRUSTED_AGAIN_S if self.is_doubted else AGREES_S):
+        if self.agreed_s > max(TRUSTED_AGAIN_S if self.is_doubted else AGREES_S, 2.0 * self.leaves_s):
             self._settle()
 
     def _settle(self) -> None:
         """End the dispute, if any: the sensor is believed again."""
         self.is_disputed = self.is_doubted = False
         self.disputed_s = self.agreed_s = self.doubted_s = self.wrong_s = 0.0
-        self.lead_N = self.moved_N = 0.0
+        self.lead_N = self.moved_N = self.leaves_s = 0.0
 
     def _begin(self, over_N: float) -> None:
         """Begin a dispute with readings `over_N` over the fit's force, and note how far the fit has to go back."""
@@ -249,22 +265,32 @@ class SensorTrust:
         self.back_N, self.moved_N = -self.moved_N, 0.0
 
     def _fade_moved(self, force_N: float, dt_s: float) -> None:
-        """Bring `moved_N` towards 0 by what a device changes by itself in `dt_s`; `force_N` >= 0 is its force.
+        """Bring `moved_N` towards 0 by what is excused, and by what the device relaxes in `dt_s`.
 
-        A loss of force may be relaxing: it adds to `relaxed_N`, until RELAXED is used up. A gain gives back as much.
+        A loss of force may be relaxing, and adds to `relaxed_N`. A gain may be won back, and takes off. Either ends at
+        RELAXED of the force, `force_N` >= 0.
         """
+        self._excuse(dt_s)
         self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
-        by_itself_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
-        relaxes_N = min(RELAXES_1_S * force_N * dt_s, max(RELAXED * force_N - self.relaxed_N, 0.0))
-        if self.moved_N < 0.0:
-            used_N = min(max(-self.moved_N - by_itself_N, 0.0), relaxes_N)
-            self.relaxed_N += used_N
-            self.moved_N = min(self.moved_N + by_itself_N + used_N, 0.0)
-        else:
-            won_N = min(max(self.moved_N - by_itself_N, 0.0), RELAXES_1_S * force_N * dt_s)
-            # a fit that swings with the handle's rate loses and gains in turn: what counts is the sum
-            self.relaxed_N = max(self.relaxed_N - won_N, 0.0)
-            self.moved_N = max(self.moved_N - by_itself_N - won_N, 0.0)
+        relaxes_N = RELAXES_1_S * force_N * dt_s
+        most_N = max(RELAXED * force_N, abs(self.relaxed_N))  # at a greater force before, more may have relaxed
+        relaxed_N = self.relaxed_N + min(max(-self.moved_N, -relaxes_N), relaxes_N)
+        relaxed_N = min(max(relaxed_N, -most_N), most_N)
+        self.moved_N += relaxed_N - self.relaxed_N
+        self.relaxed_N = relaxed_N
+
+    def _excuse(self, dt_s: float) -> None:
+        """Move from `moved_N` to `excused_N` what the slack of the last `dt_s` explains.
+
+        A field law of another shape errs anew at each force, and as much again where the force returns. So as the force
+        nears the usual, what is excused goes back to `moved_N`: a drift that steps have hidden is seen there.
+        """
+        most_N = EXCUSED * abs(self.model_N - self.usual_N) + EXCUSED_N
+        by_slack_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
+        now_N = self.excused_N + min(max(self.moved_N, -by_slack_N), by_slack_N)
+        now_N = min(max(now_N, -most_N), most_N)
+        self.moved_N -= now_N - self.excused_N
+        self.excused_N = now_N
 
     def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
         """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices.
