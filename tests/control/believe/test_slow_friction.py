@@ -7,9 +7,11 @@ from hypothesis import given, strategies as st
 
 from tormagd.config import Config
 from tormagd.control.believe.slow_friction import (
+    FASTEST_MM_S,
     MAX_STATIC,
     MIN_STATIC,
     REACH_MM,
+    SLOWS_S,
     STRIBECK_MM_S,
     SlowFriction,
     believable,
@@ -119,3 +121,15 @@ def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float
         assert MIN_FACTOR <= slow.factor <= MAX_FACTOR
         assert 0.0 <= slow.followed_N <= 5.0
         assert MIN_FACTOR <= slow.factor_at(rate_mm_s) <= MAX_FACTOR
+
+
+def test_a_handle_that_sticks_for_a_moment_does_not_creep() -> None:
+    """The gap stays for it: a fall of the rate is followed over SLOWS_S, a rise at once."""
+    slow = SlowFriction(BOUNDS)
+    slow.slide(1.0, 20.0)
+    slow.slide(1.0 + 0.3 * SLOWS_S, 1.0)
+    assert slow.creep_mm_s > 0.7 * FASTEST_MM_S
+    slow.slide(1.0 + 20.0 * SLOWS_S, 1.0)
+    assert slow.creep_mm_s == pytest.approx(1.0, abs=0.5)
+    slow.slide(1.001 + 20.0 * SLOWS_S, 20.0)
+    assert slow.creep_mm_s == 20.0

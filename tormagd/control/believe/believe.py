@@ -184,6 +184,8 @@ class Believe:
         model_N: float | None = None
         if measured is not None:
             self.memory.update(now_s, measured)
+            if self._has_creep:
+                self.slow.slide(now_s, measured.handle.sliding_mm_s)
             if measured.is_homed:
                 model_N = self.memory.force_N(self._nominal.now(measured))
                 self._hear(now_s, measured, model_N)
@@ -210,10 +212,8 @@ class Believe:
         Nothing is predicted either without `measured` (None: a silent device), or where the contact's force is not
         known. A lost encoder adds the limit HANDLE_LOST.
         """
-        device = at_speed = self.device
-        if self._has_creep:
-            sliding_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
-            device = at_speed.times(self.slow.factor_at(sliding_mm_s))
+        at_speed = self.device
+        device = at_speed.times(self.slow.factor_at(self.slow.creep_mm_s)) if self._has_creep else at_speed
         predicted_N: float | None = None
         if measured is not None and model_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))

@@ -12,11 +12,17 @@ import math
 from typing import Final, final
 
 from tormagd.control.believe.strength import MAX_RELAXED, DeviceBounds, DeviceFit
+from tormagd.control.filter import low_pass
 
 STRIBECK_MM_S: Final = 5.0
 "At this speed most of static friction is gone (plant card)."
 SLOWEST_MM_S: Final = 0.3
 "A slower handle may stand."
+FASTEST_MM_S: Final = 2.0 * STRIBECK_MM_S
+"A faster handle does not creep."
+SLOWS_S: Final = 0.1
+"""A handle that slows down creeps after some SLOWS_S. One that sticks and slips does not: if the gap opened whenever it
+sticks, it would slip further."""
 REACH_MM: Final = 0.35
 "Travel over which friction follows a rising field."
 LEARNED_S: Final = 0.3
@@ -45,6 +51,10 @@ class SlowFriction:
     "The model's force as far as the bristles of the contact have followed it."
     handle_mm: float = 0.0
     "Where the handle was when they last followed."
+    creep_mm_s: float = FASTEST_MM_S
+    "The rate that counts as the handle's, as far as it creeps."
+    slid_s: float = 0.0
+    "When `creep_mm_s` was last updated."
 
     def __init__(self, bounds: DeviceBounds) -> None:
         self._bounds: Final = bounds
@@ -55,6 +65,15 @@ class SlowFriction:
     def factor_at(self, rate_mm_s: float) -> float:
         """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
         return 1.0 + _slowness(rate_mm_s) * (self.factor - 1.0)
+
+    def slide(self, now_s: float, sliding_mm_s: float) -> None:
+        """Update `creep_mm_s` with the level of rate that friction has, `sliding_mm_s` >= 0, at `now_s`.
+
+        A rise is followed at once, a fall over SLOWS_S. Times must not fall.
+        """
+        from_mm_s = min(self.creep_mm_s, FASTEST_MM_S)
+        self.creep_mm_s = max(low_pass(from_mm_s, sliding_mm_s, now_s - self.slid_s, SLOWS_S), sliding_mm_s)
+        self.slid_s = now_s
 
     def follow(self, model_N: float, handle_mm: float) -> None:
         """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`.
