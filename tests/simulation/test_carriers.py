@@ -45,20 +45,12 @@ def a_device(baud: int = 1_000_000, seed: int = 0, ppm: float = 0.0, jitter_us: 
 
 @pytest.mark.parametrize("baud", [9600, 115_200, 1_000_000])
 def test_bytes_take_ten_bits_each_in_both_directions(baud: int) -> None:
-    device = a_device(baud)
-    byte_s = 10.0 / baud
-    arrived_s = 0.001 + len(HELLO) * byte_s
+    device, byte_s = a_device(baud), 10.0 / baud
     device.receive(0.001, HELLO)
-    out = b""
-    for count in range(1, IDENTITY_BYTES + 1):
-        leaves_s = arrived_s + count * byte_s
-        assert device.transmit(leaves_s - 0.01 * byte_s) == b""
-        byte = device.transmit(leaves_s + 1e-9)
-        assert len(byte) == 1
-        out += byte
-        if leaves_s > 0.018:  # before the first Status of the device gets in line
-            return
-    (frame,) = FrameDecoder().feed(out)
+    leave_s = [0.001 + (len(HELLO) + count) * byte_s for count in range(1, IDENTITY_BYTES + 1)]
+    seen = [device.transmit(leaves_s + later_s) for leaves_s in leave_s for later_s in (-0.01 * byte_s, 1e-9)]
+    assert [len(data) for data in seen] == [0, 1] * IDENTITY_BYTES
+    (frame,) = FrameDecoder().feed(b"".join(seen))
     assert isinstance(decode(frame.function, frame.payload), Identity)
 
 
@@ -154,30 +146,25 @@ def test_the_same_seed_gives_the_same_bytes_however_time_is_cut_and_another_seed
 
 
 def test_time_that_falls_is_refused() -> None:
-    device = a_device()
-    device.advance(1.0)
-    for attempt in (device.advance, device.transmit, lambda now_s: device.receive(now_s, b"")):
-        for now_s in (0.5, math.nan, math.inf):
-            with pytest.raises(ValueError, match="allowed is from"):
-                attempt(now_s)
-    bus = CanDevice(MessageDevice(SAMPLE_1, SteadyHand()))
-    bus.advance(0.01)
-    with pytest.raises(ValueError, match="now_s"):
-        bus.advance(0.009)
+    line, bus = a_device(), CanDevice(MessageDevice(SAMPLE_1, SteadyHand()))
+    for device in (line, bus):
+        device.advance(1.0)
+        for attempt in (device.advance, device.transmit):
+            for now_s in (0.5, math.nan, math.inf):
+                with pytest.raises(ValueError, match=r"now_s = .*: allowed is from"):
+                    attempt(now_s)
+    with pytest.raises(ValueError, match="allowed is from"):
+        line.receive(0.5, b"")
 
 
 def test_next_event_is_never_behind_and_always_comes() -> None:
-    device = a_device()
+    device, events_s = a_device(), [0.0]
     device.receive(0.0, HELLO)
-    now_s = 0.0
-    events = 0
-    while now_s < 0.1:
-        due_s = device.next_event_s
-        assert due_s >= now_s
-        now_s = max(due_s, now_s)
-        device.transmit(now_s)
-        events += 1
-    assert 100 <= events < 300
+    while events_s[-1] < 0.1:
+        events_s.append(device.next_event_s)
+        device.transmit(events_s[-1])
+    assert events_s == sorted(events_s)
+    assert 100 <= len(events_s) < 300
 
 
 # -- frames of a bus ------------------------------------------------------------------------------------------------

@@ -88,12 +88,12 @@ def test_a_plant_too_quick_for_the_substep_is_refused(table: str, key: str, valu
 
 
 def test_current_is_limited() -> None:
-    axis = an_axis()
-    currents = []
-    for step in range(steps(0.2)):
-        axis.step(12.0 if step < steps(0.1) else -12.0, 0.0)
-        currents.append(axis.current_A)
-    assert -5.0 == min(currents) <= max(currents) <= 5.0
+    axis, currents_A = an_axis(), []
+    for volts in (12.0, -12.0):
+        for _ in range(steps(0.1)):
+            axis.step(volts, 0.0)
+            currents_A.append(axis.current_A)
+    assert -5.0 == min(currents_A) <= max(currents_A) <= 5.0
 
 
 def test_under_break_away_voltage_the_screw_truly_stands() -> None:
@@ -225,13 +225,7 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
             assert put_in_J + 0.01 * throughput_J + 1e-6 >= stored_J
 
 
-# -- element, pad and sensors, and the plant of all of it --------------------------------------------------------------
-
-
-# -- motor, gearbox, screw and carriage: against the data sheet, against closed forms, and for passivity ---------------
-
-
-# -- element and sensors -----------------------------------------------------------------------------------------------
+# -- element and sensors, and the plant of all of it -------------------------------------------------------------------
 
 
 STEP_S = 1e-3
@@ -316,19 +310,25 @@ def test_warming_weakens_the_force_and_levels_off() -> None:
     assert warm.temperature_C == pytest.approx(40.0)
 
 
-def test_the_brake_gives_the_hand_no_energy_over_its_reversals() -> None:
-    plant = Plant(SAMPLE_1, ReversingHand(4.0))
-    work_J = 0.0
-    directions = set()
-    for _ in range(8000):
+@pytest.mark.parametrize(
+    ("name", "volts", "stiffness_N_mm", "least_J"), [("sample_1", None, 8.0, 0.1), ("second", 8.0, math.inf, 0.05)]
+)
+def test_the_brake_gives_the_hand_no_energy_over_its_reversals(
+    name: str, volts: float | None, stiffness_N_mm: float, least_J: float
+) -> None:
+    """At rest or while the gap opens and closes, the work is never less than what the bristles hold."""
+    plant, work_J, directions = Plant(load_plant(name), ReversingHand(4.0)), 0.0, set()
+    for step in range(8000):
+        if volts is not None:
+            plant.drive(*([-volts, -volts] if step % 1000 < 500 else [volts, volts]))
         before_mm = plant.handle_mm
         plant.advance(STEP_S)
         work_J += plant.truth.force_N * (plant.handle_mm - before_mm) * 1e-3
-        assert work_J >= 0.5 * plant.truth.force_N**2 / 8.0 * 1e-3 - 1e-6
+        assert work_J >= max(0.5 * plant.truth.force_N**2 / stiffness_N_mm * 1e-3 - 1e-6, 0.0)
         if abs(plant.handle_mm_s) > 35.0:
             assert plant.truth.force_N * plant.handle_mm_s > 0.0
             directions.add(plant.handle_mm_s > 0.0)
-    assert work_J > 0.1
+    assert work_J > least_J
     assert directions == {True, False}
 
 
@@ -336,7 +336,7 @@ def readings(plant: Plant, milliseconds: int) -> list[float]:
     values = []
     for _ in range(milliseconds):
         plant.advance(STEP_S)
-        values.append(plant.sensed_force_N)
+        values.append(plant.force_sensor.reading_N)
     return values
 
 
@@ -364,7 +364,7 @@ def test_force_sensor_shows_the_force_of_its_delay_ago(delay_ms: float, rate_Hz:
         forces.append(plant.truth.force_N)
         sampled_ms = (millisecond - round(delay_ms)) // period_ms * period_ms
         if sampled_ms >= period_ms:
-            assert plant.sensed_force_N == forces[sampled_ms - 1]
+            assert plant.force_sensor.reading_N == forces[sampled_ms - 1]
 
 
 def test_force_sensor_offset_drifts_at_the_stated_rate() -> None:
@@ -373,7 +373,7 @@ def test_force_sensor_offset_drifts_at_the_stated_rate() -> None:
     for seed in range(6):
         plant = Plant(drifting, SteadyHand(), seed)
         plant.advance(2.0)
-        offset_N = plant.sensed_force_N - plant.truth.force_N
+        offset_N = plant.force_sensor.reading_N - plant.truth.force_N
         assert abs(offset_N) == pytest.approx(0.02, rel=0.01)
         signs.add(offset_N > 0.0)
     assert signs == {True, False}
@@ -387,7 +387,7 @@ def test_time_may_be_cut_in_any_way() -> None:
     for _ in range(3000):
         pieces.advance(0.3 / 3000 / 3)
         pieces.advance(0.3 / 3000 * 2 / 3)
-    assert (pieces.truth, pieces.sensed_force_N) == (whole.truth, whole.sensed_force_N)
+    assert (pieces.truth, pieces.force_sensor.reading_N) == (whole.truth, whole.force_sensor.reading_N)
 
 
 # -- the pad -----------------------------------------------------------------------------------------------------------
@@ -429,6 +429,5 @@ def test_the_device_feels_the_finger() -> None:
     assert (plant.truth.handle_mm, plant.truth.force_N) == (0.0, 0.0)
     plant.advance(5.0)
     truth = plant.truth
-    assert (truth.handle_mm, truth.handle_mm_s) == (1.5, 0.0)
-    assert truth.force_N > 1.5
-    assert plant.sensed_force_N == pytest.approx(truth.force_N, abs=0.05)
+    assert (truth.handle_mm, truth.handle_mm_s, truth.force_N > 1.5) == (1.5, 0.0, True)
+    assert plant.force_sensor.reading_N == pytest.approx(truth.force_N, abs=0.05)

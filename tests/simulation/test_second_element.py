@@ -4,9 +4,7 @@ import msgspec
 import pytest
 
 from tormagd.lab.ideal_carriage import brake_of
-from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
-from tormagd.simulation.plant import Plant
 from tormagd.simulation.second_element import SecondElement
 
 STEP_S = 1e-3
@@ -61,8 +59,7 @@ def test_a_step_creeps_with_the_logarithm_of_time_and_comes_to_an_end() -> None:
             at_N.append(element.kinetic_N)
     assert fresh_N > at_N[0] > at_N[1] > at_N[2] > at_N[3] > rested_N
     # at most V ln 10 a decade, 0.115 N
-    assert at_N[0] - at_N[1] == pytest.approx(0.11, rel=0.1)
-    assert at_N[1] - at_N[2] == pytest.approx(0.11, rel=0.1)
+    assert (at_N[0] - at_N[1], at_N[1] - at_N[2]) == pytest.approx((0.11, 0.11), rel=0.1)
     assert at_N[3] == pytest.approx(SecondElement(SECOND, 48.0, 0.1).kinetic_N, rel=0.01)
 
 
@@ -84,24 +81,6 @@ def test_friction_grows_with_the_logarithm_of_speed_and_with_rest() -> None:
     assert 1.05 < peaks_N[1] / peaks_N[0] < 1.2
 
 
-def test_the_hand_gets_back_no_more_than_the_springs_hold() -> None:
-    """Over reversals while the gap opens and closes: the work is never less than what is stored."""
-    plant, work_J, stored_J, directions = Plant(SECOND, ReversingHand(4.0)), 0.0, [], set()
-    for step in range(8000):
-        voltage_V = -8.0 if step % 1000 < 500 else 8.0
-        plant.drive(voltage_V, voltage_V)
-        before_mm = plant.handle_mm
-        plant.advance(STEP_S)
-        work_J += plant.truth.force_N * (plant.handle_mm - before_mm) * 1e-3
-        stored_J.append(work_J)
-        if abs(plant.handle_mm_s) > 35.0:
-            assert plant.truth.force_N * plant.handle_mm_s > 0.0
-            directions.add(plant.handle_mm_s > 0.0)
-    assert min(stored_J) >= 0.0
-    assert work_J > 0.05
-    assert directions == {True, False}
-
-
 def test_warmth_weakens_it() -> None:
     element = SecondElement(SECOND, 60.0, STEP_S)
     element.advance(0.0, 60.0, SPEED_MM_S)
@@ -117,9 +96,3 @@ def test_the_ideal_carriages_know_its_force_but_for_play_and_creep(gap_mm: float
     moment_T = float(brake.moment_Tm[abs(brake.gap_mm - gap_mm).argmin()])
     known_N = 0.85 * brake.sliding_N(brake.fresh_at_N(moment_T), SPEED_MM_S)
     assert slid(gap_mm).force_N == pytest.approx(known_N, rel=0.02)
-
-
-def test_the_handle_of_a_new_device_is_felt() -> None:
-    plant = Plant(SECOND, SteadyHand(), seed=1)
-    plant.advance(0.5)
-    assert plant.sensed_force_N == pytest.approx(plant.truth.force_N, abs=0.05)

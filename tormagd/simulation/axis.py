@@ -23,9 +23,10 @@ MAX_STEP_SHARE: Final = 0.25
 class Axis:
     """State and laws of one carriage with its drive.
 
-    `position_m` is the carriage's distance from the centre plane, `angle_rad` the screw's angle since power-on.
-    `contact_N` is the force with which the nut pushes the carriage outward. Raises PlantError for a plant whose motion
-    is too fast for steps of `dt_s`.
+    `position_m` is the carriage's distance from the centre plane, `angle_rad` the screw's angle since power-on, opening
+    positive. `contact_N` is the force with which the nut pushes the carriage outward. `drag_N` of the guide,
+    `backlash_m` and both frictions may be changed at any time. Raises PlantError for a plant whose motion is too fast
+    for steps of `dt_s`.
     """
 
     def __init__(
@@ -66,7 +67,8 @@ class Axis:
         self.position_m = start_mm * 1e-3
         # at power-on the nut carries the whole attraction and the guide nothing
         self.contact_N = attraction_N
-        self._nut_zero_m = self.position_m + self._lead_of(attraction_N)
+        flank_m = self.backlash_m if attraction_N > 0.0 else -self.backlash_m
+        self._nut_zero_m = self.position_m + (flank_m + attraction_N / self._stiffness_N_m)
 
     @property
     def back_emf_V(self) -> float:
@@ -76,11 +78,12 @@ class Axis:
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
         """Advance the drive and its carriage by one time step, `dt_s`.
 
-        Sets angle, speed, current, place and `contact_N`. `voltage_V` is the mean voltage at the motor; None is an open
-        bridge, in which no current flows. `attraction_N` is the magnets' pull. The current is held within its limit,
-        the carriage between its stops; friction may hold either.
+        Sets angle, speed, current, place and `contact_N`. `voltage_V` is the mean voltage at the motor, positive to
+        open; the supply is no bound here. None is an open bridge, in which no current flows. `attraction_N` is the
+        magnets' pull, positive towards closed. The current is held within its limit, the carriage between its stops;
+        friction may hold either. Nothing is checked: NaN stays in the state.
         """
-        # four times a simulated millisecond: hence local names, and `_lead_of` written out in the second half
+        # four times a simulated millisecond: hence local names
         coupling_Nm_A = self._coupling_Nm_A
         before_rad_s, contact_N = self.speed_rad_s, self.contact_N
         if voltage_V is None:
@@ -159,8 +162,8 @@ class Axis:
     def shaft_after(self, age_s: float, voltage_V: float | None) -> tuple[float, float]:
         """Return the screw's (angle_rad, current_A) at `age_s` after the last step, without changing the state.
 
-        `age_s` is under one step. `voltage_V` is the mean voltage since that step, None for an open bridge. The speed
-        counts as constant.
+        `age_s` is from 0 to under one step; this is not checked. `voltage_V` is the mean voltage since that step, None
+        for an open bridge, whose current is 0. The speed counts as constant; the current is held within its limit.
         """
         speed_rad_s = self.speed_rad_s
         angle_rad = self.angle_rad + age_s * speed_rad_s
@@ -170,8 +173,3 @@ class Axis:
         current_A = settled_A + (self.current_A - settled_A) * math.exp(-age_s / self._electrical_time_s)
         limit_A = self._current_limit_A
         return angle_rad, -limit_A if current_A < -limit_A else limit_A if current_A > limit_A else current_A
-
-    def _lead_of(self, contact_N: float) -> float:
-        """Return how far the nut is outward of the carriage, m, while it pushes outward with `contact_N`."""
-        flank_m = self.backlash_m if contact_N > 0.0 else -self.backlash_m
-        return flank_m + contact_N / self._stiffness_N_m

@@ -3,6 +3,7 @@
 One bus: whoever has something to send waits until it is free, then the lowest identifier goes first.
 """
 
+import math
 from heapq import heappop, heappush
 from typing import NamedTuple, Protocol
 
@@ -23,11 +24,6 @@ class Delivery(NamedTuple):
 
     sender: int
     frame: CanFrame
-
-
-class _Flight(NamedTuple):
-    end_s: float
-    delivery: Delivery
 
 
 class CanLine(Protocol):
@@ -51,11 +47,13 @@ class CanLine(Protocol):
 class CanDevice:
     """One device and the bus it is on: the frames that wait, the one under way, and those that are not fetched yet.
 
-    receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
-    transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
-    advance(now_s)                only lets time pass
+        receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
+        transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
+        advance(now_s)                only lets time pass
 
-    Times are seconds from power-on. A time before the last, over all three, raises ValueError.
+    Times are seconds from power-on. A time before the last, over all three, raises ValueError, as does one that is not
+    finite. The bus carries `bitrate` bits a second. The device answers at the address `node`, 0 to 15: neither is
+    checked.
     """
 
     def __init__(self, messages: MessageDevice, bitrate: int = DEFAULT_BITRATE, node: int = DEFAULT_NODE) -> None:
@@ -63,14 +61,14 @@ class CanDevice:
         """The device itself."""
         self.lost = 0
         """Frames that found the queue full."""
-        self.busy_s = 0.0
-        """How long the bus has carried frames."""
         self._bit_s = 1.0 / bitrate
         self._node = node
         self._order = 0
         self._waiting: list[tuple[int, int, Delivery]] = []
-        self._flight: _Flight | None = None
+        self._flight: Delivery | None = None
+        "What is on the bus now."
         self._free_s = 0.0
+        "When the bus is free, again."
         self._now_s = 0.0
         self._delivered: list[Delivery] = []
 
@@ -81,20 +79,32 @@ class CanDevice:
 
     @property
     def next_event_s(self) -> float:
-        """Return when something happens next, s: a frame ends or may start, or an event inside the device."""
+        """Return when something happens next, s from power-on: a frame ends or may start, or an event inside the
+        device.
+
+        Never before the last time given, and at the latest the firmware's next tick.
+        """
         event_s = self.messages.next_event_s
-        if self._flight is not None:
-            return min(event_s, self._flight.end_s)
-        return min(event_s, max(self._free_s, self._now_s)) if self._waiting else event_s
+        is_used = self._flight is not None or self._waiting
+        return min(event_s, max(self._free_s, self._now_s)) if is_used else event_s
 
     def receive(self, now_s: float, frame: CanFrame, host: int = 1) -> None:
-        """Queue the frame that `host` (from 1) sends at `now_s`; in a full queue the frame is lost and counted."""
+        """Let time pass until `now_s` and queue the frame that `host` sends then; in a full queue it is lost, and
+        counted in `lost`.
+
+        `host` is any number from 1, the sender of the later `Delivery`. The frame is not checked: one for no node goes
+        over the bus, too. Raises ValueError for a time before the last, or not finite.
+        """
         self.advance(now_s)
         self._queue(Delivery(host, frame))
 
     def transmit(self, now_s: float) -> list[Delivery]:
-        """Let time pass until `now_s` and return the frames that have gone by since the last call, the hosts' own among
-        them."""
+        """Let time pass until `now_s` and return the frames whose last bit has gone by since the last call, the first
+        first.
+
+        The hosts' own are among them; DEVICE is the device's number. Each is returned once. Raises ValueError for a
+        time before the last, or not finite.
+        """
         self.advance(now_s)
         delivered, self._delivered = self._delivered, []
         return delivered
@@ -103,18 +113,20 @@ class CanDevice:
         """Let time pass until `now_s`: frames end and start on the bus.
 
         Frames that end, the hosts' too, are kept for `transmit`. What the device sends into a full queue counts in
-        `lost`.
+        `lost`. Raises ValueError for a time before the last, or not finite.
         """
+        if not self._now_s <= now_s < math.inf:
+            raise ValueError(f"now_s = {now_s}: allowed is from {self._now_s} on")
         while (event_s := self.next_event_s) <= now_s:
             self._pass_time(event_s)
-            if self._flight is not None and self._flight.end_s <= event_s:
+            if self._flight is not None and self._free_s <= event_s:
                 self._end_frame(self._flight)
             if self._flight is None and self._waiting and self._free_s <= event_s:
                 self._start_frame(event_s)
         self._pass_time(now_s)
 
     def _pass_time(self, time_s: float) -> None:
-        """Advance the device to `time_s`, and queue what it sends."""
+        """Advance the device to `time_s`, take what it sends out of its `outbox`, and queue that."""
         self.messages.advance(time_s)
         self._now_s = time_s
         outbox = self.messages.outbox
@@ -123,7 +135,8 @@ class CanDevice:
             self._queue(Delivery(DEVICE, CanFrame(packet.function << 4 | self._node, packet.payload)))
 
     def _queue(self, delivery: Delivery) -> None:
-        """Queue a frame by its identifier, or count it as lost where MAX_WAITING are waiting."""
+        """Queue a frame by its identifier, behind equal ones; where MAX_WAITING are waiting, drop it and count it in
+        `lost`."""
         if len(self._waiting) >= MAX_WAITING:
             self.lost += 1
             return
@@ -131,18 +144,18 @@ class CanDevice:
         heappush(self._waiting, (delivery.frame.identifier, self._order, delivery))
 
     def _start_frame(self, time_s: float) -> None:
-        """Put the waiting frame of the lowest identifier on the bus."""
-        _, _, delivery = heappop(self._waiting)
-        duration_s = frame_bits(delivery.frame) * self._bit_s
-        self.busy_s += duration_s
-        self._flight = _Flight(time_s + duration_s, delivery)
+        """Put the waiting frame of the lowest identifier on the bus, which is used until `_free_s`. One has to be
+        waiting."""
+        _, _, self._flight = heappop(self._waiting)
+        self._free_s = time_s + frame_bits(self._flight.frame) * self._bit_s
 
-    def _end_frame(self, flight: _Flight) -> None:
-        """Free the bus and put its frame among the delivered; the device gets it too where a host addresses its
-        node."""
+    def _end_frame(self, delivery: Delivery) -> None:
+        """Free the bus, and put its frame among the delivered.
+
+        The device receives it too, if a host sent it to the device's node. An error frame reaches no device.
+        """
         self._flight = None
-        self._free_s = flight.end_s
-        sender, frame = flight.delivery
-        self._delivered.append(flight.delivery)
+        self._delivered.append(delivery)
+        sender, frame = delivery
         if sender != DEVICE and frame.identifier <= MAX_IDENTIFIER and frame.identifier & 0xF == self._node:
-            self.messages.receive(flight.end_s, frame.identifier >> 4, frame.data)
+            self.messages.receive(self._free_s, frame.identifier >> 4, frame.data)

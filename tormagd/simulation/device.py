@@ -53,19 +53,15 @@ MAX_BACKLOG_BYTES: Final = 65_536
 """What the serial buffers of both ends and the adapter between them hold; more is lost, as on a real port."""
 STANDING: Final = frozenset(
     {
-        "worn_gearbox",
-        "motor_dead_left",
-        "overheated",
-        "end_stop_left",
-        "switch_stuck_left",
-        "other_schema",
-        "commands_vanish",
-        "state_crc",
-        "switch_dead_left",
+        *("worn_gearbox", "motor_dead_left", "motor_reversed_left", "duties_reversed", "overheated"),
+        *("end_stop_left", "switch_stuck_left", "switch_dead_left"),
+        *("other_schema", "commands_vanish", "answers_half", "state_crc", "no_state", "no_sense", "no_status"),
     }
 )
 """Faults without a size or state of their own, asked for by name where they show."""
 OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed", "opening"})
+SILENCES: Final = {FUNCTION[State]: "no_state", FUNCTION[Sense]: "no_sense", FUNCTION[Status]: "no_status"}
+"By function, the fault that keeps its messages from being sent."
 DRIVE: Final = bytes((FUNCTION[Drive],))
 LEFT_OPEN: Final = 1
 RIGHT_OPEN: Final = 2
@@ -89,9 +85,9 @@ class Packet(Value):
 class MessageDevice:
     """The simulated device at the level of messages: payloads in, payloads out, whatever carries them.
 
-    `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`. Times are the
-    host's, seconds from power-on. Faults strike at the firmware's first tick from their times on; those that last act
-    until `mend`. It holds the `plant` and the `firmware`.
+    `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`, from which its user
+    takes. Times are the host's, seconds from power-on. Faults strike at the firmware's first tick from their times on;
+    those that last act until `mend`. It holds the `plant` and the `firmware`, a new one after each reset.
     """
 
     def __init__(
@@ -105,7 +101,6 @@ class MessageDevice:
         self.parameters = parameters
         self.plant = Plant(parameters, hand, seed)
         self._boot = boot
-        self.firmware: Firmware | CompiledFirmware | EmulatedFirmware = boot(parameters)
         self.outbox: deque[Packet] = deque()
         self.undecodable = 0
         """Payloads that arrived and were no message."""
@@ -120,34 +115,19 @@ class MessageDevice:
         self._home_m = parameters.assumed.home_mm * 1e-3
         self._closed_m = parameters.assumed.closed_mm * 1e-3
         self._inbox: deque[Packet] = deque()
-        self._answers: deque[tuple[float, Answer]] = deque()
-        """Answers that are due, with their times."""
-        # when the first of each is due; infinite where there is none
-        self._arrival_s = math.inf
-        self._answer_s = math.inf
         self._struck: set[str] = set()
         """Names of the faults in STANDING that act now."""
         self._output: Output = OFF
         self._stuck_left: int | None = None
-        self._silent = 0
-        """Functions that a fault keeps from being sent, a bit each."""
         self._stuck_handle: int | None = None
         self._frozen_until_s = -math.inf
-        self._answering_every = 1
         self._drives = 0
-        self._left_motor_sign = 1.0
-        self._duty_sign = 1.0
         self._opening_share = 1.0
-        self._has_bad_encoders = False
         self._left_count_sign = 1
         self._left_extra_counts = 0
         self._right_extra_counts = 0
-        self._left_boot_counts = 0
-        self._right_boot_counts = 0
-        self._boot_s = 0.0
-        self._ticks = 0
-        self._tick_due_s = TICK_S / self._rate
         self._time_s = 0.0
+        self._reset(0.0)
 
     @property
     def truth(self) -> Truth:
@@ -155,34 +135,31 @@ class MessageDevice:
         return self.plant.truth
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
-        """Queue a payload that arrives at `time_s`.
+        """Queue a payload that arrives at `time_s`; the device hears it when `advance` gets there.
 
-        Raises ValueError for a time before those already queued or the last `advance`, or one that is not finite.
+        `function` is the message's number on the wire, or BYTES for bytes of a serial line. What is no message is not
+        refused here: it is counted in `undecodable` on arrival. Raises ValueError for a time before those already
+        queued or the last `advance`, or one that is not finite.
         """
-        waiting = self._arrival_s < math.inf
-        latest_s = self._inbox[-1].time_s if waiting else self._time_s
+        latest_s = self._inbox[-1].time_s if self._inbox else self._time_s
         if not latest_s <= time_s < math.inf:
             raise ValueError(f"time_s = {time_s}: allowed is from {latest_s} on")
         self._inbox.append(Packet(time_s, function, payload))
-        if not waiting:
-            self._arrival_s = time_s
 
     def advance(self, now_s: float) -> None:
         """Let time pass until `now_s`: messages arrive, faults strike, the firmware ticks and answers into `outbox`.
 
-        Raises ValueError for a time before the last one, or not finite.
+        Raises ValueError for a time before the last one, or not finite. What an emulated firmware raises passes
+        through, as does EncodeError for a value that the wire cannot say.
         """
         if not self._time_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._time_s} on")
         while (event_s := self.next_event_s) <= now_s:
             self._pass_time(event_s)
-            if self._arrival_s <= event_s:
-                packet = self._inbox.popleft()
-                self._arrival_s = self._inbox[0].time_s if self._inbox else math.inf
-                self._deliver(event_s, packet)
-            elif self._answer_s <= event_s:
+            if self._inbox and self._inbox[0].time_s <= event_s:
+                self._deliver(event_s, self._inbox.popleft())
+            elif self._answers and self._answers[0][0] <= event_s:
                 _, answer = self._answers.popleft()
-                self._answer_s = self._answers[0][0] if self._answers else math.inf
                 self._send_answer(event_s, answer)
             else:
                 self._tick(event_s)
@@ -192,13 +169,16 @@ class MessageDevice:
 
     @property
     def next_event_s(self) -> float:
-        """Return when something happens next, s from power-on, at the latest the firmware's next tick."""
+        """When something happens next, s from power-on: a message arrives, an answer leaves, or the firmware ticks.
+
+        Never before the time of the last `advance`.
+        """
         event_s = self._tick_due_s
-        if self._arrival_s < event_s:
-            event_s = self._arrival_s
-        if self._answer_s < event_s:
-            event_s = self._answer_s
-        return event_s if event_s > self._time_s else self._time_s
+        if self._inbox:
+            event_s = min(event_s, self._inbox[0].time_s)
+        if self._answers:
+            event_s = min(event_s, self._answers[0][0])
+        return max(event_s, self._time_s)
 
     def _pass_time(self, time_s: float) -> None:
         if time_s > self._time_s:
@@ -208,16 +188,19 @@ class MessageDevice:
     def _drive_bridges(self) -> None:
         """Put the firmware's present output at the motors, in steps of the PWM, as supply and faults let it.
 
-        Both bridges are open where the output is not enabled, or without supply.
+        Both bridges are open where the output is not enabled, or without supply. The output is remembered: `advance`
+        calls this for another one.
         """
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
-            if self._duty_sign < 0.0 and self.firmware.mode is DeviceMode.RUN:
+            if "duties_reversed" in self._struck and self.firmware.mode is DeviceMode.RUN:
                 left_V, right_V = -left_V, -right_V
             if self._opening_share != 1.0 and self.firmware.mode is DeviceMode.RETRACTING:
                 left_V, right_V = self._opening_share * left_V, self._opening_share * right_V
-            self.plant.drive(None if "motor_dead_left" in self._struck else self._left_motor_sign * left_V, right_V)
+            if "motor_reversed_left" in self._struck:
+                left_V = -left_V
+            self.plant.drive(None if "motor_dead_left" in self._struck else left_V, right_V)
         else:
             self.plant.drive(None, None)
 
@@ -230,7 +213,8 @@ class MessageDevice:
     def _tick(self, time_s: float) -> None:
         """Begin the faults that are due, then let the firmware tick, and send its Status if one is due.
 
-        A frozen firmware does not tick; it is reset once its watchdog's time is over.
+        Counts the tick, and sets when the next one is due. A frozen firmware does not tick; it is reset once its
+        watchdog's time is over.
         """
         self._ticks += 1
         while self._faults and self._faults[0].at_s <= time_s:
@@ -248,27 +232,27 @@ class MessageDevice:
     def _deliver(self, time_s: float, packet: Packet) -> None:
         """Give the firmware a `packet` that arrives at `time_s`, and queue its answer with the device's jitter.
 
-        Faults and a hanging firmware may drop the packet. One that is no message is dropped and counted in
-        `undecodable`.
+        The commands_vanish and answers_half faults and a hanging firmware may drop the packet. One that is no message
+        is dropped and counted in `undecodable`.
         """
         if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
-        if self._answering_every > 1 and _is_drive(packet):
+        if "answers_half" in self._struck and _is_drive(packet):
             self._drives += 1
-            if self._drives % self._answering_every:
+            if self._drives % 2:
                 return
         answer = self._hear(self._device_time_s(time_s), packet)
         if answer is not NO_ANSWER:
             answer_s = time_s + self._jitter_s * self._jitter.random()
-            if self._answer_s == math.inf:
-                self._answer_s = answer_s
-            else:
-                # none overtakes the one before it
+            if self._answers:  # none overtakes the one before it
                 answer_s = max(answer_s, self._answers[-1][0])
             self._answers.append((answer_s, answer))
 
     def _hear(self, device_s: float, packet: Packet) -> Answer:
-        """Give the firmware a packet's bytes or message, and return what it answers."""
+        """Give the firmware a packet's bytes or message, and return what it answers, at `device_s` of its own clock.
+
+        NO_ANSWER, and one more in `undecodable`, for what is no message.
+        """
         if packet.function == BYTES and isinstance(self.firmware, EmulatedFirmware):
             return self.firmware.hear(device_s, packet.payload, self._sensors())
         try:
@@ -279,7 +263,10 @@ class MessageDevice:
         return self.firmware.receive(device_s, message, self._sensors())
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
-        """Send what `answer` stands for into `outbox`: Identity, or State and Sense as they are at `time_s`."""
+        """Send what `answer` stands for into `outbox`: Identity, or State and Sense as they are at `time_s`.
+
+        The fault other_schema puts another schema's hash into the Identity.
+        """
         if answer is IDENTITY:
             known = self.firmware.identity()
             if "other_schema" in self._struck:
@@ -291,9 +278,13 @@ class MessageDevice:
         self._send(time_s, sense)
 
     def _send(self, time_s: float, message: Message) -> None:
-        """Put a message into `outbox`, unless a fault silences its kind; a fault may spoil the CRC of a State."""
+        """Put a message into `outbox` at `time_s`, unless a fault silences its kind; a fault may spoil the CRC of a
+        State.
+
+        Raises EncodeError for a value that the wire cannot say.
+        """
         function, payload = FUNCTION[type(message)], encode(message)
-        if self._silent and self._silent >> function & 1:
+        if SILENCES.get(function) in self._struck:
             return
         if "state_crc" in self._struck and isinstance(message, State):
             payload = payload[:-1] + bytes((payload[-1] ^ 0xFF,))
@@ -303,7 +294,7 @@ class MessageDevice:
         """Return what the electronics measure now, faults included.
 
         The carriages' encoders count from the firmware's last boot, the handle's from power-on. End switches follow the
-        carriages' true places. Force is the sensor's reading, the temperature the element's.
+        carriages' true places. Force is the sensor's reading, N, the temperature the element's, Celsius.
         """
         plant, struck = self.plant, self._struck
         left_m, right_m = plant.left.position_m, plant.right.position_m
@@ -323,7 +314,7 @@ class MessageDevice:
             right_counts - self._right_boot_counts,
             left_A,
             right_A,
-            plant.sensed_force_N,
+            plant.force_sensor.reading_N,
             self._handle_counts() if self._stuck_handle is None else self._stuck_handle,
             END_SWITCHES[switches],
             self._supply_V,
@@ -334,14 +325,14 @@ class MessageDevice:
         return math.floor(self.plant.handle_mm * self._handle_counts_per_mm)
 
     def _reset(self, time_s: float) -> None:
-        """Boot the firmware again: mode, zero, clock and pending answers are lost.
+        """Boot the firmware, again or for the first time: mode, zero, clock and pending answers are lost.
 
         The carriages' encoders count from here, the handle's goes on. Faults of the device, and messages on their way
         to it, stay.
         """
-        self.firmware = self._boot(self.parameters)
-        self._answers.clear()
-        self._answer_s = math.inf
+        self.firmware: Firmware | CompiledFirmware | EmulatedFirmware = self._boot(self.parameters)
+        self._answers: deque[tuple[float, Answer]] = deque()
+        """Answers that are due, with their times."""
         (left_rad, _), (right_rad, _) = self.plant.shafts
         self._left_boot_counts, self._right_boot_counts = self._encoders(left_rad, right_rad)
         self._boot_s = time_s
@@ -352,12 +343,9 @@ class MessageDevice:
         """Return left and right counts since power-on at these screw angles, faults of the encoders included."""
         stuck = self._stuck_left
         left_counts = math.floor(left_rad * self._counts_per_rad) if stuck is None else stuck
-        right_counts = math.floor(right_rad * self._counts_per_rad)
-        if not self._has_bad_encoders:
-            return left_counts, right_counts
         return (
             self._left_count_sign * left_counts + self._left_extra_counts,
-            right_counts + self._right_extra_counts,
+            math.floor(right_rad * self._counts_per_rad) + self._right_extra_counts,
         )
 
     def _count_on(self, stuck_left: int | None, left_count_sign: int) -> None:
@@ -367,7 +355,6 @@ class MessageDevice:
         """
         (left_rad, _), (right_rad, _) = self.plant.shafts
         left_counts, _ = self._encoders(left_rad, right_rad)
-        self._has_bad_encoders = True
         self._stuck_left, self._left_count_sign = stuck_left, left_count_sign
         self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
 
@@ -375,7 +362,8 @@ class MessageDevice:
         """End all faults that act on the device now, at the time of the last `advance`.
 
         What came of them stays: a firmware that was reset, counts that an encoder gained or missed, what was latched. A
-        hanging firmware hangs until its reset, and faults that are not due yet still come.
+        hanging firmware hangs until its reset, and faults that are not due yet still come. Without a fault nothing
+        changes.
         """
         plant, parameters, time_s = self.plant, self.parameters, self._time_s
         if "worn_gearbox" in self._struck:
@@ -384,11 +372,9 @@ class MessageDevice:
         for axis in (plant.left, plant.right):
             axis.backlash_m = 0.5e-6 * parameters.screw.backlash_um
         self._supply_V = parameters.electronics.supply_V
-        self._silent = 0
         self._struck.clear()
         self._stuck_handle = None
-        self._answering_every = 1
-        self._left_motor_sign = self._duty_sign = self._opening_share = 1.0
+        self._opening_share = 1.0
         if self._stuck_left is not None or self._left_count_sign < 0:
             self._count_on(None, 1)
         self._run_clock_at(time_s, 1.0 + parameters.firmware.clock_ppm * 1e-6)
@@ -397,8 +383,8 @@ class MessageDevice:
     def _strike(self, time_s: float, fault: Fault) -> None:
         """Begin `fault` at `time_s`: what it does is in `faults.KNOWN`, its size in percent, if it has one, in `fault`.
 
-        What acts on the bridges is put at the motors at once. Raises ValueError for a name whose effect is not defined
-        here.
+        What acts on the bridges is put at the motors at once. Sizes multiply with those of earlier faults, but for
+        `opening`. Raises ValueError for a name whose effect is not defined here.
         """
         if fault.name in STANDING:
             self._struck.add(fault.name)
@@ -419,7 +405,6 @@ class MessageDevice:
             case "frozen":
                 self._frozen_until_s = time_s + WATCHDOG_S
                 self._answers.clear()
-                self._answer_s = math.inf
             case "encoder_stuck_left":
                 (left_rad, _), (right_rad, _) = self.plant.shafts
                 self._stuck_left, _ = self._encoders(left_rad, right_rad)
@@ -427,13 +412,7 @@ class MessageDevice:
                 self._reset(time_s)
             case "supply_loss":
                 self._supply_V = 0.0
-            case "no_state" | "no_sense" | "no_status":
-                kinds: dict[str, type[Message]] = {"no_state": State, "no_sense": Sense, "no_status": Status}
-                self._silent |= 1 << FUNCTION[kinds[fault.name]]
-            case "answers_half":
-                self._answering_every = 2
             case "encoder_jump" | "encoder_jump_left":
-                self._has_bad_encoders = True
                 counts_rev = self.parameters.electronics.encoder_counts_per_rev
                 counts = round(JUMP_MM / self.parameters.screw.lead_mm * counts_rev)
                 self._left_extra_counts += counts
@@ -441,10 +420,6 @@ class MessageDevice:
                     self._right_extra_counts += counts
             case "encoder_reversed_left":
                 self._count_on(None, -self._left_count_sign)
-            case "motor_reversed_left":
-                self._left_motor_sign = -1.0
-            case "duties_reversed":
-                self._duty_sign = -1.0
             case "opening":
                 self._opening_share = 1.0 + fault.percent / 100.0
             case "clock":
@@ -455,7 +430,8 @@ class MessageDevice:
             self._drive_bridges()
 
     def _run_clock_at(self, time_s: float, rate: float) -> None:
-        """Let the firmware's clock run at `rate` device seconds a second, from its present time on."""
+        """Let the firmware's clock run at `rate` device seconds a second, from its present time on; its next tick moves
+        with it."""
         self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
         self._rate = rate
         self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
@@ -483,12 +459,13 @@ class SerialDevice(Protocol):
 class VirtualDevice:
     """The device behind a serial line: bytes in, bytes out, both paced to the baud rate.
 
-    receive(now_s, data)   the host hands bytes to its port; they arrive one by one from then on
-    transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
-    advance(now_s)         only lets time pass
+        receive(now_s, data)   the host hands bytes to its port; they arrive one by one from then on
+        transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
+        advance(now_s)         only lets time pass
 
-    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError. Damaged
-    frames are dropped, and counted in `statistics`; a firmware that reads frames itself gets them all.
+    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError, as does one
+    that is not finite. Damaged frames are dropped, and counted in `statistics`; a firmware that reads frames itself
+    gets them all.
     """
 
     def __init__(
@@ -521,7 +498,11 @@ class VirtualDevice:
         return self._decoder.statistics
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """Take the bytes `data` that the host writes at `now_s`; what exceeds the line's buffers is lost."""
+        """Let time pass until `now_s` and take the bytes `data` that the host writes then; they arrive one by one.
+
+        What would make more than MAX_BACKLOG_BYTES wait is lost, and not told. Raises ValueError for a time before the
+        last, or not finite.
+        """
         self.messages.advance(now_s)
         start_s = max(now_s, self._receiver_free_s)
         room = MAX_BACKLOG_BYTES - math.ceil((start_s - now_s) / self._byte_s)
@@ -537,7 +518,11 @@ class VirtualDevice:
         self._receiver_free_s = start_s + taken * self._byte_s
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`, and queue what the device sends on the line."""
+        """Let time pass until `now_s`, and queue what the device sends on the line, in frames with the next sequence
+        numbers.
+
+        Raises ValueError for a time before the last, or not finite.
+        """
         self.messages.advance(now_s)
         outbox = self.messages.outbox
         while outbox:
@@ -549,7 +534,11 @@ class VirtualDevice:
             self._line.append((start_s, frame))
 
     def transmit(self, now_s: float) -> bytes:
-        """Let time pass until `now_s` and return the bytes that have left the line since the last call."""
+        """Let time pass until `now_s` and return the bytes that have left the line since the last call; a frame may
+        come in parts.
+
+        Empty where none has. Raises ValueError for a time before the last, or not finite.
+        """
         self.advance(now_s)
         out: list[bytes] = []
         line, byte_s = self._line, self._byte_s
@@ -568,8 +557,7 @@ class VirtualDevice:
 
     @property
     def next_event_s(self) -> float:
-        """Return when something happens next, s from power-on: a frame ends on the line, or an event inside the
-        device."""
+        """When something happens next, s from power-on: a frame ends on the line, or an event inside the device."""
         event_s = self.messages.next_event_s
         if self._line:
             start_s, data = self._line[0]
@@ -584,7 +572,8 @@ def _is_drive(packet: Packet) -> bool:
 
 
 def _stretches(data: bytes) -> list[bytes]:
-    """Return `data` cut behind each delimiter: a frame has arrived when its delimiter has."""
+    """Return `data` cut behind each delimiter: a frame has arrived when its delimiter has. What follows the last stands
+    alone."""
     if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
         return [data]
     *ended, rest = data.split(DELIMITER)

@@ -60,8 +60,8 @@ class Ramp:
     def duty(self, position_mm: float, speed_mm_s: float, dt_s: float) -> float:
         """Advance the ramp by `dt_s` at the signed `speed_mm_s` and return the duty for the carriage at `position_mm`.
 
-        The duty is the share of the no-load speed, plus RAMP_GAIN_PER_MM times the ramp's lead, within DUTY_LIMIT. The
-        ramp stays within RAMP_LEAD_MM of the carriage.
+        Opening is positive. The duty is the share of the no-load speed, plus RAMP_GAIN_PER_MM times the ramp's lead,
+        within DUTY_LIMIT. The ramp stays within RAMP_LEAD_MM of the carriage.
         """
         reference_mm = self._reference_mm + speed_mm_s * dt_s
         self._reference_mm = min(max(reference_mm, position_mm - RAMP_LEAD_MM), position_mm + RAMP_LEAD_MM)
@@ -90,8 +90,9 @@ class CarriageOpening:
         """Advance by one tick, `dt_s` long and ending at `time_s`, and set `duty` and `outcome`.
 
         The carriage is driven towards its open switch at `speed_mm_s` at most. MOVING: it is not there, or has not yet
-        been braked there for SETTLE_S. DONE: it has been, with a duty of 0. FAILED, for good and with a duty of 0: it
-        has come no further for PATIENCE_S, at the current of a stall or at none.
+        been braked there for SETTLE_S. DONE: it has been, with a duty of 0; one that leaves its switch is driven again.
+        FAILED, for good and with a duty of 0: it has come no further for PATIENCE_S, at the current of a stall or at
+        none.
         """
         if self.outcome is Outcome.FAILED:
             return
@@ -152,7 +153,8 @@ class Retraction:
         return Outcome.FAILED in [opening.outcome for opening in self._openings]
 
     def is_late(self, time_s: float) -> bool:
-        """Return whether the motion has taken longer than the whole stroke takes a device that can open."""
+        """Return whether the motion has taken longer, at `time_s`, than the whole stroke takes a device that can
+        open."""
         return time_s > self._late_s
 
     def is_reversed(self, carriages: tuple[Carriage, Carriage]) -> bool:
@@ -164,7 +166,8 @@ class Retraction:
         `duties`.
 
         MOVING while a carriage is on its way, within TIME_LIMIT_S. After that, or when none is on its way: DONE where
-        both are braked at their open switches, else FAILED.
+        both are braked at their open switches, else FAILED. It may be called after that: `duties` are then what each
+        carriage needs.
         """
         for opening, carriage in zip(self._openings, carriages, strict=True):
             opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))
@@ -174,10 +177,10 @@ class Retraction:
         return Outcome.DONE if outcomes == [Outcome.DONE, Outcome.DONE] else Outcome.FAILED
 
     def _bounded_mm_s(self, carriage: Carriage) -> float:
-        """Return the speed, mm/s, at which this carriage is to open now.
+        """Return the speed, mm/s, at which this carriage is to open now; above 0.
 
-        With `tapered` it falls towards the open end. Beyond the open end the zero is wrong: the carriage then searches
-        its switch at a share of the speed.
+        With `tapered` it falls towards the open end, to CREEP_MM_S. Beyond the open end the zero is wrong: the carriage
+        then searches its switch at SEARCH_SHARE of the speed at most.
         """
         if not self._tapered:
             return self._speed_mm_s
@@ -206,7 +209,6 @@ class HomingMotion:
         self._lead_mm_rev = lead_mm_rev
         self._stall_A = stall_A
         self._speed_mm_s = speed_mm_s
-        self._begin_back_off(time_s, carriages)
         self._backed_off = False
         self._reversed_s: float | None = None
         self._edges_mm: list[float | None] = [None, None]
@@ -223,8 +225,8 @@ class HomingMotion:
         """Advance by one tick, `dt_s` long and ending at `time_s`; set `duties` and return the outcome.
 
         FAILED after the time limit, a failed search or a back-off that takes too long; `duties` may stay as they were.
-        REVERSED once a carriage that went back towards closed has been braked. DONE once both switches have been found
-        twice; else MOVING.
+        REVERSED once a carriage that went back towards closed has been braked for SETTLE_S. DONE once both switches
+        have been found twice, with `zeros_mm` set; else MOVING.
         """
         if time_s >= self._deadline_s:
             return Outcome.FAILED
@@ -248,7 +250,7 @@ class HomingMotion:
         return Outcome.MOVING
 
     def _begin_back_off(self, time_s: float, carriages: tuple[Carriage, Carriage]) -> None:
-        """Note where and when a back-off begins."""
+        """Note where and when a back-off begins; `_back_off` then drives it."""
         self._back_off_since_s = time_s
         self._starts_mm = [carriage.position_mm for carriage in carriages]
         self._ramps = [Ramp(carriage.position_mm, self._lead_mm_rev) for carriage in carriages]
@@ -276,7 +278,8 @@ class HomingMotion:
         return 0.0 if clear else ramp.duty(carriage.position_mm, -self._speed_mm_s, dt_s)
 
     def _outward(self, time_s: float, carriages: tuple[Carriage, Carriage], speed_mm_s: float) -> Retraction:
-        """Return a search for both open switches that begins at `time_s`, at `speed_mm_s` throughout."""
+        """Return a search for both open switches that begins at `time_s`, at `speed_mm_s` throughout. Nothing moves
+        yet."""
         return Retraction(
             time_s,
             carriages,

@@ -77,7 +77,8 @@ class Plant:
     `advance` takes any time step and keeps the remainder of a substep for the next call. A voltage that changes within
     a substep acts in it with its mean. A bridge opens at the nearer end of a substep, which moves a carriage at full
     speed by up to 25 um. Screws and currents can be read within a substep; all other state is that at its beginning. At
-    power-on both bridges are open. Raises HandError for a hand that feels at a pad, and what `Axis` and the element
+    power-on both bridges are open. `left` and `right` are the carriages, `element` what is between the magnets. `seed`
+    is of the force sensor's noise. Raises HandError for a hand that feels at a pad, and what `Axis` and the element
     raise.
     """
 
@@ -124,15 +125,11 @@ class Plant:
         return (self.left.position_m + self.right.position_m) * 1e3
 
     @property
-    def sensed_force_N(self) -> float:
-        """Reading of the force sensor now, N."""
-        return self.force_sensor.reading_N
-
-    @property
     def shafts(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return angle, rad, and current, A, of the left and the right screw now, which may be within a substep."""
+        """The left and the right screw now, which may be within a substep: of each angle, rad since power-on, and
+        current, A."""
         left, right, left_V, right_V = self.left, self.right, self._left_V, self._right_V
-        age_s = self._target_s - self._substeps * self._substep_s
+        age_s = self._target_s - self.time_s
         if age_s < _ROUNDING * self._substep_s:
             return (left.angle_rad, left.current_A), (right.angle_rad, right.current_A)
         early = self._substep_s / age_s
@@ -143,12 +140,13 @@ class Plant:
 
     @property
     def truth(self) -> Truth:
-        """Return the true state at `time_s`; force and handle are those of the last whole millisecond."""
+        """The true state at `time_s`, the last whole substep; force and handle are those of the last whole
+        millisecond."""
         left, right, element = self.left, self.right, self.element
         return Truth(
-            self._substeps * self._substep_s,
+            self.time_s,
             element.force_N,
-            (left.position_m + right.position_m) * 1e3,
+            self.gap_mm,
             left.position_m * 1e3,
             right.position_m * 1e3,
             left.current_A,
@@ -160,7 +158,7 @@ class Plant:
         )
 
     def drive(self, left_V: float | None, right_V: float | None) -> None:
-        """Put `left_V` and `right_V` at the motors from now on; None opens that motor's bridge.
+        """Put `left_V` and `right_V` at the motors from now on, positive to open; None opens that motor's bridge.
 
         They hold until the next call. The supply's voltage is no bound here.
         """
@@ -173,8 +171,8 @@ class Plant:
         """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each millisecond.
 
         What is left of a substep waits for the next call. `dt_s` is not below 0; this is not checked, and would turn
-        the plant's clock back. Raises what the element raises, and ValueError or OverflowError for a time that is not
-        finite.
+        the plant's clock back. Raises what the element and the hand raise, and ValueError or OverflowError for a time
+        that is not finite.
         """
         self._target_s = target_s = self._target_s + dt_s
         due = int(target_s / self._substep_s + _ROUNDING)
@@ -198,7 +196,8 @@ class Plant:
     def _advance_element(self, time_s: float) -> None:
         """Move the hand to `time_s`, then advance the element and the force sensor by their step.
 
-        Sets `handle_mm` and `handle_mm_s`. A hand that feels moves as the element's friction lets it.
+        Sets `handle_mm` and `handle_mm_s`. A hand that feels moves as the element's friction lets it; another as it is
+        prescribed.
         """
         hand, element, before_mm = self._hand, self.element, self.handle_mm
         if isinstance(element, PressedPad):
@@ -218,7 +217,8 @@ class Plant:
     def wear(self, divisor: float) -> None:
         """Divide the friction of both gearboxes and screws by `divisor`, each time it is called.
 
-        1 / `divisor` undoes it. Raises ZeroDivisionError for 0.
+        1 / `divisor` undoes it; one below 1 makes friction greater. Raises ZeroDivisionError for 0, which is the only
+        number refused.
         """
         for axis in (self.left, self.right):
             axis.gear_friction_Nm /= divisor
@@ -233,7 +233,8 @@ def _applied_V(axis: Axis, voltage_V: float | None) -> float:
 def _early_V(axis: Axis, share: float, before_V: float | None, voltage_V: float | None) -> float:
     """Return what the voltage before the change adds to the mean over the substep, of which `share` has passed, V.
 
-    A bridge opens (None) at the nearer end of the substep: no mean voltage takes the current away at once.
+    `before_V` held until now, `voltage_V` does from now on; None is an open bridge. A bridge opens at the nearer end of
+    the substep: no mean voltage takes the current away at once.
     """
     share = float(round(share)) if voltage_V is None else share
     return share * (_applied_V(axis, before_V) - _applied_V(axis, voltage_V))
@@ -269,7 +270,8 @@ class SimulatedSensor:
         """Bring the sensor to `time_s`, at which the rendered force is `force_N`: sample when due, show what has
         arrived.
 
-        A call makes one sample at most.
+        A call makes one sample at most, so call it once a millisecond; this is not checked. A sample beyond the
+        sensor's range is held at its end. Updates `reading_N`.
         """
         # half an element step of tolerance: a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
