@@ -57,20 +57,6 @@ class ForceCurve(Protocol):
         """Return the trust, 0..1, in a field whose predicted force misses the force asked by `error_N`."""
 
 
-def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> None:
-    """Raise `DomainError` naming the first feature that is NaN, infinite or beyond `LARGEST`."""
-    # written out because it stands before every prediction of the control loop
-    if (
-        -_LARGEST <= displacement_mm <= _LARGEST
-        and -_LARGEST <= rate_mm_s <= _LARGEST
-        and -_LARGEST <= field_mT <= _LARGEST
-        and -_LARGEST <= cip_percent <= _LARGEST
-    ):
-        return
-    for name, value in zip(FEATURES, (displacement_mm, rate_mm_s, field_mT, cip_percent), strict=True):
-        require_number(name, value)
-
-
 def within(value: float, ends: tuple[float, float]) -> float:
     """Return `value`, held within the two `ends`, the least first: so a model is asked only where it was trained.
 
@@ -91,10 +77,11 @@ class Known:
         self.span_N: Final = span_N
 
     def excess(self, place: int, value: float) -> float:
-        """Return how far feature number `place` of `FEATURES` lies outside its range, as a share of it; 0 inside, and
-        for NaN.
+        """Return how far feature number `place` of `FEATURES`, from 0, lies outside its range, as a share of it; 0
+        inside, and for NaN.
 
-        For a feature that never varied, as a share of its magnitude, of 1 unit at least.
+        For a feature that never varied, as a share of its magnitude, of 1 unit at least. Raises IndexError for another
+        place.
         """
         outside = max(self.lows[place] - value, value - self.highs[place])
         return outside / self.scales[place] if outside > 0.0 else 0.0
@@ -134,9 +121,19 @@ class Network:
         self.known: Final = known
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
-        """Return the force curve at a state of the handle. Raises `DomainError` naming a number that is not finite, or
-        beyond `LARGEST`."""
-        require_inputs(displacement_mm, rate_mm_s, 0.0, cip_percent)
+        """Return the force curve at a state of the handle, in mm, mm/s and percent of iron by volume.
+
+        A state outside the range of training is not refused: `confidence` tells. Raises `DomainError` naming a number
+        that is not finite, or beyond `LARGEST`.
+        """
+        # written out because it stands before every prediction of the control loop
+        if not (
+            -_LARGEST <= displacement_mm <= _LARGEST
+            and -_LARGEST <= rate_mm_s <= _LARGEST
+            and -_LARGEST <= cip_percent <= _LARGEST
+        ):
+            for name, value in zip(FEATURES, (displacement_mm, rate_mm_s, 0.0, cip_percent), strict=True):
+                require_number(name, value)
         shift = [
             bias + by_mm * displacement_mm + by_mm_s * rate_mm_s + by_percent * cip_percent
             for bias, by_mm, by_mm_s, by_percent in zip(self.bias, self.displacement, self.rate, self.cip)  # noqa: B905

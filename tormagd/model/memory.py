@@ -55,11 +55,8 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     @property
     def added(self) -> PronySeries:
         """The relaxation of the force that the field adds."""
-        return PronySeries(self._field_fractions, self.times_s)
-
-    @property
-    def _field_fractions(self) -> tuple[float, ...]:
-        return self.fractions if isinstance(self.field_fractions, msgspec.UnsetType) else self.field_fractions
+        own = self.field_fractions
+        return PronySeries(self.fractions if isinstance(own, msgspec.UnsetType) else own, self.times_s)
 
 
 NO_MEMORY = Memory()

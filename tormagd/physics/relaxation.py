@@ -11,7 +11,7 @@ import math
 from typing import Final, TypeAlias, final
 
 from firmware_protocol.value import Value
-from tormagd.physics.errors import DomainError, require
+from tormagd.physics.errors import DomainError, require, require_that
 
 PronyState: TypeAlias = tuple[float, ...]
 """The last driving force, N, then one branch force h_i, N, for each time constant."""
@@ -59,7 +59,7 @@ class PronyStep(Value):
         return force_N, tuple(following)
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
-        """Return the step, of equal length, of a series with equal times and other fractions.
+        """Return the step, of equal length, of a series with equal times and other fractions; this one stays.
 
         There are as many `fractions` as before, with a sum below 1: neither is checked here.
         """
@@ -74,14 +74,13 @@ class PronySeries(Value):
     """
 
     def __init__(self, fractions: tuple[float, ...], times_s: tuple[float, ...]) -> None:
-        if len(fractions) != len(times_s):
-            raise DomainError("times_s", times_s, f"one time for each of the {len(fractions)} fractions")
+        paired = f"one time for each of the {len(fractions)} fractions"
+        require_that(len(fractions) == len(times_s), "times_s", times_s, paired)
         for fraction in fractions:
             require("fractions", fraction, 0.0, 1.0)
         for time_s in times_s:
             require("times_s", time_s, 1e-6, 1e9)
-        if not sum(fractions) < 1.0:
-            raise DomainError("fractions", fractions, "a sum below 1")
+        require_that(sum(fractions) < 1.0, "fractions", fractions, "a sum below 1")
         self.fractions: Final = fractions
         self.times_s: Final = times_s
 
@@ -97,7 +96,7 @@ class PronySeries(Value):
     def discretise(self, dt_s: float) -> PronyStep:
         """Return the update for steps of `dt_s`; 0 is a jump of the driving force. Keep it where the step is constant.
 
-        Raises `DomainError` unless 0 <= dt_s <= MAX_STEP_S.
+        Raises `DomainError` unless 0 <= dt_s <= MAX_STEP_S, and so for NaN.
         """
         if not 0.0 <= dt_s <= MAX_STEP_S:  # spares every plan the call of `require`
             require("dt_s", dt_s, 0.0, MAX_STEP_S)
