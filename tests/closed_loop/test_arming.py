@@ -53,37 +53,29 @@ def fastest_N_s(samples: list[Sample]) -> float:
     return max(abs(after - before) / OVER_S for before, after in zip(forces_N, forces_N[over:], strict=False))
 
 
-def held(loop: ClosedLoop) -> None:
-    ticks(loop, 1.5, 1.1)
-    loop.command("pause")
-    ticks(loop, 0.2)
-
-
-def stopped(loop: ClosedLoop) -> None:
-    ticks(loop, 1.0)
-    loop.command("stop")
-    ticks(loop, 0.1)  # the gap still opens
-
-
-def disabled(loop: ClosedLoop) -> None:
-    loop.command("disable")
-    ticks(loop, 0.5)
-
-
-STATES: dict[str, tuple[Callable[[ClosedLoop], object], tuple[str, ...]]] = {
-    "paused": (held, ("resume",)),
-    "stopped": (stopped, ("clear-fault", "enable")),
-    "disabled": (disabled, ("enable",)),
-    "enabled": (lambda loop: None, ()),
-}
-
-
-@pytest.mark.parametrize("name", STATES)
+@pytest.mark.parametrize(
+    ("before_s", "before_N", "command", "after_s", "given"),
+    [
+        pytest.param(1.5, 1.1, "pause", 0.2, ("resume",), id="paused"),
+        # the gap still opens
+        pytest.param(1.0, ASKED_N, "stop", 0.1, ("clear-fault", "enable"), id="stopped"),
+        pytest.param(0.0, ASKED_N, "disable", 0.5, ("enable",), id="disabled"),
+        pytest.param(0.0, ASKED_N, None, 0.0, (), id="enabled"),
+    ],
+)
 def test_from_each_state_the_force_goes_to_a_live_setpoint_along_the_ramp(
-    armed: ClosedLoop, core: Core, name: str
+    armed: ClosedLoop,
+    core: Core,
+    before_s: float,
+    before_N: float,
+    command: str | None,
+    after_s: float,
+    given: tuple[str, ...],
 ) -> None:
-    before, given = STATES[name]
-    before(armed)
+    ticks(armed, before_s, before_N)
+    if command:
+        armed.command(command)
+    ticks(armed, after_s)
     arming, samples = arm_beside(armed)
     assert (arming.given, arming.refusal) == (given, None)
     release_N_s = core.scene.force.release_N_s

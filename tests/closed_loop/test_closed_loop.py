@@ -4,7 +4,7 @@ All data here are synthetic: the device is the simulator's, the pulse is a formu
 
 import math
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -34,15 +34,10 @@ def pulse_N(time_s: float) -> float:
     return 1.4 + 0.15 * (1.0 - math.cos(phase + 0.4 * math.sin(phase)))
 
 
-def published(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int) -> Iterable[Sample]:
-    """The ticks while a publisher sends this force, one by one."""
-    times = np.arange(round(duration_s * rate_hz)) / rate_hz
-    return loop.run(duration_s, stream(times + loop.now_s, np.array([force_N(time) for time in times])))
-
-
 def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
-    """All of them."""
-    return list(published(loop, force_N, duration_s, rate_hz))
+    """The ticks while a publisher sends this force."""
+    times = np.arange(round(duration_s * rate_hz)) / rate_hz
+    return list(loop.run(duration_s, stream(times + loop.now_s, np.array([force_N(time) for time in times]))))
 
 
 def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: float) -> float:

@@ -39,12 +39,9 @@ def closed(core: Core) -> Opens:
     def build(bus: str, plant: str | PlantParameters = "sample_1", gap_mm: float = HALF_MM, faults=()) -> ClosedLoop:
         parameters = load_plant(plant) if isinstance(plant, str) else plant
         struck = [parse_fault(fault) for fault in faults]
-        config, stepper = Config(), core.stepper()
-        if bus == "can":
-            device = CanDevice(MessageDevice(parameters, SteadyHand(0.0), struck, 1))
-            loop = ClosedLoop(config, stepper, None, VirtualBus(device))
-        else:
-            loop = ClosedLoop(config, stepper, None, VirtualDevice(parameters, SteadyHand(0.0), struck, 1))
+        made = parameters, SteadyHand(0.0), struck, 1
+        device = VirtualBus(CanDevice(MessageDevice(*made))) if bus == "can" else VirtualDevice(*made)
+        loop = ClosedLoop(Config(), core.stepper(), None, device)
         loop.arm(gap_plan(OPEN_MM))
         held(loop, gap_mm, 0.6 + (OPEN_MM - gap_mm) / MM_S)
         assert loop.stepper.safety.faults == ()

@@ -473,14 +473,6 @@ def test_a_grid_of_fields_has_the_forces_of_its_fields(
     assert forces == pytest.approx(one_by_one, rel=0, abs=accuracy * curve.magnitude_N)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
-@pytest.mark.parametrize("place", ["displacement_mm", "rate_mm_s", "cip_percent"])
-def test_a_state_that_is_no_number_is_refused_by_name(model: ForceModel, value: float, place: str) -> None:
-    state = {"displacement_mm": 0.3, "rate_mm_s": 12.0, "cip_percent": 40.0}
-    with pytest.raises(DomainError, match=place):
-        model.curve(*(state | {place: value}).values())
-
-
 @pytest.mark.parametrize("exponent", [LARGEST_EXPONENT, 709.7, 710.0, 1e4, 1e18])
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_unit_far_from_its_step_is_shut_or_open(exponent: float, side: int) -> None:

@@ -24,42 +24,32 @@ speeds = st.floats(-200.0, 200.0)
 levels = st.floats(0.0, 10.0)
 
 
+REACH_MM = FRICTION.level_N(30.0, 2.0) / 8.0
+
+
 @pytest.mark.parametrize(
-    ("speed_mm_s", "force_N", "rel"),
+    ("start_mm", "speed_mm_s", "kinetic_N", "dt_s", "end_mm", "rel"),
     [
-        (42.0, 2.0 + 0.0005 * 42.0, 1e-6),
-        (-42.0, -2.0 - 0.0005 * 42.0, 1e-6),
-        (1e-2, 2.0 * 1.15, 1e-4),
-        (5.0, 2.0 * (1.0 + 0.15 / math.e) + 0.0025, 1e-6),
+        pytest.param(0.0, 42.0, 2.0, 1e3, 0.25, 1e-6, id="steady sliding: the kinetic level"),
+        pytest.param(0.0, -42.0, 2.0, 1e3, -0.25, 1e-6, id="and the other way"),
+        pytest.param(0.0, 1e-2, 2.0, 1e3, 0.25 * 1.15, 1e-4, id="break-away: the static level"),
+        pytest.param(0.0, 5.0, 2.0, 1e3, 0.25 * (1.0 + 0.15 / math.e), 1e-6, id="at Stribeck's speed"),
+        pytest.param(0.0, 0.1, 2.0, 1e-2, 1e-3, 3e-3, id="the first micrometres: a spring"),
+        # from -z_ss, dz/dt = v - sigma0 |v| z / g has z = z_ss (1 - 2 exp(-x / z_ss)) after a travel x
+        pytest.param(
+            *(-REACH_MM, 30.0, 2.0, 0.01, REACH_MM * (1.0 - 2.0 * math.exp(-0.3 / REACH_MM)), 1e-12), id="a reversal"
+        ),
+        pytest.param(0.1, 0.0, 2.0, 1e3, 0.1, 1e-15, id="at rest: held"),
+        pytest.param(0.25, 0.0, 0.5, 0.0, 0.5 * 1.15 / 8.0, 1e-6, id="a falling level: it slips"),
+        pytest.param(0.25, 42.0, 0.0, 1e-3, 0.0, 1e-6, id="no level: viscous alone"),
     ],
 )
-def test_steady_sliding_gives_kinetic_plus_viscous_force_and_break_away_the_static_level(
-    speed_mm_s: float, force_N: float, rel: float
+def test_the_bristles_deflect_as_the_closed_forms_and_force_follows(
+    start_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float, end_mm: float, rel: float
 ) -> None:
-    assert FRICTION.advance(0.0, speed_mm_s, 2.0, 1e3)[0] == pytest.approx(force_N, rel=rel)
-
-
-def test_the_first_micrometres_are_a_spring() -> None:
-    force, deflection = FRICTION.advance(0.0, 0.1, 2.0, 1e-2)
-    assert deflection == pytest.approx(1e-3, rel=3e-3)
-    assert force == pytest.approx(8.0 * deflection + 0.0005 * 0.1, rel=1e-12)
-
-
-def test_the_exact_solution_between_reversals() -> None:
-    """From -z_ss, dz/dt = v - sigma0 |v| z / g has z = z_ss (1 - 2 exp(-x / z_ss)) after a travel x."""
-    reach = FRICTION.level_N(30.0, 2.0) / 8.0
-    _, deflection = FRICTION.advance(-reach, 30.0, 2.0, 0.01)
-    assert deflection == pytest.approx(reach * (1.0 - 2.0 * math.exp(-0.3 / reach)), rel=1e-12)
-
-
-def test_at_rest_the_force_is_held() -> None:
-    assert FRICTION.advance(0.1, 0.0, 2.0, 1e3) == pytest.approx((0.8, 0.1), rel=1e-15)
-
-
-def test_a_falling_level_lets_the_bristle_slip() -> None:
-    _, deflection = FRICTION.advance(0.25, 0.0, 0.5, 0.0)
-    assert 8.0 * deflection == pytest.approx(0.5 * 1.15)
-    assert FRICTION.advance(0.25, 42.0, 0.0, 1e-3) == pytest.approx((0.021, 0.0))
+    force_N, deflection_mm = FRICTION.advance(start_mm, speed_mm_s, kinetic_N, dt_s)
+    assert deflection_mm == pytest.approx(end_mm, rel=rel)
+    assert force_N == pytest.approx(8.0 * deflection_mm + 0.0005 * speed_mm_s, rel=1e-12)
 
 
 @given(frictions, st.floats(-1.0, 1.0), speeds, st.floats(0.01, 10.0), st.floats(1e-6, 0.1), st.floats(0.0, 1.0))
