@@ -91,7 +91,7 @@ class Core(NamedTuple):
     def planner(self, now_s: float = 0.0) -> Planner:
         """Return a new planner that begins at `now_s`, with the gap open and nothing known of the device.
 
-        Planners of one core share nothing that changes.
+        Planners of one core share nothing that changes. Plan no earlier than `now_s`.
         """
         return Planner(self.config, self.scene, self.element, now_s)
 
@@ -183,7 +183,7 @@ def platform_name() -> str:
 
 
 def _brake(scene: Scene) -> tuple[ElementContact, FieldOfGap, float]:
-    """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent.
+    """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent by volume.
 
     Raises DomainError for an unknown insert, and as `Insert.elastomer` and `FieldOfGap`.
     """
@@ -193,7 +193,7 @@ def _brake(scene: Scene) -> tuple[ElementContact, FieldOfGap, float]:
 
 
 def _pad(finger: Finger, model: ForceModel) -> tuple[ElementContact, FieldOfGap, float]:
-    """Return a tactile pad's contact, the mean field in the pad over the gap, and its share of iron, percent.
+    """Return a tactile pad's contact, the mean field in the pad over the gap, and its share of iron, percent by volume.
 
     The share of iron is the least that the model was trained on; the scene's insert is not looked at.
     """
@@ -202,7 +202,7 @@ def _pad(finger: Finger, model: ForceModel) -> tuple[ElementContact, FieldOfGap,
 
 
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
-    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`.
+    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`, its force over the gap.
 
     `Aim` holds the fields that the search finds near this law. Raises DomainError where the law does not hold for the
     gaps, and for an unknown insert. Do not call it for a pad: the thesis prints no law for one, and nothing is refused
@@ -221,7 +221,8 @@ def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
 def _known_fields_mT(
     scene: Scene, model: ForceModel, contact: ElementContact, field: FieldOfGap
 ) -> tuple[tuple[float, float], bool]:
-    """Return the range of fields, mT, that the scene's gaps give and the model knows, and whether its force rises.
+    """Return the fields, least and greatest, mT, that the scene's gaps give and the model knows, and whether its force
+    rises.
 
     False: it may fall somewhere when a pad is pressed to another depth than the portrait's. Raises DomainError where no
     such range is left, and where the force falls at the portrait's depth or displacement.
@@ -262,7 +263,10 @@ def _stable_margins(config: Config) -> Margins:
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
-    """Raise ConfigError where half of the allowed voltage cannot open the scene's closed gap against the magnets."""
+    """Raise ConfigError where the voltage cannot open the scene's closed gap against friction and the magnets.
+
+    Only half of the supply's voltage at the duty limit counts.
+    """
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
     needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
     max_V = config.position.duty_limit * motor.supply_V / 2.0
@@ -274,7 +278,7 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
 
 
 def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
-    """Return what the gaps do not reach of the scene's greatest and standby forces, with what is allowed.
+    """Return what the gaps do not reach of the scene's greatest and standby forces, a line each with what is allowed.
 
     Empty where they reach both. Standby has to be above the open gap's force, by STANDBY_N at most, and not above the
     scene's greatest force. A scene may leave it out. The scene's least force may be any.
@@ -298,8 +302,8 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
 def at_rates_of(scene: Scene, config: Config) -> Config:
     """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`.
 
-    The control rate is MIN_CONTROL_HZ at least. Whether control is stable at these rates is `build_core`'s to tell.
-    Raises ConfigError for rates that a configuration may not have.
+    The control rate is MIN_CONTROL_HZ at least, the other rates stay. Whether control is stable at these rates is
+    `build_core`'s to tell. Raises ConfigError for rates that a configuration may not have.
     """
     if not config.rates.of_scene:
         return config
@@ -313,7 +317,8 @@ def at_rates_of(scene: Scene, config: Config) -> Config:
 
 
 def _slowed(config: Config, scene: Scene) -> Config:
-    """Return the configuration with the scene's gap speed; `config` itself unless the scene's is lower."""
+    """Return the configuration with the scene's gap speed; `config` itself where the scene states none, or no lower
+    one."""
     position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
     if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
         return config
@@ -325,7 +330,7 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
 
     The first is the force at which the scene lets the brake wait. The others are a third, two thirds and all of
     STANDBY_N above the open gap's force. The middle is that of the first and the scene's greatest; from above it the
-    time is negative. Empty for a pad.
+    time is negative. The gap moves at its greatest speed all the way. Empty for a pad.
     """
     if core.scene.element == "tactile":
         return []
@@ -345,8 +350,10 @@ def least_resolution_N(reach: Portrait, most_N: float) -> float:
 
 
 def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
-    """Return that the scene's resolution is finer than the device makes and measures, and what is allowed; else
-    nothing."""
+    """Return that the scene's resolution is finer than the device makes and measures, and what is allowed, as one line.
+
+    Empty where it is not. Raises DomainError as `least_resolution_N`.
+    """
     least_N = least_resolution_N(reach, scene.force.most_N)
     if scene.force.resolution_N >= least_N:
         return []
@@ -377,7 +384,7 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
     """Return what ideal carriages at the gap's speed miss of the scene's signal; None where the scene states no signal.
 
     The first LOOKED_AT_S of the signal count, within what scene and device give. Its file is read from the folder
-    `beside`. Raises ConfigError for a file that is refused.
+    `beside`. Raises ConfigError for a file that is refused or cannot be read.
     """
     if scene.signal is None:
         return None
@@ -391,7 +398,10 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
 
 def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
     """Return that ideal carriages miss the scene's signal by more than its tolerance, with the tolerance that they
-    keep; else nothing."""
+    keep.
+
+    One line; empty where they do not, and for a scene without a signal (`miss` None).
+    """
     if miss is None or miss.rms_N <= scene.force.tolerance_rms_N:
         return []
     worst = ", ".join(
@@ -408,9 +418,9 @@ def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
 def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
     """Return that an opening gap could release the force faster than the scene allows, with what it has to allow.
 
-    Three things are taken at their worst: the weakest believable device, the greatest force that the ceiling lets it
-    make, and the speed. The speed is that of the device's own opening or the gap's, whichever is greater. Nothing is
-    returned where it could not.
+    One line; empty where it could not. Three things are taken at their worst: the weakest believable device, the
+    greatest force that the ceiling lets it make, and the speed. The speed is that of the device's own opening or the
+    gap's, whichever is greater.
     """
     # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
     # ceiling lets no gap make more than CEILING times the scene's greatest
@@ -435,8 +445,8 @@ def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
     Raises DomainError for an unknown name, and for settings that the search does not have. Whether the search fits the
     model is `inverse.choice.build`'s to tell.
 
-    Where the scene leaves the choice, it is the portrait if the handle's rate is no term. With the rate it is Newton's
-    method where the force `rises` with the field, else the k-nearest search.
+    Where the scene leaves the choice ("auto"), it is the portrait if the handle's rate is no term. With the rate it is
+    Newton's method where the force `rises` with the field, else the k-nearest search.
     """
     wanted = scene.solver
     if wanted.name == AUTO:

@@ -42,11 +42,12 @@ def conditions(
     *,
     sensor_doubted: bool,
 ) -> Conditions:
-    """Return the conditions at `now_s` on which operators' commands are taken.
+    """Return the conditions at `now_s`, on the host's clock, on which operators' commands are taken.
 
     `output` is the newest step's, None before the first. `sensor_doubted` tells whether the plans doubt the force
-    sensor. `cause` is a stream that stopped, else the connection's own. Skew and the greatest values that a command may
-    find are not among them: `Watch.command_conditions` adds these. Nothing changes, and nothing is waited for.
+    sensor. `cause` is a stream that stopped, else the connection's own. Without a measurement `connected` and all that
+    needs one are False, round trip and drift 0. Skew and the greatest values that a command may find are not among
+    them: `Watch.command_conditions` adds these. Nothing changes, and nothing is waited for.
     """
     measurement = connection.measurement
     old = "" if measurement is None else _late_stream(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)

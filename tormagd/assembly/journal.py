@@ -148,7 +148,8 @@ class Journal:
         self._add((MISSING,))
 
     def take(self) -> list[Entry]:
-        """Return the entries since the last `take`, and remove them from the journal; empty where none came.
+        """Return the entries since the last `take`, the oldest first, and remove them from the journal; empty where
+        none came.
 
         MISSING among them says that entries before it were lost. What follows can be rerun only from the next snapshot.
         """

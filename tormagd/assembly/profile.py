@@ -56,11 +56,12 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     gains: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")] = ""
 
     def learned(self, now_ns: int, gains: str = "") -> Learned:
-        """Return what is still known of the device at CLOCK_REALTIME `now_ns`, driven with these `gains`.
+        """Return what is still known of the device at CLOCK_REALTIME `now_ns`, driven with these `gains`, as of
+        `gains_of`.
 
         Scale and offset become as uncertain as a day makes them, even a second after; without covariance. A sensor's
         zero saved ZERO_LASTS_S or more from `now_ns`, before or after, is 0. The factor at a creep stays, and with the
-        same `gains` the carriages' lag; else it is 0.
+        same `gains` the carriages' lag; else it is 0. The profile stays.
         """
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
@@ -80,8 +81,9 @@ def profile_of(
 ) -> Profile:
     """Return the profile that keeps `learned` of the device `serial_number` with the insert `insert`.
 
-    `model` and `gains` are fingerprints, SHA-256 in hexadecimal. `saved_ns` is the time of saving, CLOCK_REALTIME. A
-    scale less certain than an unseen device's is kept as certain as that. Nothing is checked, and no file is written.
+    `model` and `gains` are fingerprints, SHA-256 in hexadecimal; empty `gains` stand for none. `saved_ns` is the time
+    of saving, CLOCK_REALTIME. A scale less certain than an unseen device's is kept as certain as that. Nothing is
+    checked, and no file is written.
     """
     return Profile(
         v=VERSION,
@@ -101,11 +103,12 @@ def profile_of(
 
 
 def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: DeviceBounds) -> Profile:
-    """Return the profile in `data`, the bytes of a profile's file.
+    """Return the profile in `data`, the bytes of a profile's file; no file is read here.
 
     `serial_number`, `insert` and `model` are those in use; `model` is the model's fingerprint, SHA-256 in hexadecimal.
     Raises ProfileError for data over MAX_BYTES, for data that are no profile, and for a profile of another device,
-    insert or model. Values beyond the `bounds` of a device raise ProfileError, too.
+    insert or model. Values beyond the `bounds` of a device raise ProfileError, too. Its age and `gains` are not looked
+    at.
     """
     if len(data) > MAX_BYTES:
         raise ProfileError(f"{len(data)} bytes: allowed is {MAX_BYTES}")

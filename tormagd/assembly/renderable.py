@@ -34,7 +34,7 @@ def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_spe
     They begin at the first force, and change it by at most what their top speed `gap_speed_mm_s` gives at the force
     where they are. `shown` gives the force over the gap; hold the forces within its own, as none out of reach is
     noticed. The mean is over the n - 1 steps. Raises DomainError for NaN. One force, or equal times, raise
-    ZeroDivisionError.
+    ZeroDivisionError, no force ValueError; fewer times raise IndexError.
     """
     tenth_N = max(max(forces_N) - min(forces_N), 1e-9) / 10.0
     furthest: dict[int, Point] = {}

@@ -38,10 +38,9 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     output_gain: float
 
     def scaled(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map `features` (n x 4) to the network's scale (n x 4): -1..1 within the ranges of training, beyond it
-        outside.
+        """Return `features` (n x 4) on the network's scale (n x 4): from -1 to 1 within the ranges of training.
 
-        Nothing is clamped or checked.
+        Outside these it goes on beyond. A feature that never varied becomes 0. Nothing is checked.
         """
         scaled: NDArray[np.float64] = (features - np.array(self.input_offset)) * np.array(self.input_gain)
         return scaled
@@ -55,9 +54,9 @@ def require_number(name: str, value: float) -> None:
 
 
 def require_features(features: NDArray[np.float64]) -> None:
-    """Raise `DomainError` unless `features` is n x 4, finite and within +-`LARGEST`; it names row and feature.
+    """Raise `DomainError` unless `features` is n x 4, finite and within +-`LARGEST`; it names row, from 0, and feature.
 
-    No rows at all (0 x 4) pass.
+    No rows at all (0 x 4) pass. The array has to be of numbers: others raise TypeError.
     """
     if features.ndim != 2 or features.shape[1] != len(FEATURES):
         raise DomainError(

@@ -194,10 +194,11 @@ class ForceModel:
         return _checksum(_header(self.metadata), _tensors(self))
 
     def of(self, insert: str) -> "ForceModel":
-        """Return the model of one of its several inserts: ranges of that insert alone, the field's lag to their scale.
+        """Return the model of one of its several inserts: the ranges are that insert's alone; the weights are the same.
 
-        Scaled by the insert's greatest field over that of all inserts. Returns this model itself where it holds no
-        ranges for `insert`. Raises DomainError where the scaled lag makes no `Memory`.
+        The field's lag and turn in `memory` are scaled by the insert's greatest field over that of all inserts. Returns
+        this model itself where it holds no ranges for `insert`. Raises DomainError where the scaled lag makes no
+        `Memory`.
         """
         whole, memory = self.metadata, self.metadata.memory
         ranges = (whole.boxes or {}).get(insert)
@@ -209,7 +210,7 @@ class ForceModel:
         return replace(self, metadata=own)
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
-        """Return the force over the field at one state of the handle.
+        """Return the force over the field at one state of the handle, as `Network.curve`.
 
         Raises `DomainError` naming an input that is not finite, or beyond `LARGEST`.
         """
@@ -218,8 +219,9 @@ class ForceModel:
     def predict(self, features: ArrayLike) -> Array:
         """Return the force, N (n), at `features` (n x 4, order of `FEATURES`); a single point is 1 x 4.
 
-        No rows give no forces. Raises `DomainError` for another shape, and for a number that is not finite, or beyond
-        `LARGEST`. Raises ValueError or TypeError for what is no array of numbers.
+        No rows give no forces. Nothing is clamped: outside the ranges of training it extrapolates. Raises `DomainError`
+        for another shape, and for a number that is not finite, or beyond `LARGEST`. Raises ValueError or TypeError for
+        what is no array of numbers.
         """
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
@@ -239,7 +241,7 @@ class ForceModel:
     def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
         """Return the slope of the force over the field, dF/dB, N/mT (n), at `features` (n x 4, order of `FEATURES`).
 
-        Raises `DomainError` like `predict`.
+        Raises as `predict`.
         """
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
@@ -252,7 +254,8 @@ class ForceModel:
 def save_model(path: Path | str, model: ForceModel) -> None:
     """Write `model` to `path`; equal models give equal bytes. Readers see the old file or the whole new one.
 
-    Raises OSError, also where the folder is missing or `path` is one; an earlier file is then as it was.
+    An earlier file is replaced. Raises OSError, also where the folder is missing or `path` is one; an earlier file is
+    then as it was.
     """
     tensors = _tensors(model)
     header = _header(model.metadata)
@@ -266,8 +269,9 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
 
     Of a model of several inserts, return that of `insert`; with None the whole.
 
-    Raises `ModelFileError` when the file cannot be read, is truncated or altered, or belongs to another element or
-    insert. Raises it, too, for anything but a finite 4-h-1 network in the features and units of this program.
+    Raises `ModelFileError`, with the path, when the file cannot be read, is truncated or altered, or belongs to another
+    element or insert. Raises it, too, for anything but a finite 4-h-1 network in the features and units of this
+    program.
     """
     source = Path(path)
     try:
@@ -324,7 +328,7 @@ def _tensor(name: str, content: dict[str, Any]) -> Array:
 
 
 def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return `value` as a read-only float64 copy.
+    """Return `value` as a read-only float64 copy of `shape`; `name` is what an error calls it.
 
     Raises `DomainError` for numbers that are not floating-point, not finite or beyond `LARGEST`, and for another shape.
     """
@@ -340,7 +344,7 @@ def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _tensors(model: ForceModel) -> dict[str, Array]:
-    """Return the weights of a model as its file's tensors, by their names."""
+    """Return the weights of a model as its file's tensors, by their names; `output_bias` is an array of one."""
     return {
         "hidden_weight": model.hidden_weight,
         "hidden_bias": model.hidden_bias,
@@ -356,7 +360,10 @@ def _header(metadata: ModelMetadata) -> dict[str, str]:
 
 
 def _checksum(header: dict[str, str], tensors: dict[str, Array]) -> str:
-    """Return the SHA-256 of header and tensors, as hexadecimal digits; their order does not matter."""
+    """Return the SHA-256 of header and tensors, as hexadecimal digits; their order does not matter.
+
+    The header is without its own field `checksum`, else another sum comes out.
+    """
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]

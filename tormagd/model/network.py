@@ -67,9 +67,9 @@ class ForceNetwork(nn.Module):
 
 
 def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
-    """Copy the weights of `network` into a model, to be saved and used.
+    """Copy the weights of `network` into a model, to be saved and used; its scaling has to be that of `metadata`.
 
-    Raises `DomainError` when `metadata` does not fit them, or a weight is not finite.
+    That is not checked. Raises `DomainError` when `metadata` does not fit the weights, or a weight is not finite.
     """
     return ForceModel(
         metadata=metadata,

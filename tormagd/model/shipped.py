@@ -11,10 +11,11 @@ _FOLDER, _ENDING = resources.files(__package__) / "models", ".safetensors"
 
 
 def model_path(name_or_path: str, beside: Path, insert: str = "") -> Path:
-    """Return the path of a model file: a shipped one by its name, else a path relative to `beside`.
+    """Return the path of a model file: a shipped one by its name, else a path relative to `beside`; a shipped name goes
+    first.
 
-    AUTO stands for the shipped model of `insert`, or of all inserts of its matrix. Raises ConfigError, naming the
-    shipped models, where there is no such file.
+    AUTO stands for the shipped model of `insert`, or of all inserts of its matrix. The file is not opened. Raises
+    ConfigError, naming the shipped models, where there is no such file.
     """
     if name_or_path == AUTO:
         own = f"torque_{insert.lower().replace('-', '_')}"

@@ -47,9 +47,10 @@ _SCALAR = SimpleNamespace(
 
 
 def functions(value: Any) -> SimpleNamespace | ModuleType:
-    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for an array.
+    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for anything else.
 
-    For a float there are those of `_SCALAR` only. They raise ValueError where numpy's give NaN or infinity.
+    Both have `sqrt`, `log`, `log1p`, `expm1`, `where` and `all`; for a float there are only these. For a float they
+    raise ValueError where numpy's give NaN or infinity.
     """
     return _SCALAR if isinstance(value, float | int) else np
 
@@ -73,7 +74,8 @@ class BrakeCurve(NamedTuple):
         """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq. 29).
 
         It may be over MAX_COMPRESSION, and over 1, where the model does not hold: keep the load within `load` of
-        MAX_COMPRESSION.
+        MAX_COMPRESSION. A load under 0 or of NaN is not refused, and its result means nothing; a float may raise
+        ValueError.
         """
         fn = functions(load)
         p = 1.0 - self.a * load

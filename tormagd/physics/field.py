@@ -45,8 +45,10 @@ class ThesisFieldLaw:
         return _TM_PER_MT_MM * (_EQ7_C1 * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P) + _EQ7_C2)
 
     def gap_mm(self, radial_moment_Tm: Real) -> Real:
-        """Return the gap that gives a radial moment, mm. Raises `DomainError` for a moment that no gap of 45..95 mm
-        gives."""
+        """Return the gap that gives a radial moment, mm: the inverse of `radial_moment_Tm`.
+
+        Raises `DomainError` for a moment, T m, that no gap of 45..95 mm gives, and for NaN.
+        """
         _require_moment(radial_moment_Tm, self)
         # abs(): the weakest moment itself, times 1e6, may round to just under c2
         excess = abs(radial_moment_Tm / _TM_PER_MT_MM - _EQ7_C2)
@@ -55,7 +57,7 @@ class ThesisFieldLaw:
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
         """Return the slope of the radial moment at a gap, T m / mm, negative, and 0 at 95 mm.
 
-        Raises `DomainError` for a gap outside 45..95 mm.
+        Raises `DomainError` for a gap outside 45..95 mm, and for NaN.
         """
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return -_TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 1.0)
@@ -92,7 +94,7 @@ class PowerFieldLaw:
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
         """Return the slope of the radial moment at a gap, T m / mm, negative.
 
-        Raises `DomainError` for a gap outside 1 mm to 10 m.
+        Raises `DomainError` for a gap outside 1 mm to 10 m, and for NaN.
         """
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * self.exponent * _power(gap_mm, self.exponent - 1.0)
@@ -110,7 +112,7 @@ def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_
     """Return the radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq. 6 with Eq. 8's permeability).
 
     `radial_moment_Tm` is a float or an array, whose shape and type the result keeps. Raises `DomainError` unless 0 <= a
-    <= 1e6 T m, 1 <= mu_r <= 1000 and 10 um <= R <= 1 m.
+    <= 1e6 T m, 1 <= mu_r <= 1000 and 10 um <= R <= 1 m; NaN never is.
     """
     require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e6)
     require("relative_permeability", relative_permeability, 1.0, 1e3)
@@ -119,8 +121,8 @@ def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_
 
 
 def _require_moment(radial_moment_Tm: Real, law: FieldLaw) -> None:
-    """Raise `DomainError` for a radial moment that no gap in the law's range gives, and for NaN; of an array for any
-    element."""
+    """Raise `DomainError` for a radial moment, T m, that no gap in the law's range gives, and for NaN; of an array for
+    any element."""
     nearest_mm, farthest_mm = law.gap_range_mm
     weakest_Tm, strongest_Tm = law.radial_moment_Tm(farthest_mm), law.radial_moment_Tm(nearest_mm)
     require("radial_moment_Tm", radial_moment_Tm, weakest_Tm, strongest_Tm)

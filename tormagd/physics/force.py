@@ -82,7 +82,7 @@ def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geomet
     """Return the kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34), 0 without field.
 
     A float gives a float, an array one of its shape and type. Raises `DomainError` unless the radial moment is from 0
-    to `max_radial_moment_Tm`.
+    to `max_radial_moment_Tm`; NaN never is.
     """
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
@@ -109,7 +109,8 @@ class Reduced(NamedTuple):
     def force(self, moment_Tm: Real) -> Real:
         """Return the friction force at the roller, N, at a radial moment of 0 to `max_moment_Tm`, T m.
 
-        Nothing is checked: above that the force means nothing, and a float may raise ValueError.
+        A float gives a float, an array one of its shape and type. Nothing is checked: above that the force means
+        nothing, and a float may raise ValueError.
         """
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)

@@ -40,7 +40,7 @@ class Friction(Value):
     def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
         """Return the steady level g(v) of the dry part at a speed, N; the speed's sign does not matter.
 
-        `kinetic_N` >= 0 is the level of a fast handle. Nothing is checked.
+        `kinetic_N` >= 0 is the level of a fast handle; at rest it is `static_ratio` times that. Nothing is checked.
         """
         ratio = speed_mm_s / self.stribeck_speed_mm_s
         return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))

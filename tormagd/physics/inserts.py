@@ -80,7 +80,7 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def elastomer(self) -> Elastomer:
-        """Shear modulus, permeability and friction of the insert.
+        """Shear modulus, permeability and friction of the insert, for `brake_force_N`.
 
         What the insert does not state comes from Eq. 5 and from its matrix. Raises `DomainError` outside Eq. 5's range
         and `Elastomer`'s, and where the friction is needed from a matrix that is not in `MATRICES`.
@@ -94,7 +94,8 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def matrix(self) -> Matrix:
-        """The silicone of the insert's hardness. Raises `DomainError` where none of `MATRICES` has it."""
+        """The silicone of the insert's hardness. Raises `DomainError` where none of `MATRICES`, the registry's, has
+        it."""
         known = ", ".join(map(str, MATRICES))
         allowed = f"one of a [[matrix]], {known}; or state friction_coefficient"
         require_that(self.shore_hardness in MATRICES, f"{self.name}: shore_hardness", self.shore_hardness, allowed)
@@ -139,7 +140,7 @@ INSERTS = {item.name: item for item in _FILE.insert}
 
 
 def insert(name: str) -> Insert:
-    """Return an insert by its name, such as "MRE-50-40"; capitals count.
+    """Return an insert of the registry by its name, such as "MRE-50-40"; capitals count.
 
     Raises `DomainError` listing the names if there is none.
     """

@@ -270,10 +270,10 @@ class Scene(Strict, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """The hash, 16 hex digits, of what the scene asks for.
+        """The hash, 16 hex digits, of what the scene asks for; equal scenes have equal ones in every process.
 
-        The scene's name, description and budget, how it is served (terms, rates, search), and the folders of its files
-        do not count.
+        The scene's name, description and budget, and how it is served (terms, rates, search), do not count. Of its
+        files only the names do, not folders and contents.
         """
         signal, insert = self.signal, self.insert
         task = msgspec.structs.replace(
@@ -305,9 +305,9 @@ def scene_path(name_or_path: str) -> Path:
 
 
 def load_scene(name_or_path: str) -> Scene:
-    """Read and check a shipped scene, by its name, or the scene in a file.
+    """Read and check a shipped scene, by its name, or the scene in a file; a shipped name goes first.
 
     Model, insert and signal that it names are neither looked for nor read. Raises ConfigError naming file, key, value
-    and what is allowed.
+    and what is allowed, also for a file that cannot be read or is no TOML.
     """
     return convert(scene_path(name_or_path), Scene)

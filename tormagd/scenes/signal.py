@@ -17,7 +17,8 @@ Array = npt.NDArray[np.float64]
 def recorded(path: Path) -> tuple[Array, Array]:
     """Read a file of forces, and return its times from the first row on, s, and forces, N (n each, 2 at least).
 
-    Displacement and rate in it are passed over. Raises ConfigError naming `signal.file`.
+    Times rise. Displacement and rate in it are passed over. Raises ConfigError naming `signal.file`, for a file that
+    cannot be read or is no table of forces.
     """
     try:
         table = read_forces(path)

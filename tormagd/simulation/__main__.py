@@ -40,9 +40,10 @@ FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware,
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come.
 
-    `arguments` None: those of the process. Writes `--truth` while it runs, and says on stderr how often it fell behind
-    real time. Returns 0, or 1 where stdout cannot be written or an emulated processor ends. Raises SystemExit(2) for
-    usage, or parts that cannot be used.
+    `arguments` None: those of the process. Writes the CSV file of `--truth` while it runs, and closes the door and that
+    file at the end. Says on stderr how often it fell behind real time. Returns 0, or 1 where stdout cannot be written
+    or an emulated processor ends. Raises SystemExit(2) for usage, or for a plant, hand, fault, firmware or door that
+    cannot be used. While it runs, OSError for a full disk and can.CanError for a bus that has gone pass through.
     """
     command = parser()
     options = command.parse_args(arguments)
@@ -73,10 +74,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
-    """Return the device and the door that the options ask for, to be closed by `resources`.
+    """Return the device and the door that the options ask for; `resources` closes them.
 
-    Without `--hand` it is `steady`, or `pressing` at a pad. A CAN door without a path gets a temporary folder. Raises
-    PlantError, HandError, FaultError, DomainError, BuildError or OSError.
+    `options` are those of `parser`. Without `--hand` it is `steady`, or `pressing` at a pad. A CAN door without a path
+    gets a temporary folder, which `resources` removes. Raises PlantError, HandError or FaultError for those words,
+    DomainError for a plant outside the force law. Raises BuildError for a firmware that cannot be built, OSError for a
+    door that cannot be opened.
     """
     boot = FIRMWARES[options.firmware]
     plant = load_plant(options.plant)
@@ -102,7 +105,11 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the argument parser of `python -m tormagd.simulation`; the reference of commands is made from it, too."""
+    """Return the argument parser of `python -m tormagd.simulation`; the reference of commands is made from it, too.
+
+    It refuses rates and node numbers out of range. Plant, hand, faults and door are words or paths, and are looked at
+    by `main`.
+    """
     made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
     doors = made.add_mutually_exclusive_group(required=True)
     doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal, its path printed first")

@@ -35,10 +35,13 @@ class BusDoor:
         return (self._fd,)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Take up to FRAMES_AT_ONCE frames from the bus if it is `readable`; send what the device has sent by `now_s`.
+        """Hand the device what waits on the bus, if the bus is `readable`, and send what the device has sent by
+        `now_s`.
 
-        Ignored are frames that are no classical data frames of 11 bits, or carry a function that only the device sends.
-        Raises can.CanError when the bus goes away, or does not take a frame at once.
+        `now_s` is seconds from power-on; `readable` counts as a yes or no. It takes FRAMES_AT_ONCE frames at most, and
+        the rest waits. Ignored are frames that are no classical data frames of 11 bits, and those with a function that
+        only a device sends. Raises can.CanError when the bus goes away, or does not take a frame at once. Raises
+        ValueError for a time before the last.
         """
         if readable:
             for _ in range(FRAMES_AT_ONCE):

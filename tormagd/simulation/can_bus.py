@@ -53,7 +53,12 @@ class SimulatorBus(can.BusABC):
 
     @staticmethod
     def _detect_available_configs() -> list[AutoDetectedConfig]:
-        """Return the channels of running simulators that were given no path of their own; python-can asks for them."""
+        """Return the channels of running simulators that were given no path of their own, sorted; python-can asks for
+        them.
+
+        Each is a dict with `interface`, "tormagsim", and `channel`, the socket's path. Empty where none runs. Raises
+        OSError where /proc/net/unix cannot be read, as outside Linux.
+        """
         listening = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace").split()
         found = sorted(str(path) for path in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/can"))
         return [{"interface": "tormagsim", "channel": path} for path in found if path in listening]
@@ -65,8 +70,9 @@ class SimulatorBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a classical data frame, waiting up to `timeout` seconds for room; None waits for ever, 0 not at all.
 
-        Raises can.CanOperationError for any other frame, for no room, and where the simulator has gone. An identifier
-        over 11 bits is not refused, but cut to its lowest 11.
+        Raises can.CanOperationError for any other frame, for no room in time, and where the simulator has gone. An
+        identifier over 11 bits is not refused, but cut to its lowest 11. That the frame was sent says nothing of
+        whether a node heard it.
         """
         if msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd or len(msg.data) > MAX_DATA:
             raise can.CanOperationError(f"{msg}: allowed are classical data frames of 11-bit identifiers")
@@ -81,10 +87,11 @@ class SimulatorBus(can.BusABC):
             raise can.CanOperationError("the simulator has gone", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        """Return the next frame and that it is not filtered yet; in place of the frame None after `timeout` seconds.
+        """Return the next frame, and False: python-can has still to filter it. After `timeout` seconds the frame is
+        None.
 
-        A `timeout` of None waits for ever. An error frame is one with ERROR_FLAG. Raises can.CanOperationError: the
-        simulator has gone, or sent no frame.
+        A `timeout` of None waits for ever, 0 not at all. A packet with ERROR_FLAG becomes an error frame. Raises
+        can.CanOperationError where the simulator has gone, or sent what is no frame.
         """
         try:
             if timeout != 0:

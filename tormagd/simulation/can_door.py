@@ -38,10 +38,12 @@ class CanDoor:
         return (self._listener.fileno(), *self._hosts)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Admit hosts, take their frames, and hand on every frame that has gone by until `now_s`.
+        """Admit hosts, take their frames, and hand on every frame that has gone by until `now_s`, seconds from
+        power-on.
 
-        A frame goes to all hosts but its sender. A host that has left, or sent what is no frame, is disconnected. One
-        that does not read loses frames.
+        `readable` are those of `descriptors` on which something waits; any other is taken for a host that connects. A
+        frame goes to all hosts but its sender. A host that has left, or sent what is no frame, is disconnected. One
+        that does not read loses frames. Raises ValueError for a time before the last.
         """
         for descriptor in readable:
             if descriptor in self._hosts:
@@ -54,14 +56,18 @@ class CanDoor:
                 self._hand(descriptor, packet)
 
     def close(self) -> None:
-        """Disconnect all hosts and remove the socket."""
+        """Disconnect all hosts and remove the socket from its folder. A second call changes nothing."""
         for descriptor in list(self._hosts):
             self._dismiss(descriptor)
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
     def _welcome(self) -> None:
-        """Admit the host that connects; one above MAX_HOSTS is disconnected."""
+        """Admit the host that connects; one above MAX_HOSTS is disconnected at once. Without one waiting it does
+        nothing.
+
+        Raises OSError where the process may open no more files.
+        """
         with contextlib.suppress(BlockingIOError):  # a host that came has gone again
             host, _ = self._listener.accept()
             if len(self._hosts) >= MAX_HOSTS:
@@ -74,9 +80,11 @@ class CanDoor:
         self._hosts.pop(descriptor).close()
 
     def _take(self, now_s: float, descriptor: int) -> None:
-        """Hand the device at most FRAMES_AT_ONCE frames of the host at `descriptor`, with the time `now_s`.
+        """Hand the device at most FRAMES_AT_ONCE frames of the host at `descriptor`, with the time `now_s`; the rest
+        waits.
 
-        A host that has left, or sent what is no frame, is disconnected.
+        A host that has left, or sent what is no frame, is disconnected. Raises ValueError for a time before the last,
+        and KeyError where no host has this descriptor.
         """
         for _ in range(FRAMES_AT_ONCE):
             try:
@@ -92,7 +100,8 @@ class CanDoor:
             self._device.receive(now_s, frame, descriptor)
 
     def _hand(self, descriptor: int, packet: bytes) -> None:
-        """Send a packet to a host. One that does not read loses the packet; one that has gone is disconnected."""
+        """Send a packet to the host at `descriptor`. One that does not read loses the packet; one that has gone is
+        disconnected."""
         try:
             self._hosts[descriptor].send(packet)
         except BlockingIOError:
@@ -104,7 +113,7 @@ class CanDoor:
 def _remove_abandoned(path: Path) -> None:
     """Remove the socket at `path` if nobody listens there; leave it where somebody does, and do nothing without one.
 
-    Raises OSError where that cannot be found out, as for a file that is no socket, or it cannot be removed.
+    Raises OSError where that cannot be found out, as for a file that is no socket, or where it cannot be removed.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
         try:

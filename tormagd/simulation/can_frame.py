@@ -27,9 +27,9 @@ class CanFrame(NamedTuple):
 
 
 def frame_bits(frame: CanFrame) -> int:
-    """Return how many bit times the frame takes, with its stuff bits and the pause behind it (ISO 11898-1).
+    """Return how many bit times the frame takes, with its stuff bits and the pause of 3 behind it (ISO 11898-1).
 
-    Identifier and data have to be those of a classical frame: larger ones are not refused, and the result means
+    The frame has to be a classical one of 11 bits and at most 8 bytes: others are not refused, and their result means
     nothing. An error frame raises OverflowError.
     """
     # start of frame, identifier, then RTR, IDE and r0, which are 0 in a classical data frame, and the length
@@ -58,7 +58,8 @@ def to_socket(frame: CanFrame) -> bytes:
 def from_socket(packet: bytes) -> CanFrame | None:
     """Return the frame in a packet of the simulator's socket, None where the packet holds no valid one.
 
-    An error frame is valid, and has ERROR_FLAG in its identifier. An empty packet, the socket's end, gives None.
+    Valid has the length of SOCKET_FRAME, an identifier of 11 bits and at most 8 bytes of data. An error frame is valid,
+    and has ERROR_FLAG in its identifier. An empty packet, the socket's end, gives None.
     """
     if len(packet) != SOCKET_FRAME.size:
         return None
@@ -79,8 +80,10 @@ _CRC_TABLE = [_crc_of(byte) for byte in range(256)]
 
 
 def _after(run: int, byte: int) -> tuple[int, int]:
-    """Return the stuff bits in a byte that follows a run of `run` zeros (ones where negative), and the run it
-    leaves."""
+    """Return the stuff bits in a byte that follows a run of equal bits, and the run that it leaves.
+
+    A run counts zeros, negative ones: from -4 to 4. The byte's highest bit comes first.
+    """
     stuffed = 0
     for place in range(7, -1, -1):
         one = -1 if byte >> place & 1 else 1

@@ -78,9 +78,10 @@ class View(ctypes.Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    """Load the library, once for this process, and declare its functions' types.
+    """Return the library, loaded once for this process, with its functions' types declared.
 
-    Raises BuildError where the library cannot be built, or its structures are laid out otherwise than ctypes does it.
+    Compiles the C sources where that has not been done. Raises BuildError where they cannot be built, or their
+    structures are laid out otherwise than ctypes does it.
     """
     library = load_library()
     pointer, time_s, payload = ctypes.c_void_p, ctypes.c_double, ctypes.c_char_p
@@ -110,8 +111,10 @@ def _sizes(library: ctypes.CDLL) -> list[int]:
 
 
 class CompiledFirmware:
-    """One device's firmware in C from its boot on, as `Firmware`. Raises BuildError where the C sources cannot be
-    built."""
+    """One device's firmware in C from its boot on, as `Firmware`: the same calls, times and results.
+
+    Raises BuildError where the C sources cannot be built. Two of them share nothing that changes.
+    """
 
     def __init__(self, plant: PlantParameters) -> None:
         library = _library()
@@ -123,9 +126,10 @@ class CompiledFirmware:
         """What can be read of the device; None once something has happened to it."""
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host and return what to answer; messages of a device are ignored.
+        """Act on one message of the host at `time_s`, s since boot, and return what to answer, as `Firmware.receive`.
 
-        Raises EncodeError for a message that has no form on the wire, DecodeError for one that the C codec refuses.
+        Messages of a device are ignored: NONE. That times do not fall is not checked. Raises EncodeError for a message
+        that has no form on the wire, DecodeError for one that the C codec refuses.
         """
         payload, self._known = encode(message), None
         answer: int = _library().tormag_bridge_receive(
@@ -136,8 +140,10 @@ class CompiledFirmware:
         return ANSWERS[answer]
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick, as `Firmware.tick`: a Status every twentieth time, None otherwise. Raises EncodeError as
-        `status`."""
+        """Run one 1 kHz tick at `time_s`, as `Firmware.tick`: return a Status every twentieth time, None otherwise.
+
+        Motions and watches have gone on even where it raises EncodeError, as `status`.
+        """
         payload, self._known = ctypes.create_string_buffer(MAX_PAYLOAD), None
         length: int = _library().tormag_bridge_tick(self._device, time_s, seen(sensors), payload)
         _require_sent(length, sensors)
@@ -146,15 +152,17 @@ class CompiledFirmware:
     def status(self, sensors: Sensors) -> Status:
         """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any).
 
-        Raises EncodeError for a supply or temperature that has no step on the wire.
+        Nothing changes. Raises EncodeError for a supply or temperature that has no step on the wire.
         """
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
         _require_sent(_library().tormag_bridge_status(self._device, seen(sensors), payload), sensors)
         return _decoded(Status, payload.raw)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return State and Sense of that moment. Raises EncodeError for a current or force that has no step on the
-        wire."""
+        """Return State and Sense of that moment, as `Firmware.measurement`: each call counts State's counter up.
+
+        Raises EncodeError for a current or force that has no step on the wire.
+        """
         payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
         result: int = _library().tormag_bridge_measurement(self._device, time_s, seen(sensors), payloads)
         _require_sent(result, sensors)
@@ -183,7 +191,7 @@ class CompiledFirmware:
 
     @property
     def output(self) -> Output:
-        """State of both bridges now: the same object until it changes."""
+        """The state of both bridges now: the same object until it changes, so `is` tells whether it has."""
         view = self._view()
         output = Output(view.left_duty, view.right_duty, view.enabled)
         if output != self._output:
@@ -215,7 +223,10 @@ def parameters_of(plant: PlantParameters) -> CParameters:
 
 
 def seen(sensors: Sensors) -> CSensors:
-    """Return `sensors` as the firmware's structure. Counts beyond 32 bits run over, as the firmware's own do."""
+    """Return `sensors` as the firmware's structure. Counts beyond 32 bits run over, as the firmware's own do.
+
+    Numbers are not checked: NaN is passed on.
+    """
     return CSensors(
         sensors.left_counts,
         sensors.right_counts,

@@ -5,8 +5,10 @@ from typing import final
 
 @final
 class Curve:
-    """A function as a table of its values, two at least, on a uniform grid from `start` to `end`; linear between the
-    points."""
+    """A function as a table: its values at equal distances from `start` to `end`, linear between them.
+
+    There are two `values` at least, and `end` is over `start`; neither is checked.
+    """
 
     def __init__(self, values: list[float], start: float, end: float) -> None:
         self._start = start
@@ -15,7 +17,7 @@ class Curve:
         self._values = values
 
     def at(self, x: float) -> float:
-        """Return the value at `x`; the outermost pieces continue beyond both ends.
+        """Return the value at `x`; beyond both ends the outermost pieces go on in their direction.
 
         Raises ValueError for NaN, OverflowError for an infinite `x`.
         """

@@ -54,14 +54,20 @@ class TorqueElement:
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
         """Advance by one step that ends at `time_s` and at gap `gap_mm`, with the handle at the mean speed
-        `speed_mm_s`."""
+        `speed_mm_s`.
+
+        It is `prepare` and `slide`.
+        """
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
-        """Begin a step that ends at `time_s` and `gap_mm`: advance field, relaxation, temperature and `kinetic_N`.
+        """Begin a step that ends at `time_s`, s from power-on, and at `gap_mm`: advance all but the bristles, and set
+        `kinetic_N`.
 
-        None of these depends on the handle; `slide` ends the step.
+        That is field, relaxation and temperature; none depends on the handle. Call it once a step of `dt_s`, before
+        `slide`: neither is checked. A gap beyond the stops is not refused. Raises ValueError for a gap of NaN,
+        OverflowError for an infinite one.
         """
         moment_Tm = self._field.advance(gap_mm)
         driving_N = self._force.at(moment_Tm) * self._warmth.advance(time_s)
@@ -70,15 +76,19 @@ class TorqueElement:
         self.kinetic_N = max(relaxed_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """Return the friction that the step begun by `prepare` would end with at the mean handle speed `speed_mm_s`.
+        """Return the friction, N, that the step begun by `prepare` would end with at the mean handle speed
+        `speed_mm_s`.
 
-        The state stays.
+        The state stays: several speeds may be tried before `slide`. NaN gives NaN.
         """
         return self._friction.advance(self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
         """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`: set `force_N` and the
-        bristles."""
+        bristles.
+
+        A speed of NaN is not refused, and stays in the bristles.
+        """
         self.force_N, self._deflection_mm = self._friction.advance(
             self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s
         )

@@ -62,10 +62,11 @@ class _PinsOut(ctypes.Structure):
 
 
 class EmulatedFirmware:
-    """One device's firmware on its processor from its boot on, as `Firmware`.
+    """One device's firmware on its processor from its boot on, as `Firmware`, with times in seconds since that boot.
 
-    `output` is what its bridges do. Raises BuildError without compiler or emulator. Where the emulator ends by itself,
-    every method that lets the firmware run raises EmulationError.
+    `output` is what its bridges do; the same object until it changes. `close` ends the emulator, as does the end of
+    this process. Raises BuildError without compiler or emulator. Where the emulator ends by itself, every method that
+    lets the firmware run raises EmulationError.
     """
 
     def __init__(self, plant: PlantParameters) -> None:
@@ -95,10 +96,10 @@ class EmulatedFirmware:
         self._pins = self._told(bytes(parameters_of(plant)))
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Let a message of the host arrive, in a frame of its own with the next sequence number, and return what was
-        answered.
+        """Let a message of the host arrive at `time_s`, in a frame of its own with the next sequence number; return
+        what was answered.
 
-        Raises EncodeError for a value that does not fit the wire, EmulationError as `hear`.
+        As `hear` otherwise. Raises EncodeError for a value that does not fit the wire, and EmulationError.
         """
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
@@ -108,8 +109,9 @@ class EmulatedFirmware:
         """Let bytes of the link arrive at `time_s` of its clock, one whole frame at most, and return what was answered
         to them.
 
-        Without bytes it does nothing and returns NONE. A State and Sense that it answers wait for `measurement`. Raises
-        EmulationError.
+        More than one frame is not refused, but only the last answer is returned. Without bytes it does nothing and
+        returns NONE, as for a damaged frame. A State and Sense that it answers wait for `measurement`, an Identity for
+        `identity`. Raises EmulationError.
         """
         answer = Answer.NONE
         for start in range(0, len(data), MAX_BYTES):
@@ -119,21 +121,25 @@ class EmulatedFirmware:
         return answer
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Let it sleep until its tick, as `Firmware.tick`: a Status every twentieth time, None otherwise."""
+        """Let it sleep until its tick at `time_s`, as `Firmware.tick`, and return a Status every twentieth time, None
+        otherwise.
+
+        Raises EmulationError.
+        """
         self._answer(self._wake(time_s, sensors))
         status, self._status = self._status, None
         return status
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return the oldest State and Sense that it has sent and nobody has taken; time and sensors given here do not
-        count.
+        """Return the oldest State and Sense that it has sent and nobody has taken, and forget them.
 
-        Their moment is that of `hear` or `receive`, which answered MEASUREMENT. Raises IndexError where none waits.
+        They are of the moment of the `hear` or `receive` that answered MEASUREMENT; `time_s` and `sensors` given here
+        do not count. Raises IndexError where none waits.
         """
         return self._measured.popleft()
 
     def identity(self) -> Identity:
-        """Return what it has answered to the last Hello. Raises RuntimeError before any."""
+        """Return what it has answered to the last Hello, again and again. Raises RuntimeError before any."""
         if self._identity is None:
             raise RuntimeError("the firmware has sent no Identity yet: allowed is to ask after a Hello")
         return self._identity
@@ -164,7 +170,11 @@ class EmulatedFirmware:
         return INSTRUCTIONS_PER_CYCLE * int(self._pins.busy)
 
     def _answer(self, messages: list[Message]) -> Answer:
-        """Keep what the firmware has sent in one wake, and return what answer it is."""
+        """Keep what the firmware has sent in one wake for `measurement`, `identity` and `tick`, and return what answer
+        it is.
+
+        Raises AssertionError for messages that no device sends in this order.
+        """
         answer = Answer.NONE
         match messages:
             case [State() as state, Sense() as sense, *rest]:
@@ -180,9 +190,11 @@ class EmulatedFirmware:
         return answer
 
     def _wake(self, time_s: float, sensors: Sensors, data: bytes = b"") -> list[Message]:
-        """Let it sleep until `time_s` on its clock, and act on its sensors and the link's `data` then.
+        """Let it sleep until `time_s` on its clock, then act on its sensors and on at most MAX_BYTES of the link's
+        `data`.
 
-        Returns the messages that it sends. Raises EmulationError.
+        Returns the messages that it sends. Updates `output` and what can be read of it. Raises EmulationError;
+        AssertionError where what it sends is no frame.
         """
         cycles = round(time_s * CYCLES_PER_S)
         record = _PinsIn(seen(sensors), cycles - self._cycles, len(data))
@@ -196,9 +208,9 @@ class EmulatedFirmware:
         return [decode(frame.function, frame.payload) for frame in frames]
 
     def _told(self, record: bytes, data: bytes = b"") -> _PinsOut:
-        """Tell the firmware a record, put `data` on the link, and return what it says when it waits again.
+        """Put `data` on the link, tell the firmware a record of its pins, and return what it says when it waits again.
 
-        Raises EmulationError.
+        Raises EmulationError with the emulator's last words where it has ended; it is killed then.
         """
         to, of = _pipes(self._process)
         said = b""
@@ -222,7 +234,11 @@ def _pipes(process: "subprocess.Popen[bytes]") -> tuple[IO[bytes], IO[bytes]]:
 
 
 def _end(process: "subprocess.Popen[bytes]", link: socket.socket, errors: IO[bytes]) -> int | None:
-    """End the emulation, as `EmulatedFirmware.close`: without its pins the firmware counts its stack and stops."""
+    """End the emulation, as `EmulatedFirmware.close`: without its pins the firmware counts its stack and stops.
+
+    Closes pipes, link and error file; an emulator that goes on for END_S more is killed. Returns how many bytes of the
+    stack were ever used, None where the firmware did not say.
+    """
     to, of = _pipes(process)
     to.close()
     used = of.read(4)

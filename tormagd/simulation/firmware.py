@@ -116,10 +116,11 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 
 @final
 class Firmware:
-    """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall.
+    """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall; this is
+    not checked.
 
     `mode`, latched `faults`, `homed` and the bridges' `output` are its state, besides the motion under way and the
-    counters of what it accepted last.
+    counters of what it accepted last. `output` is the same object until it changes.
     """
 
     def __init__(self, plant: PlantParameters) -> None:
@@ -177,8 +178,9 @@ class Firmware:
     def _drive(self, time_s: float, drive: Drive, sensors: Sensors) -> Answer:
         """Act on a Drive; one with a new counter is answered in every mode, so that a host can always measure.
 
-        In RUN its duties become the output. RUN is entered only from IDLE: homed, of a matching schema, without a
-        fault. Where anything but OFF ended the last run, an OFF must come first.
+        MEASUREMENT is that answer, NO_ANSWER the one to a counter that came last. In RUN its duties become the output.
+        RUN is entered only from IDLE: homed, of a matching schema, without a fault. Where anything but OFF ended the
+        last run, an OFF must come first. An OFF in RUN opens the gap.
         """
         if drive.counter == self._drive_counter:
             return NO_ANSWER
@@ -252,7 +254,7 @@ class Firmware:
         """Watch a run: any fault is latched, ends it and opens the gap.
 
         That is SUPPLY, TEMPERATURE, OVERCURRENT, COMMAND_TIMEOUT, END_STOP or SKEW. Without one, an opening duty at an
-        open switch is taken away.
+        open switch is taken away from `output`.
         """
         left_mm, right_mm = self._positions_mm(sensors)
         fault = self._causes(time_s, sensors)
@@ -320,7 +322,10 @@ class Firmware:
     @staticmethod
     def _bounded(output: Output, sensors: Sensors) -> Output:
         """Return `output` without an opening duty for a carriage at its open switch, which must not run on into the
-        stop."""
+        stop.
+
+        `output` itself where no switch is closed.
+        """
         if not sensors.switches:
             return output
         return Output(
@@ -332,7 +337,10 @@ class Firmware:
     # -- transitions ---------------------------------------------------------------------------------------------
 
     def _fail(self, time_s: float, fault: DeviceFault, sensors: Sensors) -> None:
-        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves."""
+        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves.
+
+        A device whose drives stay off is LATCHED at once; one that opens already goes on.
+        """
         self.faults |= fault
         if not self._motors_on and DeviceFault.UNCOMMANDED_MOTION not in fault:
             self._rest(time_s, LATCHED)
@@ -409,7 +417,7 @@ class Firmware:
         self._right_calm_s = time_s
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
-        """Return how far a carriage, the further of the two, has moved from where it rested, mm.
+        """Return how far a carriage, the further of the two, has moved from where it rested, mm, whichever way.
 
         While opening only the way back from its most open place counts. 0 within COASTING_S of the last transition.
         Updates the place that this way is measured from.
@@ -426,7 +434,7 @@ class Firmware:
         return max(abs(left - left_then), abs(right - right_then)) * self._mm_per_count
 
     def _positions_mm(self, sensors: Sensors) -> tuple[float, float]:
-        """Return the left and the right carriage's place, mm, from its zero; opening is positive.
+        """Return the left and the right carriage's place, mm, from its zero; opening is positive, so most are negative.
 
         The zero is where it was at boot, and after homing where its open switch closed.
         """
@@ -451,8 +459,10 @@ class Firmware:
         return Identity(SCHEMA_HASH, VERSION[0], VERSION[1], SERIAL_NUMBER)
 
     def status(self, sensors: Sensors) -> Status:
-        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before
-        any)."""
+        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any).
+
+        HOMED is one of the switches. Nothing changes; the wire's ranges are not checked here.
+        """
         ends: int = sensors.switches
         return Status(
             mode=self.mode,

@@ -33,8 +33,8 @@ class GapField:
     def advance(self, gap_mm: float) -> float:
         """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m.
 
-        A gap beyond the device's stops is not refused: the table's last piece goes on there. An unchanged gap changes
-        nothing.
+        The lag depends on the way of the gap, never on time. An unchanged gap changes nothing. A gap beyond the
+        device's stops is not refused: the table's last piece goes on there. Raises ValueError for NaN.
         """
         moment_Tm = self._moment.at(gap_mm)
         change_Tm = moment_Tm - self._moment_Tm

@@ -304,11 +304,12 @@ def plant_names() -> tuple[str, ...]:
 
 
 def load_plant(path_or_name: str | Path) -> PlantParameters:
-    """Read a plant by the name of a packaged one (`sample_1`) or from a TOML file.
+    """Read a plant by the name of a packaged one (`sample_1`), or from a TOML file; a packaged name goes first.
 
-    A file with `carriages` states only a pad or the second plant's element: all other parts are those of the plant that
-    it names. Raises PlantError for a missing or unreadable file, bad TOML, and unknown or missing keys. Values that are
-    not finite, out of range, or contradict each other raise PlantError, too.
+    A file with `carriages` states only a pad or the second plant's element. All other parts are those of the plant that
+    it names, packaged or a file. Raises PlantError for a missing or unreadable file, bad TOML, and unknown or missing
+    keys. Values that are not finite, out of range, or contradict each other raise PlantError, too. Whether its motion
+    and force can be simulated is seen when a `Plant` is made.
     """
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)
@@ -322,8 +323,8 @@ def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
     """Return the plant with the insert called `name` in the place of its own; the plant itself for PLANTS_INSERT.
 
     The elastomer deviates from the registry's `name` by the factors by which the plant's own deviates from
-    PLANTS_INSERT. Relative permeability stays at 1 or above. The bounds of a plant file are not checked again. Raises
-    `DomainError` for an unknown insert.
+    PLANTS_INSERT. Relative permeability stays at 1 or above. All else stays, a pad too; the bounds of a plant file are
+    not checked again. Raises `DomainError` for an unknown insert.
     """
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
     own = plant.elastomer

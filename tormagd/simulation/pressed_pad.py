@@ -45,11 +45,12 @@ class PressedPad:
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
-        """Advance by one step that ends at `time_s` and `gap_mm`, with the finger `depth_mm` deep and pressing at
-        `speed_mm_s`.
+        """Advance by one step that ends at `time_s`, s, and at `gap_mm`, with the finger `depth_mm` deep and pressing
+        at `speed_mm_s`.
 
-        Sets `force_N`. Depth and speed are clamped to 0..6 mm and +-100 mm/s. Raises DomainError for a depth or speed
-        of NaN, and for a gap so small that its field is over 500 mT. Raises ValueError for a gap of NaN.
+        Sets `force_N`. Depth and speed are held within 0..6 mm and +-100 mm/s, positive inwards. Raises DomainError for
+        a depth or speed of NaN, and for a gap so small that its field is over 500 mT. Raises ValueError for a gap of
+        NaN.
         """
         field_mT = MT_PER_TM * self._field.advance(gap_mm)
         depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)

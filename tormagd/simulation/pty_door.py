@@ -29,7 +29,7 @@ class Pty:
         self.address = os.ttyname(self._theirs)
 
     def close(self) -> None:
-        """Close both ends of the line, once: a second call raises OSError."""
+        """Close both ends of the line, once: a second call raises OSError. A host that has it open finds it hung up."""
         os.close(self._ours)
         os.close(self._theirs)
 
@@ -43,10 +43,10 @@ class Pty:
         return os.read(self._ours, READ_BYTES)
 
     def write(self, data: bytes) -> None:
-        """Hand bytes to the host. When nobody reads, bytes are thrown away, as in any receiver that overruns.
+        """Hand `data` to the host at once. What nobody reads is thrown away, as in any receiver that overruns.
 
-        Unread ones are dropped where they and `data` would fill MAX_UNREAD_BYTES; `data` is dropped, too, where the
-        line takes nothing.
+        Bytes that still wait are dropped where they and `data` would fill MAX_UNREAD_BYTES. Both are dropped where the
+        line takes nothing, and the end of `data` where it takes a part. Nothing of that is told.
         """
         (unread,) = struct.unpack("i", fcntl.ioctl(self._theirs, termios.FIONREAD, bytes(4)))
         if unread + len(data) > MAX_UNREAD_BYTES - 1:
@@ -65,11 +65,11 @@ class PtyDoor(Pty):
         self._device = device
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device the host's bytes where `readable` is not empty, and the host what the device has sent by
+        """Hand the device the host's bytes, if `readable` is not empty, and the host what the device has sent by
         `now_s`.
 
-        READ_BYTES of the host's are taken at most. Raises BlockingIOError where `readable` is not true, ValueError for
-        a time before the last.
+        `now_s` is seconds from power-on. READ_BYTES of the host's are taken at most; the rest waits. Raises
+        BlockingIOError where `readable` is not true, and ValueError for a time before the last.
         """
         if readable:
             self._device.receive(now_s, self.read())

@@ -67,8 +67,9 @@ def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: T
 
     `stopped` is asked before each wait, which ends with the device's next event or with something from a host. A
     wake-up more than LATE_S late is counted; more than SLIP_S late makes the device's time stand still for as long.
-    `truth`, unless None, gets TRUTH_HEADER and a row each TRUTH_PERIOD_S. Freezes the garbage collector's present
-    objects. Raises what `door` and `truth` raise.
+    `truth`, unless None, gets TRUTH_HEADER and then a row for each TRUTH_PERIOD_S of the device's time; `t_ns` is
+    CLOCK_REALTIME. It is not flushed, and nothing is closed. Freezes the garbage collector's present objects for the
+    whole process. Raises what `door`, `device` and `truth` raise.
     """
     # nothing made so far will die: keep the collector from walking it while the device runs
     gc.freeze()
@@ -102,6 +103,8 @@ def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: T
 
 
 def _truth_row(truth: Truth, t_ns: int) -> str:
+    """Return a line of the truth's file, in the order of TRUTH_HEADER, for the state `truth` at CLOCK_REALTIME
+    `t_ns`."""
     return (
         f"{t_ns},{truth.force_N:.5f},{truth.gap_mm:.5f},{truth.left_mm:.5f},{truth.right_mm:.5f},"
         f"{truth.handle_mm:.4f},{truth.handle_mm_s:.3f},{truth.temperature_C:.3f},{truth.kinetic_N:.5f}\n"

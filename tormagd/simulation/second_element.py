@@ -1,4 +1,4 @@
-"""The element of the second plant: each law is of another form than those of `Element` and of the controller's models.
+"""The element of the second plant: each law is of another form than those of `TorqueElement` and of the controller.
 
 It only judges: no model is trained on it, and no constant of a controller was chosen by it. Sizes are assumptions, of
 the order that the literature gives; they stand in `plants/second.toml`, with their sources.
@@ -30,7 +30,7 @@ def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) 
     `concentration`.
 
     Two equal blocks make the 2; `concentration` is what the iron shaft draws in (Furlani 2001). The gap is above 0 mm:
-    0 raises ZeroDivisionError, and less is not refused.
+    0 raises ZeroDivisionError, and less is not refused, as NaN is not.
     """
     width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
 
@@ -46,7 +46,7 @@ def fresh_N(field_mT: float, second: SecondParameters) -> float:
     """Return the kinetic friction, N, of the fresh, cool element in the field `field_mT`, sliding at the reference
     speed.
 
-    The field's sign does not matter.
+    Fresh is without creep. The field's sign does not matter; NaN gives NaN.
     """
     saturation = math.tanh(field_mT / second.saturating_mT)
     return second.without_field_N + second.saturated_N * saturation * saturation
@@ -55,7 +55,8 @@ def fresh_N(field_mT: float, second: SecondParameters) -> float:
 def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> float:
     """Return the friction at `speed_mm_s` and contact age `age_s` over that of steady sliding at the reference speed.
 
-    The sign of the speed does not matter. The age, s, is not below 0; this is not checked.
+    It has no unit, and is 1 at the reference speed and its own age. The sign of the speed does not matter. The age, s,
+    is not below 0; this is not checked.
     """
     reference_mm_s, slow_mm_s = second.reference_mm_s, second.slow_mm_s
     reference_age = second.renewed_mm / reference_mm_s / second.ageing_s
@@ -66,11 +67,12 @@ def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> fl
 
 @final
 class SecondElement:
-    """The second plant's element, behind the interface of `Element`; advances in equal steps of `dt_s`.
+    """The second plant's element, behind the interface of `TorqueElement`; advances in equal steps of `dt_s`.
 
-    State are the plays, the creeping force, the contact's age and its springs. `kinetic_N` is the friction at the
-    reference speed. The element is passive: the handle alone stretches its springs, and they slip. Raises ValueError
-    for a plant without `second`.
+    State are the plays, the creeping force, the contact's age and its springs. `force_N` is the friction at the
+    roller's surface, positive against positive motion. `kinetic_N`, never negative, is that at the reference speed. The
+    element is passive: the handle alone stretches its springs, and they slip. Raises ValueError for a plant without
+    `second`.
     """
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
@@ -102,9 +104,11 @@ class SecondElement:
         self.slide(speed_mm_s)
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
-        """Begin a step that ends at `time_s` and `gap_mm`: advance plays, creep, temperature and `kinetic_N`.
+        """Begin a step that ends at `time_s`, s from power-on, and at `gap_mm`: advance plays, creep, temperature and
+        `kinetic_N`.
 
-        None of these depends on the handle; `slide` ends the step.
+        None of these depends on the handle; `slide` ends the step. Call it once a step: this is not checked. Raises
+        ZeroDivisionError for a gap of 0.
         """
         second = self._second
         driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self._warmth.advance(time_s)
@@ -113,21 +117,23 @@ class SecondElement:
         self.kinetic_N = max((1.0 - second.creeping_share) * driving_N + self._creeping_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """Return the friction that the step begun by `prepare` would end with at the mean handle speed `speed_mm_s`.
+        """Return the friction, N, that the step begun by `prepare` would end with at the mean handle speed
+        `speed_mm_s`.
 
-        The state stays.
+        The state stays: several speeds may be tried before `slide`.
         """
         return self._slid(speed_mm_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
         """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`.
 
-        Sets `force_N`, the contact's age and its springs.
+        Sets `force_N`, the contact's age and its springs. NaN is not refused, and stays in them.
         """
         self.force_N, self._age_s, self._stretched_mm = self._slid(speed_mm_s)
 
     def _slid(self, speed_mm_s: float) -> tuple[float, float, list[float]]:
-        """Return force, N, contact age, s, and spring lengths, mm, at the end of a step at the mean speed `speed_mm_s`.
+        """Return force, N, contact age, s, and each spring's length, mm, at the end of a step at the mean speed
+        `speed_mm_s`.
 
         The state stays.
         """
@@ -147,7 +153,7 @@ class SecondElement:
         return force_N, age_s, springs_mm
 
     def _magnetised_mT(self, gap_mm: float) -> float:
-        """Move the plays to the field at `gap_mm` and return the field with their hysteresis."""
+        """Move the plays to the field at `gap_mm`, and return that field with their hysteresis, mT."""
         second = self._second
         field_mT = shaft_field_mT(gap_mm, self._plant, second.concentration)
         found_mT = field_mT
@@ -158,9 +164,9 @@ class SecondElement:
         return found_mT
 
     def _crept_N(self, creeping_N: float) -> float:
-        """Return what `dt_s` leaves of the creeping force, by the exact solution: tanh(s / 2 V) falls by exp(-dt / T).
+        """Return what is left of the creeping force, N, after `dt_s`. Its sign stays, and the state does.
 
-        The form loses no digits at a large s.
+        It is the exact solution: tanh(s / 2 V) falls by exp(-dt / T). The form loses no digits at a large s.
         """
         scale_N = self._second.creep_scale_N
         large = math.exp(-abs(creeping_N) / scale_N)

@@ -20,7 +20,8 @@ class Warmth:
     def advance(self, time_s: float) -> float:
         """Set `temperature_C` to that of `time_s`, s since power-on; return the factor on a cool elastomer's force.
 
-        It is 1 at the ambient temperature. Only the time counts, not how the device works.
+        It is 1 at the ambient temperature, and under 1 where warmth softens. Only the time counts, not how the device
+        works, and it may be any: nothing but the temperature is remembered.
         """
         if self._warming_K > 0.0:
             self.temperature_C = self._ambient_C - self._warming_K * math.expm1(
