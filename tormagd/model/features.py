@@ -5,7 +5,7 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tormagd.physics.errors import DomainError
 
@@ -53,17 +53,18 @@ def require_number(name: str, value: float) -> None:
         raise DomainError(name, value, f"a finite number within +-{LARGEST:g}")
 
 
-def require_features(features: NDArray[np.float64]) -> None:
-    """Raise `DomainError` unless `features` is n x 4, finite and within +-`LARGEST`; it names row, from 0, and feature.
+def feature_rows(features: ArrayLike) -> NDArray[np.float64]:
+    """Return `features` as an array of float64 (n x 4, in the order of `FEATURES`); no rows at all (0 x 4) are as good.
 
-    No rows at all (0 x 4) pass. The array has to be of numbers: others raise TypeError.
+    Raises `DomainError` for another shape, and for a number that is not finite or beyond `LARGEST`; it names row, from
+    0, and feature. Raises ValueError or TypeError for what is no array of numbers.
     """
-    if features.ndim != 2 or features.shape[1] != len(FEATURES):
-        raise DomainError(
-            "features", f"an array of shape {features.shape}", f"n x 4 in the order {', '.join(FEATURES)}"
-        )
-    refused = ~(np.abs(features) <= LARGEST)
+    rows = np.asarray(features, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != len(FEATURES):
+        raise DomainError("features", f"an array of shape {rows.shape}", f"n x 4 in the order {', '.join(FEATURES)}")
+    refused = ~(np.abs(rows) <= LARGEST)
     if refused.any():
         row, column = np.argwhere(refused)[0]
         where = f"features[{row}], {FEATURES[column]}"
-        raise DomainError(where, features[row, column], f"a finite number within +-{LARGEST:g}")
+        raise DomainError(where, rows[row, column], f"a finite number within +-{LARGEST:g}")
+    return rows

@@ -29,7 +29,7 @@ from tormagd.model.features import (
     UNITS,
     Element,
     Scaling,
-    require_features,
+    feature_rows,
     require_number,
 )
 from tormagd.model.force_curve import ForceCurve, Known, Network
@@ -154,9 +154,8 @@ class ForceModel:
             object.__setattr__(self, name, _weights(name, getattr(self, name), shape))
         require_number("output_bias", self.output_bias)
         object.__setattr__(self, "physical", self._fold())
-        weight, bias, output, constant = self.physical
         known = Known(self.feature_ranges, self.force_span_N)
-        object.__setattr__(self, "network", Network(weight, bias, output, constant, known))
+        object.__setattr__(self, "network", Network(*self.physical, known))
 
     def _fold(self) -> PhysicalLayers:
         """Return the network with the scaling folded in. Raises `DomainError` where a folded number is not finite."""
@@ -223,8 +222,7 @@ class ForceModel:
         for another shape, and for a number that is not finite, or beyond `LARGEST`. Raises ValueError or TypeError for
         what is no array of numbers.
         """
-        rows = np.asarray(features, dtype=np.float64)
-        require_features(rows)
+        rows = feature_rows(features)
         weight, bias, output, constant = self.physical
         # sigmoid(z) = (1 + tanh(z/2)) / 2: one operation fewer than exp, and it cannot overflow
         forces_N = np.tanh((rows @ weight.T + bias) / 2) @ (output / 2) + (constant + float(output.sum()) / 2)
@@ -243,8 +241,7 @@ class ForceModel:
 
         Raises as `predict`.
         """
-        rows = np.asarray(features, dtype=np.float64)
-        require_features(rows)
+        rows = feature_rows(features)
         weight, bias, output, _ = self.physical
         # the sigmoid's slope without 1 - tanh^2, which is 0 by rounding where a unit is saturated
         falls = np.exp(-np.abs(rows @ weight.T + bias))
