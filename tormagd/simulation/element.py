@@ -27,8 +27,8 @@ class TorqueElement:
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         self._dt_s = dt_s
         self._field = GapField(plant, gap_mm)
-        weakest_Tm = self._field.static_Tm(2.0 * plant.open_stop_mm) - self._field.branch_Tm
-        strongest_Tm = self._field.static_Tm(2.0 * plant.closed_stop_mm) + self._field.branch_Tm
+        weakest_Tm = self._field.static.at(2.0 * plant.open_stop_mm) - self._field.branch_Tm
+        strongest_Tm = self._field.static.at(2.0 * plant.closed_stop_mm) + self._field.branch_Tm
         self._force = force_over_moment(plant, weakest_Tm, strongest_Tm)
         friction = plant.friction
         self._friction = Friction(

@@ -14,11 +14,12 @@ class GapField:
     """Radial moment of a plant's magnets, T m, with rate-independent hysteresis of at most `branch_Tm` either way."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float) -> None:
-        self._moment = moment_over_gap(plant)
-        largest_Tm = self._moment.at(SMALLEST_GAP_MM)
+        self.static: Final = moment_over_gap(plant)
+        "The moment over the gap without hysteresis."
+        largest_Tm = self.static.at(SMALLEST_GAP_MM)
         self.branch_Tm: Final = plant.field.hysteresis_percent / 100.0 * largest_Tm
         self._turn_Tm: Final = plant.assumed.hysteresis_scale * largest_Tm
-        self._moment_Tm = self._moment.at(gap_mm)
+        self._moment_Tm = self.static.at(gap_mm)
         self._lag_Tm = 0.0
 
     @property
@@ -26,17 +27,13 @@ class GapField:
         """Radial moment at the newest gap, with hysteresis, T m."""
         return self._moment_Tm + self._lag_Tm
 
-    def static_Tm(self, gap_mm: float) -> float:
-        """Return the radial moment at `gap_mm` without hysteresis, T m; the state stays."""
-        return self._moment.at(gap_mm)
-
     def advance(self, gap_mm: float) -> float:
         """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m.
 
         The lag depends on the way of the gap, never on time. An unchanged gap changes nothing. A gap beyond the
         device's stops is not refused: the table's last piece goes on there. Raises ValueError for NaN.
         """
-        moment_Tm = self._moment.at(gap_mm)
+        moment_Tm = self.static.at(gap_mm)
         change_Tm = moment_Tm - self._moment_Tm
         if change_Tm != 0.0:
             # rate-independent: the lag moves along |change| towards the branch that change leads to
