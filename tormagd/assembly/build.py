@@ -91,7 +91,7 @@ class Core(NamedTuple):
     def planner(self, now_s: float = 0.0) -> Planner:
         """Return a new planner that begins at `now_s`, with the gap open and nothing known of the device.
 
-        Planners of one core share nothing that changes. Plan no earlier than `now_s`.
+        Planners of one core share nothing that changes.
         """
         return Planner(self.config, self.scene, self.element, now_s)
 

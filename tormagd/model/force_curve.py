@@ -80,8 +80,7 @@ class Known:
         """Return how far feature number `place` of `FEATURES`, from 0, lies outside its range, as a share of it; 0
         inside, and for NaN.
 
-        For a feature that never varied, as a share of its magnitude, of 1 unit at least. Raises IndexError for another
-        place.
+        For a feature that never varied, as a share of its magnitude, of 1 unit at least.
         """
         outside = max(self.lows[place] - value, value - self.highs[place])
         return outside / self.scales[place] if outside > 0.0 else 0.0

@@ -362,8 +362,7 @@ class MessageDevice:
         """End all faults that act on the device now, at the time of the last `advance`.
 
         What came of them stays: a firmware that was reset, counts that an encoder gained or missed, what was latched. A
-        hanging firmware hangs until its reset, and faults that are not due yet still come. Without a fault nothing
-        changes.
+        hanging firmware hangs until its reset, and faults that are not due yet still come.
         """
         plant, parameters, time_s = self.plant, self.parameters, self._time_s
         if "worn_gearbox" in self._struck:

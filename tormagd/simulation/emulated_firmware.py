@@ -109,9 +109,9 @@ class EmulatedFirmware:
         """Let bytes of the link arrive at `time_s` of its clock, one whole frame at most, and return what was answered
         to them.
 
-        More than one frame is not refused, but only the last answer is returned. Without bytes it does nothing and
-        returns NONE, as for a damaged frame. A State and Sense that it answers wait for `measurement`, an Identity for
-        `identity`. Raises EmulationError.
+        Without bytes it does nothing and returns NONE, as for a damaged frame. A State and Sense that it answers wait
+        for `measurement`, an Identity for `identity`. Raises EmulationError, and AssertionError where more than one
+        frame has been answered.
         """
         answer = Answer.NONE
         for start in range(0, len(data), MAX_BYTES):

@@ -237,9 +237,9 @@ class Firmware:
     # -- time ----------------------------------------------------------------------------------------------------
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick: the motion under way and the watches, which may latch faults.
+        """Run one 1 kHz tick at `time_s`, s since boot: the motion under way and the watches, which may latch faults.
 
-        Returns a Status every twentieth time, None otherwise.
+        Returns a Status every twentieth time, None otherwise. Updates `mode`, `homed` and `output`.
         """
         if self.mode is RUN:
             self._tick_run(time_s, sensors)
@@ -272,8 +272,9 @@ class Firmware:
     def _tick_motion(self, time_s: float, sensors: Sensors) -> None:
         """Advance homing or retraction by one tick, and set `output`; at its end take the zeros over and rest.
 
-        Other faults end a homing and open the gap, as its failure does. A reversed motor or encoder is latched at once
-        as HOMING_FAILED, drives off. A retraction goes on while it latches UNCOMMANDED_MOTION or RETRACT_FAILED.
+        SUPPLY, TEMPERATURE and OVERCURRENT end a homing and open the gap, as its failure does. A reversed motor or
+        encoder is latched at once as HOMING_FAILED, drives off. A retraction goes on while it latches
+        UNCOMMANDED_MOTION or RETRACT_FAILED.
         """
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
@@ -310,7 +311,7 @@ class Firmware:
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
         """Watch the resting device, and latch what shows: UNCOMMANDED_MOTION, or SUPPLY and TEMPERATURE where new.
 
-        Motion by itself also opens the gap.
+        Motion by itself also opens the gap; after the others the drives stay off.
         """
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)

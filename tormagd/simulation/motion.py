@@ -166,8 +166,7 @@ class Retraction:
         `duties`.
 
         MOVING while a carriage is on its way, within TIME_LIMIT_S. After that, or when none is on its way: DONE where
-        both are braked at their open switches, else FAILED. It may be called after that: `duties` are then what each
-        carriage needs.
+        both are braked at their open switches, else FAILED.
         """
         for opening, carriage in zip(self._openings, carriages, strict=True):
             opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))

@@ -150,8 +150,10 @@ class NetworkDelay(Generic[T]):
         self._under_way: list[tuple[float, int, float, T]] = []
 
     def send(self, time_s: float, value: T) -> None:
-        """Send `value` at `time_s`: it arrives after the delay and its jitter, or by chance or in the outage is
-        lost."""
+        """Send `value` at `time_s`: it arrives after the delay and its jitter. By chance, or in the outage, it is lost.
+
+        Nobody is told of a loss. Times are seconds of any clock. What arrives is kept until `arrived` hands it out.
+        """
         chance, arrives_s = self._draw.random(), time_s + self._delay_s + self._jitter_s * self._draw.random()
         self._is_losing = chance < (self._goes_on if self._is_losing else self._begins)
         self._sent += 1

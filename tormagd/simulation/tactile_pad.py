@@ -142,7 +142,8 @@ def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, 
 
 
 def worked_pad(parameters: PadParameters) -> TactilePad:
-    """Return a new pad after one pass of `cycling_program` without field, twelve cycles, and a rest."""
+    """Return a new pad that has been pressed through one pass of `cycling_program`, twelve cycles without field, and
+    has rested."""
     pad = TactilePad(parameters)
     time_s, displacement_mm, rate_mm_s, _ = cycling_program(50)
     pad.run(time_s, displacement_mm, rate_mm_s, np.zeros_like(time_s))
