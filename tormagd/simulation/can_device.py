@@ -99,8 +99,8 @@ class CanDevice:
         self._queue(Delivery(host, frame))
 
     def transmit(self, now_s: float) -> list[Delivery]:
-        """Let time pass until `now_s` and return the frames whose last bit has gone by since the last call, the first
-        first.
+        """Let time pass until `now_s` and return the frames whose last bit has gone by since the last call, in that
+        order.
 
         The hosts' own are among them; DEVICE is the device's number. Each is returned once. Raises ValueError for a
         time before the last, or not finite.

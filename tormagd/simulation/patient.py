@@ -79,8 +79,8 @@ class Patient:
     def update(self, time_s: float, handle_mm: float) -> Felt:
         """Advance to `time_s`, with the handle at `handle_mm` since the last update, and return what the tip feels.
 
-        The first update puts tip and robot at the handle's place. Times must not fall and no number be NaN: neither is
-        checked, and the patient's state is of no use afterwards.
+        The first update puts tip and robot at the handle's place, from where the wall counts. Times must not fall and
+        no number be NaN: neither is checked, and the patient's state is of no use afterwards.
         """
         if math.isnan(self._time_s):
             self._time_s, self._start_mm, self._robot_mm, self._tip_mm = time_s, handle_mm, handle_mm, handle_mm
