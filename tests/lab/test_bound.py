@@ -23,6 +23,7 @@ from tormagd.lab.ideal_carriage import (
     Asked,
     Brake,
     Drive,
+    Lag,
     asked_of,
     bound as best,
     brake_of,
@@ -44,8 +45,7 @@ AT_ONCE = Drive(stall_mm_s2=900.0 * SPEED_MM_S, per_s=900.0, most_mm_s2=1e9)
 STRAIGHT = Brake(
     gap_mm=np.array([0.0, 100.0]),
     moment_Tm=np.array([11.0, 1.0]),
-    branch_Tm=0.0,
-    turn_Tm=1.0,
+    lag=Lag(0.0, 1.0),
     strength_Tm=np.array([1.0, 11.0]),
     fresh_N=np.array([1.0, 11.0]),
     relaxation=PronySeries((), ()),
@@ -162,16 +162,16 @@ def test_the_force_of_the_gap_is_that_of_the_devices_element() -> None:
     assert wanted.force_N == pytest.approx(np.minimum(force_N, 1.5), abs=1e-4)
     gap_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
     rendered_N = wanted.rendered_N(brake, gap_mm)
-    element, kinetic, felt = TorqueElement(plant, brake.rested_mm, STEP_S), [], []
+    element, found = TorqueElement(plant, brake.rested_mm, STEP_S), []
     for before_mm in (brake.gap_mm[0], brake.gap_mm[-1]):
         element.advance(0.0, float(before_mm), 0.0)
     for index, gap in enumerate(gap_mm.tolist()):
         element.advance(STEP_S * index, gap, hand_mm_s)
-        kinetic.append(element.kinetic_N)
-        felt.append(element.force_N)
-    assert wanted.scale * np.array(kinetic) + wanted.offset_N == pytest.approx(rendered_N, abs=2e-3)
+        found.append((element.kinetic_N, element.force_N))
+    kinetic_N, felt_N = np.array(found).T
+    assert wanted.scale * kinetic_N + wanted.offset_N == pytest.approx(rendered_N, abs=2e-3)
     # friction follows a rising level within some hundredths of a second at this speed
-    assert np.median(np.abs(np.array(felt) - rendered_N)[1000:]) <= 0.02
+    assert np.median(np.abs(felt_N - rendered_N)[1000:]) <= 0.02
 
 
 def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag() -> None:
@@ -181,7 +181,7 @@ def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag() 
     wanted = asked_of(brake, 1.3 - 0.3 * np.cos(2.0 * time_s(3.5)), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
     greedy_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
     assert rms(wanted.rendered_N(brake, greedy_mm) - wanted.force_N) <= 1e-3
-    assert np.ptp(greedy_mm) > np.ptp(no_delay_mm(drive_of(plant), brake._replace(branch_Tm=0.0), wanted, STEP_S))
+    assert np.ptp(greedy_mm) > np.ptp(no_delay_mm(drive_of(plant), brake._replace(lag=Lag(0.0, 1.0)), wanted, STEP_S))
 
 
 def test_the_fields_lag_takes_some_of_what_foresight_gains() -> None:
@@ -195,7 +195,7 @@ def test_the_fields_lag_takes_some_of_what_foresight_gains() -> None:
 
     best_mm = foresight_mm(drive, brake, wanted, STEP_S)
     best_N = error_N(brake, best_mm)
-    straight = brake._replace(branch_Tm=0.0)
+    straight = brake._replace(lag=Lag(0.0, 1.0))
     assert best_N > error_N(straight, foresight_mm(drive, straight, wanted, STEP_S))
     # what only moves or shrinks the way is within the drive's limits as well
     others_mm = [best_mm - 0.05, best_mm + 0.05, np.roll(best_mm, -5), np.roll(best_mm, 5)]
@@ -252,7 +252,7 @@ def missed_N(core: Core, device: VirtualDevice, stepper: Stepper) -> float:
         assert sample.safety.faults == ()
         assert sample.truth.gap_mm > sample.plan.min_gap_mm - 0.01
         errors_N.append(sample.truth.force_N - 1.4 - 0.2 * math.sin(math.tau * 3.0 * sample.time_s))
-    return float(np.sqrt(np.mean(np.square(errors_N[2_200:]))))
+    return rms(np.array(errors_N[2_200:]))
 
 
 def test_the_same_core_misses_less_with_carriages_that_lose_no_time() -> None:

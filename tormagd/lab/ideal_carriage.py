@@ -121,14 +121,49 @@ class Drive(NamedTuple):
         return driving - nut - direction * friction
 
 
+class Lag(NamedTuple):
+    """Law of remanence: what the moment of the field lacks while it rises, and has too much while it falls.
+
+    The lag goes to -`branch_Tm`, T m, while the moment rises, and to `branch_Tm` while it falls. A change by `turn_Tm`,
+    above 0, takes it most of the way. Time has no part in it.
+    """
+
+    branch_Tm: float
+    turn_Tm: float
+
+    def after_Tm(self, lag_Tm: float, change_Tm: float) -> float:
+        """Return the lag once the moment has changed by `change_Tm` in one direction, from the lag `lag_Tm`."""
+        branch_Tm = math.copysign(self.branch_Tm, -change_Tm)
+        return branch_Tm + (lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm)
+
+    def along_Tm(self, moments_Tm: Array, lag_Tm: float, before_Tm: float) -> Array:
+        """Return the lag (n), T m, at each of `moments_Tm` (n), T m, in order.
+
+        Before the first the moment was `before_Tm`, and lagged `lag_Tm`. Where the moment stays, so does the lag. NaN
+        is not refused, and makes all that follows NaN.
+        """
+        found = []
+        for moment_Tm in moments_Tm.tolist():
+            if moment_Tm != before_Tm:
+                lag_Tm = self.after_Tm(lag_Tm, moment_Tm - before_Tm)
+                before_Tm = moment_Tm
+            found.append(lag_Tm)
+        return np.array(found)
+
+
+def lag_of(plant: PlantParameters) -> Lag:
+    """Return the law of remanence of a plant with magnets and an insert, as the simulated device has it."""
+    largest_Tm = float(radial_moment_Tm(np.array([SMALLEST_GAP_MM]), plant)[0])
+    return Lag(plant.field.hysteresis_percent / 100.0 * largest_Tm, plant.assumed.hysteresis_scale * largest_Tm)
+
+
 class Brake(NamedTuple):
     """Force of the gap while the handle slides.
 
-    A gap gives a moment of the field (`moment_Tm` over `gap_mm`, from closed to open). The moment lags while it
-    changes: by up to `branch_Tm`, most of it within a change of `turn_Tm`. Moment and lag together, the strength, give
-    the force of the fresh, cool insert (`fresh_N` over `strength_Tm`), part of which relaxes. `sliding_N` makes the
-    felt force of a kinetic level, N, and the handle's speed, mm/s. `rested_mm` is the gap at which the insert rested
-    before.
+    A gap gives a moment of the field (`moment_Tm` over `gap_mm`, from closed to open), which lags while it changes.
+    Moment and lag together, the strength, give the force of the fresh, cool insert (`fresh_N` over `strength_Tm`), part
+    of which relaxes. `sliding_N` makes the felt force of a kinetic level, N, and the handle's speed, mm/s. `rested_mm`
+    is the gap at which the insert rested before.
 
     For the second plant a field in T stands for the moment, one exponential for creep, and an exponential lag for play.
     There a bound is near, but not exact.
@@ -136,8 +171,7 @@ class Brake(NamedTuple):
 
     gap_mm: Array
     moment_Tm: Array
-    branch_Tm: float
-    turn_Tm: float
+    lag: Lag
     strength_Tm: Array
     fresh_N: Array
     relaxation: PronySeries
@@ -153,22 +187,10 @@ class Brake(NamedTuple):
         """Return the felt force of the open gap with a fresh element, while the handle moves at `hand_mm_s`."""
         return self.sliding_N(self.fresh_at_N(float(self.moment_Tm[-1])), hand_mm_s)
 
-    def lag_after_Tm(self, lag_Tm: float, change_Tm: float) -> float:
-        """Return the lag once the moment has changed by `change_Tm` in one direction, from the lag `lag_Tm`."""
-        branch_Tm = math.copysign(self.branch_Tm, -change_Tm)
-        return branch_Tm + (lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm)
-
     def lags_Tm(self, moments_Tm: Array) -> Array:
         """Return the lag at each moment of a series; before the first the gap had been opened, and lagged
         `branch_Tm`."""
-        lag_Tm, before_Tm = self.branch_Tm, float(self.moment_Tm[-1])
-        found = []
-        for moment_Tm in moments_Tm.tolist():
-            if moment_Tm != before_Tm:
-                lag_Tm = self.lag_after_Tm(lag_Tm, moment_Tm - before_Tm)
-                before_Tm = moment_Tm
-            found.append(lag_Tm)
-        return np.array(found)
+        return self.lag.along_Tm(moments_Tm, self.lag.branch_Tm, float(self.moment_Tm[-1]))
 
     def moment_for_Tm(self, strength_Tm: float, moment_Tm: float, lag_Tm: float) -> float:
         """Return the moment, T m, that together with its lag makes `strength_Tm`, coming from `moment_Tm` with the lag
@@ -179,12 +201,25 @@ class Brake(NamedTuple):
         wanted_Tm = moment_Tm
         for _ in range(NEWTON_STEPS):
             change_Tm = wanted_Tm - moment_Tm
-            short_Tm = strength_Tm - wanted_Tm - self.lag_after_Tm(lag_Tm, change_Tm)
+            short_Tm = strength_Tm - wanted_Tm - self.lag.after_Tm(lag_Tm, change_Tm)
             # at a standstill the branch is the one that leads to the wanted strength
-            branch_Tm = math.copysign(self.branch_Tm, -(change_Tm or short_Tm))
-            fading = abs(lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm) / self.turn_Tm
+            branch_Tm = math.copysign(self.lag.branch_Tm, -(change_Tm or short_Tm))
+            fading = abs(lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.lag.turn_Tm) / self.lag.turn_Tm
             wanted_Tm += short_Tm / max(1.0 - fading, MIN_GAIN)
         return wanted_Tm
+
+
+def friction_of(plant: PlantParameters) -> Friction:
+    """Return the friction between roller and insert of a plant, as the simulated device has it.
+
+    A plant with [pad] or [second] has the numbers too, though its own friction is another.
+    """
+    return Friction(
+        presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
+        viscous_N_s_mm=plant.friction.viscous_N_s_mm,
+        static_ratio=plant.friction.static_to_kinetic,
+        stribeck_speed_mm_s=plant.friction.stribeck_speed_mm_s,
+    )
 
 
 def drive_of(plant: PlantParameters) -> Drive:
@@ -218,23 +253,15 @@ def brake_of(plant: PlantParameters) -> Brake:
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
     if plant.second is not None:
         return _second_brake(gap_mm, plant, plant.second)
-    moment_Tm = np.asarray(radial_moment_Tm(gap_mm, plant), dtype=np.float64)
-    largest_Tm = float(radial_moment_Tm(np.array([SMALLEST_GAP_MM]), plant)[0])
-    branch_Tm = plant.field.hysteresis_percent / 100.0 * largest_Tm
-    weakest_Tm, strongest_Tm = float(moment_Tm[-1]) - branch_Tm, float(moment_Tm[0]) + branch_Tm
+    moment_Tm, lag = np.asarray(radial_moment_Tm(gap_mm, plant), dtype=np.float64), lag_of(plant)
+    weakest_Tm, strongest_Tm = float(moment_Tm[-1]) - lag.branch_Tm, float(moment_Tm[0]) + lag.branch_Tm
     force = force_over_moment(plant, weakest_Tm, strongest_Tm)
     strength_Tm = np.linspace(weakest_Tm, strongest_Tm, MOMENT_POINTS)
-    friction = Friction(
-        presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
-        viscous_N_s_mm=plant.friction.viscous_N_s_mm,
-        static_ratio=plant.friction.static_to_kinetic,
-        stribeck_speed_mm_s=plant.friction.stribeck_speed_mm_s,
-    )
+    friction = friction_of(plant)
     return Brake(
         gap_mm,
         moment_Tm,
-        branch_Tm,
-        assumed.hysteresis_scale * largest_Tm,
+        lag,
         strength_Tm,
         np.array([force.at(strength) for strength in strength_Tm.tolist()]),
         PronySeries(plant.relaxation.fractions, plant.relaxation.times_s),
@@ -252,8 +279,7 @@ def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameter
     return Brake(
         gap_mm,
         field_T,
-        branch_T,
-        1e-3 * max(second.play_mT),
+        Lag(branch_T, 1e-3 * max(second.play_mT)),
         strength_T,
         np.array([fresh_N(1e3 * strength, second) for strength in strength_T.tolist()]),
         PronySeries((second.creeping_share,), (second.creep_s,)),
@@ -348,8 +374,8 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
     offset_N = brake.sliding_N(0.0, hand_mm_s)
     scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
     # a gap that has been opened brakes a little more than one that was never closed
-    least_N = brake.fresh_at_N(float(brake.moment_Tm[-1]), brake.branch_Tm)
-    greatest_N = brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.branch_Tm)
+    least_N = brake.fresh_at_N(float(brake.moment_Tm[-1]), brake.lag.branch_Tm)
+    greatest_N = brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.lag.branch_Tm)
     series = brake.relaxation
     rested_Tm = float(np.interp(brake.rested_mm, brake.gap_mm, brake.moment_Tm))
     relax, memory = series.discretise(step_s), series.relaxed(brake.fresh_at_N(rested_Tm))
@@ -373,7 +399,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
     They begin at rest at the gap of the first force.
     """
     gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
-    moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.branch_Tm
+    moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.lag.branch_Tm
 
     def wanted_mm(strength_Tm: float) -> float:
         return float(np.interp(brake.moment_for_Tm(strength_Tm, moment_Tm, lag_Tm), moments_Tm, gaps_mm))
@@ -400,7 +426,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
         found.append(gap_mm)
         arrived_Tm = float(np.interp(gap_mm, brake.gap_mm, brake.moment_Tm))
         if arrived_Tm != moment_Tm:
-            lag_Tm = brake.lag_after_Tm(lag_Tm, arrived_Tm - moment_Tm)
+            lag_Tm = brake.lag.after_Tm(lag_Tm, arrived_Tm - moment_Tm)
         moment_Tm, before_Tm = arrived_Tm, now_Tm
     return np.array(found)
 
@@ -474,7 +500,7 @@ def run(options: argparse.Namespace) -> Found:
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
     plant = with_insert(plant, options.insert)
     brake = brake_of(plant)
-    most_N = brake.sliding_N(brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.branch_Tm), TURNED_MM_S)
+    most_N = brake.sliding_N(brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.lag.branch_Tm), TURNED_MM_S)
     try:
         figures = bound(plant, time_s, force_N).figures()
         return Found({**figures, "least_N": brake.open_N(TURNED_MM_S), "most_N": most_N})
@@ -507,8 +533,8 @@ def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tu
     """
     steps = len(moment_Tm)
     change_Tm = np.diff(moment_Tm)
-    kept = np.exp(-np.abs(change_Tm) / brake.turn_Tm)
-    pulled = np.sign(change_Tm) * (lag_Tm[:-1] + np.sign(change_Tm) * brake.branch_Tm) / brake.turn_Tm * kept
+    kept = np.exp(-np.abs(change_Tm) / brake.lag.turn_Tm)
+    pulled = np.sign(change_Tm) * (lag_Tm[:-1] + np.sign(change_Tm) * brake.lag.branch_Tm) / brake.lag.turn_Tm * kept
     # the first lag is what it is
     of_gaps = sparse.diags(
         [np.concatenate([[0.0], pulled]) * turned, -pulled * turned[:-1]], [0, -1], shape=(steps, steps)

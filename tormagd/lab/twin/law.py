@@ -11,11 +11,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from tormagd.lab.arrays import Array
+from tormagd.lab.ideal_carriage import friction_of, lag_of
 from tormagd.lab.twin.excerpt import GRID_HZ, Excerpt
 from tormagd.physics.force import TORMAG, Elastomer, reduced
-from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
-from tormagd.simulation.gap_field import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
 
@@ -80,8 +79,8 @@ def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
     """Return the fresh insert's kinetic friction (n) along the way, N, as warm as it is."""
     moment_Tm = moments_Tm(plant, way.gap_mm)
     warmer_K = way.temperature_C - plant.assumed.ambient_C
-    fresh = fresh_N(plant, moment_Tm + _lag_Tm(plant, moment_Tm))
-    return fresh * (1.0 + plant.thermal.force_percent_K / 100.0 * warmer_K)
+    lag_Tm = lag_of(plant).along_Tm(moment_Tm, 0.0, float(moment_Tm[0]))
+    return fresh_N(plant, moment_Tm + lag_Tm) * (1.0 + plant.thermal.force_percent_K / 100.0 * warmer_K)
 
 
 def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh: Array) -> Array:
@@ -101,29 +100,9 @@ def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh
     return np.interp(way.time_s - 1e-3 * plant.force_sensor.delay_ms, way.time_s, force)
 
 
-def _lag_Tm(plant: PlantParameters, moment_Tm: Array) -> Array:
-    """Return what hysteresis adds to the moments (n), T m, as `GapField` has it."""
-    largest_Tm = float(moments_Tm(plant, np.array([SMALLEST_GAP_MM]))[0])
-    branch_Tm = plant.field.hysteresis_percent / 100.0 * largest_Tm
-    changes = np.diff(moment_Tm, prepend=moment_Tm[0])
-    kept = np.exp(-np.abs(changes) / (plant.assumed.hysteresis_scale * largest_Tm))
-    lag, lags = 0.0, []
-    for share, added in zip(kept.tolist(), (-np.sign(changes) * branch_Tm * (1.0 - kept)).tolist(), strict=True):
-        lag = share * lag + added
-        lags.append(lag)
-    return np.array(lags)
-
-
 def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
     """Return the friction at the roller (n), N, for kinetic levels (n) and handle speeds (n)."""
-    said = plant.friction
-    friction = Friction(
-        presliding_stiffness_N_mm=said.presliding_stiffness_N_mm,
-        viscous_N_s_mm=said.viscous_N_s_mm,
-        static_ratio=said.static_to_kinetic,
-        stribeck_speed_mm_s=said.stribeck_speed_mm_s,
-    )
-    bristles_mm, forces = 0.0, []
+    friction, bristles_mm, forces = friction_of(plant), 0.0, []
     for speed, level_N in zip(speed_mm_s.tolist(), kinetic_N.tolist(), strict=True):
         force_N, bristles_mm = friction.advance(bristles_mm, speed, level_N, 1.0 / GRID_HZ)
         forces.append(force_N)
