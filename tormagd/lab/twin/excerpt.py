@@ -141,26 +141,23 @@ class Taking:
         self._moves: dict[str, list[Array]] = {side: [] for side in SIDES}
 
     def see(self, seen: Seen) -> None:
-        """Take a message of a recording; snapshots are passed over."""
-        if seen.is_tick:
-            tick = seen.message
-            *numbers, mode = msgspec.structs.astuple(tick)
-            self.take((*numbers, float(mode == "RUN")))
+        """Take a message of a recording; snapshots, and ticks without a time, are passed over.
 
-    def take(self, row: tuple[float, ...]) -> None:
-        """Take a tick: a value for each of NUMBERS, and 1 where the device runs by the duties, else 0."""
-        now_s = row[0]
-        if self._refusal or math.isnan(now_s):
+        Time that falls, or a recording over LONGEST_S, is refused by `done`; what follows is passed over.
+        """
+        if not seen.is_tick or self._refusal or math.isnan(now_s := seen.message.monotonic_s):
             return
-        if math.isnan(self._first_s):
+        if not self._rows:
             self._first_s = now_s
-        if self._rows and not now_s >= self._rows[-1][0]:
-            self._refusal = f"monotonic_s = {now_s} after {self._rows[-1][0]}: allowed is time that rises"
+        before_s = self._rows[-1][0] if self._rows else now_s
+        if now_s < before_s:
+            self._refusal = f"monotonic_s = {now_s} after {before_s}: allowed is time that rises"
         elif now_s - self._first_s > LONGEST_S:
             self._refusal = f"{now_s - self._first_s:.0f} s of recording: allowed are {LONGEST_S:g} s"
-        elif self._rows and (now_s - self._first_s) // CHUNK_S > (self._rows[-1][0] - self._first_s) // CHUNK_S:
+        elif (now_s - self._first_s) // CHUNK_S > (before_s - self._first_s) // CHUNK_S:
             self._end_chunk()
-        self._rows.append(row)
+        *numbers, mode = msgspec.structs.astuple(seen.message)
+        self._rows.append((*numbers, float(mode == "RUN")))
 
     def done(self) -> Excerpt:
         """Return what all ticks said. Raises LabError, which names the recording, where they do not serve."""
