@@ -230,18 +230,18 @@ def fit(
     return replace(model, metadata=msgspec.structs.replace(model.metadata, metrics=metrics))
 
 
-def require_rising(model: ForceModel, points: int = 64) -> None:
-    """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1% of its span.
+def require_rising(model: ForceModel) -> None:
+    """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1 % of its span.
 
-    Tried are `points` fields over those seen in training, at the greatest displacement, the middle rate and the least
-    iron. Where the force falls, more than one field gives it.
+    Else do nothing. Tried are 64 fields over those seen in training, at the greatest displacement, the middle rate and
+    the least iron. Where the force falls, more than one field gives it.
     """
     ranges = dict(zip(FEATURES, model.feature_ranges, strict=True))
     rate_mm_s = sum(ranges["rate_mm_s"]) / 2.0
     rows = np.array(
         [
             (ranges["displacement_mm"][1], rate_mm_s, field_mT, ranges["cip_percent"][0])
-            for field_mT in np.linspace(*ranges["field_mT"], points)
+            for field_mT in np.linspace(*ranges["field_mT"], 64)
         ]
     )
     force_N = model.predict(rows)

@@ -2,8 +2,10 @@
 
 import csv
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +45,17 @@ class Dataset:
     force_N: Array
     cycle: NDArray[np.int64] | None = None
     time_s: Array | None = None
+
+    @classmethod
+    def of(cls, columns: Mapping[str, NDArray[Any]]) -> "Dataset":
+        """Return the data of columns by name, as the method `columns` gives them; `cycle` is cut to whole numbers.
+
+        Columns of other names are passed over, and values are not checked. Raises KeyError without one of COLUMNS,
+        LabError as the class, ValueError for columns of different lengths.
+        """
+        cycle = columns["cycle"].astype(np.int64) if "cycle" in columns else None
+        features = np.column_stack([columns[name] for name in FEATURES])
+        return cls(features, columns["force_N"], cycle, columns.get("time_s"))
 
     def __post_init__(self) -> None:
         if len(self.force_N) < 2:
@@ -93,9 +106,7 @@ class Dataset:
 
     def subset(self, rows: NDArray[np.integer] | Mask) -> "Dataset":
         """Return the chosen `rows`, indices or a mask, as data of their own."""
-        cycle = None if self.cycle is None else self.cycle[rows]
-        time_s = None if self.time_s is None else self.time_s[rows]
-        return Dataset(self.features[rows], self.force_N[rows], cycle, time_s)
+        return Dataset.of({name: column[rows] for name, column in self.columns().items()})
 
     def split(self, validation_share: float, seed: int) -> tuple["Dataset", "Dataset"]:
         """Split at random into (training, validation), the same way for the same seed.
@@ -125,13 +136,10 @@ def read_csv(path: Path) -> Dataset:
     Raises `LabError` naming the row of the file, the column, the value and what is allowed.
     """
     named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, allowed=ALLOWED, is_exact=True)
-    cycle = None
-    if "cycle" in named:
-        cycle = named["cycle"].astype(np.int64)
-        for row in np.flatnonzero(cycle != named["cycle"])[:1].tolist():
-            found = named["cycle"][row]
-            raise LabError(f"{path}: row {row + 2}, cycle: '{found:g}' is not allowed, only whole numbers")
-    return Dataset(np.column_stack([named[name] for name in FEATURES]), named["force_N"], cycle, named.get("time_s"))
+    cycle = named.get("cycle", np.zeros(0))
+    for row in np.flatnonzero(cycle != np.floor(cycle))[:1].tolist():
+        raise LabError(f"{path}: row {row + 2}, cycle: '{cycle[row]:g}' is not allowed, only whole numbers")
+    return Dataset.of(named)
 
 
 def write_csv(path: Path | str, dataset: Dataset) -> None:

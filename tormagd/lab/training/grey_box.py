@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.memory import records, relaxed_N
+from tormagd.lab.training.memory import records, relaxed_N, times_of
 from tormagd.model.features import FIELD, RATE
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.relaxation import PronySeries
@@ -95,7 +95,7 @@ def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries,
     rest count; the others make the state that they begin in. Raises `DomainError` without `time_s`.
     """
     at_rest = holds.features[:, RATE] == 0.0
-    still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(holds)]
+    still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(times_of(holds))]
     terms = len(START_TIMES_S)
 
     def series(parameters: Array) -> tuple[PronySeries, PronySeries]:

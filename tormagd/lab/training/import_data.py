@@ -23,8 +23,8 @@ from tormagd.lab.main import Found
 from tormagd.lab.options import within
 from tormagd.lab.pages import subplots
 from tormagd.lab.training.dataset import ALLOWED, Dataset, write_csv
+from tormagd.lab.training.memory import records
 from tormagd.model.displacement import MOBILISED_MM
-from tormagd.model.features import FEATURES
 
 MAX_FILE_BYTES = 1 << 28
 LENGTH = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1e3}
@@ -125,9 +125,7 @@ def run(options: argparse.Namespace) -> Found:
             raise LabError(f"{path}: its columns are not taken as those of {options.files[0]}: {part.taken}")
         parts.append(part)
     columns = [part.data.columns() for part in parts]
-    joined = {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
-    features = np.column_stack([joined[name] for name in FEATURES])
-    data = Dataset(features, joined["force_N"], joined.get("cycle"), joined.get("time_s"))
+    data = Dataset.of({name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     missing = _missing(data)
     write_csv(options.out, data)
     if options.picture is not None:
@@ -167,12 +165,9 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
         if not (values.min() >= least and values.max() <= most):
             seen = f"{name} from {values.min():g} to {values.max():g}"
             raise LabError(f"{path}: {seen}: allowed is {least:g}..{most:g}; is its unit another?")
-    labels = quantities["cycle"].astype(np.int64) if "cycle" in quantities else None
-    features = np.column_stack([quantities[name] for name in FEATURES])
-    data = Dataset(features, quantities["force_N"], labels, quantities.get("time_s")).subset(~far)
     left_out = {"missing": missing, "duplicate": duplicates, "outlier": int(np.count_nonzero(far))}
     taken = {name: f"{column.name} ({column.unit})" for name, column in columns.items()}
-    return Imported(data, taken, made, left_out)
+    return Imported(Dataset.of(quantities).subset(~far), taken, made, left_out)
 
 
 def _stated(text: str) -> tuple[str, Stated]:
@@ -186,12 +181,9 @@ def _stated(text: str) -> tuple[str, Stated]:
     if not colon:
         name, unit = column, ""
     if quantity not in UNITS or not equals or (colon and unit not in UNITS[quantity]):
-        raise LabError(f"--column {text[:80]}: allowed is QUANTITY=NAME[:UNIT] with {_units()}")
+        known = "; ".join(f"{each} in {', '.join(units)}" for each, units in UNITS.items() if each != "cycle")
+        raise LabError(f"--column {text[:80]}: allowed is QUANTITY=NAME[:UNIT] with {known}")
     return quantity, (name, unit or None)
-
-
-def _units() -> str:
-    return "; ".join(f"{quantity} in {', '.join(units)}" for quantity, units in UNITS.items() if quantity != "cycle")
 
 
 def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], dict[str, Array], int]:
@@ -267,13 +259,8 @@ def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[s
             f"{path}: {columns['time_s'].name} falls after {before_s:g} s; allowed is to rise, and to begin anew with "
             "each cycle, a column"
         )
-    if min(map(len, _records(found["time_s"]))) < MIN_ROWS:
+    if min(rows.stop - rows.start for rows in records(found["time_s"])) < MIN_ROWS:
         raise LabError(f"{path}: a cycle of one row; at least {MIN_ROWS} are needed")
-
-
-def _records(time_s: Array) -> list[Array]:
-    """Return the places (n) of each record's rows; a new one begins wherever time falls."""
-    return np.split(np.arange(len(time_s)), np.flatnonzero(np.diff(time_s) < 0.0) + 1)
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -351,10 +338,8 @@ def _outliers(path: Path, force_N: Array) -> Mask:
     off_N = np.abs(force_N - np.median(around, axis=1))
     range_N = np.subtract(*np.percentile(force_N, (98.0, 2.0)))
     most_N = max(OUTLIER_SDS * 1.4826 * float(np.median(off_N)), OUTLIER_OF_RANGE * float(range_N))
-    far: Mask = off_N > most_N
     # rows of a table without order jump everywhere: there nothing is an outlier by its neighbours
-    if np.median(off_N) > OUTLIER_OF_RANGE * range_N:
-        return np.zeros(len(force_N), bool)
+    far: Mask = (off_N > most_N) & (np.median(off_N) <= OUTLIER_OF_RANGE * range_N)
     if (share := float(far.mean())) > MAX_OUTLIERS:
         raise LabError(f"{path}: {share:.1%} of the forces are far from the next ones; allowed is {MAX_OUTLIERS:.0%}")
     return far
@@ -396,7 +381,7 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
     if "rate_mm_s" not in quantities:
         if place is None or time_s is None:
             raise LabError(f"{path}: no column is rate_mm_s; needed is that, or time_s and displacement_mm")
-        rates = [np.gradient(place[rows], time_s[rows]) for rows in _records(time_s)]
+        rates = [np.gradient(place[rows], time_s[rows]) for rows in records(time_s)]
         quantities["rate_mm_s"] = np.concatenate(rates)
         made.append("rate_mm_s from displacement_mm over time_s")
     rate = quantities["rate_mm_s"]
@@ -404,10 +389,8 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
         quantities["displacement_mm"] = np.full(len(rate), MOBILISED_MM)
         made.append(f"displacement_mm = {MOBILISED_MM:g}: every row is taken as sliding")
     elif place.min() < 0.0 or place.max() > MOBILISED_MM:
-        turned = np.flatnonzero(np.diff(np.sign(rate)) != 0.0) + 1
-        begins = np.zeros(len(rate), np.int64)
-        begins[turned] = turned
-        begins = np.maximum.accumulate(begins)
+        has_turned = np.diff(np.sign(rate), prepend=np.sign(rate[0])) != 0.0
+        begins = np.maximum.accumulate(np.where(has_turned, np.arange(len(rate)), 0))
         quantities["displacement_mm"] = np.minimum(np.abs(place - place[begins]), MOBILISED_MM)
         made.append("displacement_mm from positions: travel since the last turn")
     quantities["rate_mm_s"] = np.abs(rate)

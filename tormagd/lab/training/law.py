@@ -11,6 +11,7 @@ network, so one that rises with the field is fitted to the law. The file's metri
 
 import datetime
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
@@ -181,8 +182,10 @@ def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: i
         weight[:, FIELD] = np.exp(weight[:, FIELD])
         return weight, numbers[weights : weights + hidden], np.exp(numbers[weights + hidden : -1])
 
-    def jacobian(numbers: Array) -> tuple[Array, Array]:
+    @lru_cache(maxsize=1)  # the curvature is asked for where the cost was
+    def jacobian(packed: bytes) -> tuple[Array, Array]:
         """The errors (n), and their slopes (n x p)."""
+        numbers = np.frombuffer(packed)
         weight, bias, output = split(numbers)
         units = expit(inputs @ weight.T + bias)
         by_bias = units * (1.0 - units) * output
@@ -192,11 +195,11 @@ def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: i
         return units @ output + numbers[-1] - targets, np.concatenate(slopes, axis=1)
 
     def cost(numbers: Array) -> tuple[float, Array]:
-        error, slopes = jacobian(numbers)
+        error, slopes = jacobian(numbers.tobytes())
         return 0.5 * float(error @ error), slopes.T @ error
 
     def curvature(numbers: Array) -> Array:
-        slopes = jacobian(numbers)[1]
+        slopes = jacobian(numbers.tobytes())[1]
         return slopes.T @ slopes
 
     found = minimize(

@@ -27,6 +27,7 @@ DAMPING_DOWN = 0.1
 DAMPING_UP = 10.0
 MIN_POSITIVE = 1e-3
 "Least start of a weight that has to stay positive."
+MIN_IMPROVEMENT = 1e-4
 MIN_DAMPING = 1e-15
 GREATEST_DAMPING = 1e10
 """Marquardt's schedule with the factors that trainlm made usual; errors are means, so they fit any number of rows."""
@@ -70,14 +71,13 @@ def train(
     *,
     epochs: int = 200,
     patience: int = 10,
-    least_improvement: float = 1e-4,
     rising: bool = False,
 ) -> Training:
     """Fit `network`, of float64, to `training` in place, and leave it with the weights that did best on `validation`.
 
     These are the weights of the start, `best.epoch` 0, where no step did better. It stops (`stopped_by`) after `epochs`
     accepted steps ("epochs"), or when no damping lowers the training error any more ("damping"). It also stops when
-    `patience` steps in a row have not lowered the validation error by the share `least_improvement` ("validation").
+    `patience` steps in a row have not lowered the validation error by the share MIN_IMPROVEMENT ("validation").
     Deterministic for a given network and data.
 
     With `rising` the force rises with the field everywhere, whatever the data. The start is changed first, as in
@@ -97,11 +97,9 @@ def train(
     error = _mean_square(network, inputs, targets)
     check_error = _mean_square(network, check_inputs, check_targets)
     best = Epoch(0, to_N * math.sqrt(error), to_N * math.sqrt(check_error))
-    reference = best.validation_rmse_N  # what the patience is measured against
+    reference, improved = best.validation_rmse_N, 0  # what the patience is measured against
     history: list[Epoch] = []
-    waited = 0
-    damping = INITIAL_DAMPING
-    stopped_by = "epochs"
+    damping, stopped_by = INITIAL_DAMPING, "epochs"
     for epoch in tqdm(range(1, epochs + 1), desc="training", unit="epoch", disable=None, leave=False):
         normal, gradient = _normal_equations(network, inputs, targets)
         per_change = torch.where(is_positive, weights, 1.0)
@@ -125,11 +123,9 @@ def train(
         history.append(step)
         if step.validation_rmse_N < best.validation_rmse_N:
             best, best_weights = step, weights
-        if step.validation_rmse_N < reference * (1 - least_improvement):
-            reference, waited = step.validation_rmse_N, 0
-        else:
-            waited += 1
-        if waited == patience:
+        if step.validation_rmse_N < reference * (1 - MIN_IMPROVEMENT):
+            reference, improved = step.validation_rmse_N, epoch
+        elif epoch - improved == patience:
             stopped_by = "validation"
             break
     torch.nn.utils.vector_to_parameters(best_weights, network.parameters())

@@ -10,10 +10,9 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
 
 
-def records(data: Dataset) -> list[slice]:
-    """Return the rows of each record: a new one begins wherever time goes back. Raises `DomainError` without
-    `time_s`."""
-    starts = [0, *(np.flatnonzero(np.diff(times_of(data)) < 0) + 1).tolist(), len(data)]
+def records(time_s: Array) -> list[slice]:
+    """Return the rows of each record in times (n), in order: a new one begins wherever time goes back."""
+    starts = [0, *(np.flatnonzero(np.diff(time_s) < 0) + 1).tolist(), len(time_s)]
     return [slice(first, last) for first, last in itertools.pairwise(starts)]
 
 
@@ -34,7 +33,7 @@ def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
     times = times_of(data)
     # records with the same times run side by side: a laboratory repeats one program, and rows are slow one by one
     alike: dict[bytes, list[slice]] = {}
-    for rows in records(data):
+    for rows in records(times):
         alike.setdefault(times[rows].tobytes(), []).append(rows)
     forces = np.empty(len(data))
     for group in alike.values():

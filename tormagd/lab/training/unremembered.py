@@ -114,7 +114,7 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
     record of `rows` begins without a lag.
     """
     lag_mT = np.zeros_like(field_mT)
-    for record in records(rows):
+    for record in records(times_of(rows)):
         now, found = 0.0, []
         for change in np.diff(field_mT[record], prepend=field_mT[record.start]).tolist():
             if change != 0.0:
@@ -132,7 +132,7 @@ def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:
     """
     times, away_N = times_of(rows), np.zeros_like(driving_N)
     fractions = np.array(memory.fractions)
-    for record in records(rows):
+    for record in records(times):
         steps_s = np.diff(times[record], prepend=times[record.start])
         decays = np.exp(-steps_s[:, np.newaxis] / np.array(memory.times_s))
         driving = driving_N[record]
