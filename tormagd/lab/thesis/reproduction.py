@@ -388,13 +388,10 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
     coverage of each design by objective, `best` the greatest coverage and its spread by use case and objective. Besides
     `gap_speed_mm_s` by objective, `max_seconds` and `note`. Raises ValueError without a global run.
     """
-    starts: list[Json] = []
-    local: list[Json] = []
-    corners: list[Json] = []
-    for key, run in runs.items():
-        use_case, start, objective, solver = key
+    rows: dict[RunKey, Json] = {}
+    for (use_case, start, objective, solver), run in runs.items():
         outcome = outcomes[run]
-        row: Json = {
+        rows[use_case, start, objective, solver] = {
             "use_case": use_case,
             "start": start,
             "objective": objective,
@@ -404,10 +401,10 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
             "volume_cm3": 1e-3 * outcome.volume_mm3,
             "seconds": outcome.seconds,
         }
-        if objective == "corners":
-            corners.append({**row, "solver": solver})
-        else:
-            (starts if solver == "global" else local).append(row)
+    starts, local = (
+        [row for (*_, objective, by), row in rows.items() if by == solver and objective != "corners"]
+        for solver in ("global", "local")
+    )
     designs = []
     for number, case in USE_CASES.items():
         found = [
@@ -428,7 +425,9 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
     return {
         "starts": starts,
         "local_starts": local,
-        "corner_cost_starts": corners,
+        "corner_cost_starts": [
+            row | {"solver": solver} for (*_, objective, solver), row in rows.items() if objective == "corners"
+        ],
         "thesis_designs": designs,
         "best": [
             {"use_case": number, "objective": objective, "coverage": max(values), "spread": max(values) - min(values)}
