@@ -1,5 +1,7 @@
 """The relaxation-aware model on a small synthetic element with a known memory."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,20 +24,16 @@ def parts(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return free, free * 0.5 * (field / 300) ** 2
 
 
-def element(features: np.ndarray, time_s: np.ndarray, cycle: np.ndarray) -> Dataset:
-    empty = Dataset(features, np.zeros(len(features)), cycle, time_s)
+def records(displacement: np.ndarray, time_s: np.ndarray, fields: tuple[float, ...]) -> Dataset:
+    """The element pressed alike at each field, with noise."""
+    rate = np.gradient(displacement, time_s)
+    pressed, field = np.column_stack((displacement, rate)), np.repeat(fields, len(time_s))
+    features = np.column_stack((np.tile(pressed, (len(fields), 1)), field, np.full_like(field, 45)))
+    cycle = np.arange(len(field)) // (len(time_s) // 4)
+    empty = Dataset(features, np.zeros(len(field)), cycle, np.tile(time_s, len(fields)))
     free, added = parts(features)
     force = relaxed_N(SERIES, free, empty) + relaxed_N(FIELD_SERIES, added, empty)
-    return Dataset(features, force + np.random.default_rng(0).normal(0, NOISE_N, len(force)), cycle, time_s)
-
-
-def records(displacement: np.ndarray, time_s: np.ndarray, fields: tuple[float, ...]) -> Dataset:
-    rate = np.gradient(displacement, time_s)
-    blocks = [
-        np.column_stack((displacement, rate, np.full_like(rate, field), np.full_like(rate, 45))) for field in fields
-    ]
-    cycle = np.arange(len(time_s) * len(fields)) // (len(time_s) // 4)
-    return element(np.concatenate(blocks), np.tile(time_s, len(fields)), cycle)
+    return replace(empty, force_N=force + np.random.default_rng(0).normal(0, NOISE_N, len(force)))
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +65,8 @@ def test_a_series_is_recovered_from_holds_even_when_the_level_is_wrong(holds: Da
 
 def test_records_that_begin_late_were_run_before() -> None:
     # a constant force: after n passes of 10 s it has relaxed for n * 10 s
-    features = np.eye(1, 4).repeat(10, axis=0)
     for passes in (0, 3):
-        data = Dataset(features, np.zeros(10), None, np.arange(1.0, 11.0) + 10 * passes)
+        data = Dataset(np.zeros((10, 4)), np.zeros(10), None, np.arange(1.0, 11.0) + 10 * passes)
         force = relaxed_N(PronySeries((0.5,), (20.0,)), np.full(10, 8.0), data)
         ramp = 20.0 * (1 - np.exp(-1 / 20.0))  # the first step is a ramp of 1 s
         remembered = 4.0 * ramp * np.exp(-(9 + 10 * passes) / 20.0)
