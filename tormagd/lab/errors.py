@@ -13,10 +13,12 @@ class LabError(ValueError):
 
 
 def not_installed(module: str) -> str:
-    """Return one sentence that pip's package of the module `module` is missing, with the command that installs it.
+    """Return the sentence `PACKAGE is not installed: COMMAND`, for the module `module`; whether it is missing is not
+    checked.
 
-    PACKAGE_OF names packages that are not called like their module. The command takes the extra `lab`. For a packaged
-    tormagd it takes that package alone, in the versions that tormagd needs, into the folder where tormagd is installed.
+    PACKAGE is pip's name, by PACKAGE_OF where it differs. COMMAND installs tormagd's extra `lab`. For a packaged
+    tormagd it installs that package alone, in the version that tormagd needs, into the folder of tormagd. Raises
+    PackageNotFoundError for a packaged tormagd without its metadata.
     """
     package = PACKAGE_OF.get(module, module)
     library = Path(__file__).resolve().parents[2]

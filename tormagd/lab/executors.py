@@ -17,9 +17,9 @@ ResultT = TypeVar("ResultT")
 
 
 def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> None:
-    """Add `--workers`, by default `workers`, and `--dask` to `parser`.
+    """Add the options `--workers`, 1..1024, and `--dask ADDRESS` to `parser`; without the latter `dask` is None.
 
-    `needed` says what a cluster's workers must have installed.
+    `workers` is the default, and not checked. `needed` says in the help what a cluster's workers must have installed.
     """
     parser.add_argument("--workers", type=WORKERS, default=workers, help="processes on this machine (%(default)s)")
     parser.add_argument(
@@ -29,10 +29,12 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 
 @contextmanager
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
-    """Give the executor that `options` ask for, and shut it down at the end: processes here, or a Dask cluster.
+    """Give the executor that `options.workers` and `options.dask` ask for, as a context: processes here, or a Dask
+    cluster.
 
-    Raises OSError where no scheduler answers at the address `options.dask`, LabError for one that is no address, and
-    ModuleNotFoundError where Dask is not installed.
+    `dask` None: so many new processes of this machine, which inherit nothing of this one. The end of the context waits
+    for all runs, and ends the processes, or lets the cluster go. Raises OSError where no scheduler answers at `dask`,
+    LabError for one that is no address, and ModuleNotFoundError where Dask is not installed.
     """
     if options.dask is None:
         # a fork of this process would inherit the locks of libraries' threads, but not the threads
@@ -56,8 +58,9 @@ def finished(
     """Run `function` on every item; yield each item with its done future, in order of completion, beside a progress
     bar.
 
-    All items are handed to `executor` at the first step. A run's error stays in its future, and stops no other. A
-    caller that stops iterating cancels the runs that have not begun.
+    All items are handed to `executor` at the first step. An error of a run, also of a process that dies, stays in its
+    future: `result()` raises it, and the other runs go on. A caller that stops iterating cancels the runs that have not
+    begun. The bar counts `unit`, on stderr, and only on a terminal.
     """
     pending = {executor.submit(function, item): item for item in items}
     try:

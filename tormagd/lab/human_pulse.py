@@ -21,9 +21,11 @@ EDGE_S = 0.5
 
 
 def measured_pulse() -> Array:
-    """Return heartpy's recording (n) as shipped, at SOURCE_HZ, in the light sensor's own unit, which is no force.
+    """Return heartpy's recording (n, some 25 s) as shipped, at SOURCE_HZ, in the light sensor's own unit, which is no
+    force.
 
-    Raises ModuleNotFoundError where heartpy is not installed, OSError where its file is missing.
+    The file is read anew each time. Raises ModuleNotFoundError where heartpy is not installed, OSError where its file
+    is missing, ValueError for a cell that is no number.
     """
     # found, not imported: heartpy's import fails beside a current setuptools
     package = importlib.util.find_spec("heartpy")
@@ -37,8 +39,9 @@ def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int
     reaches.
 
     It is low-passed without lag, and lasts `duration_s` at `rate_hz`. Times begin at 0, EDGE_S into the recording.
-    Raises ValueError where the recording, less EDGE_S at both ends, is shorter than `duration_s`, and for no sample at
-    all. Raises ModuleNotFoundError and OSError as `measured_pulse`.
+    Forces are not checked: with `most_N` the smaller the pulse is upside down. Raises ValueError where the recording,
+    less EDGE_S at both ends, is shorter than `duration_s`, and for no sample at all. Raises ModuleNotFoundError and
+    OSError as `measured_pulse`.
     """
     raw = measured_pulse()
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=SOURCE_HZ, output="sos"), raw)
@@ -56,17 +59,18 @@ def scaled(values: Array, least: float, most: float) -> Array:
     """Return `values` (n) mapped linearly so that they range from `least` to `most`; with `most` the smaller they are
     mirrored.
 
-    Values that are all equal are not refused, and give NaN. Raises ValueError where there are none.
+    The given array stays. Values that are all equal are not refused: they give NaN, with NumPy's RuntimeWarning. A NaN
+    among them makes all NaN. Raises ValueError where there are none.
     """
     found: Array = least + (values - values.min()) / np.ptp(values) * (most - least)
     return found
 
 
 def recorded(folder: str) -> list[Path]:
-    """Return the CSV files in `folder` of the measured data, sorted; none unless the variable TORMAG_DATA names its
-    place.
+    """Return the CSV files of `folder`, sorted by name, within the folder of measured data that TORMAG_DATA names.
 
-    None also where there is no such folder in it.
+    The result is empty where this variable of the environment is not set, or there is no such folder. Nothing is
+    opened.
     """
     data = os.environ.get("TORMAG_DATA")
     return sorted((Path(data) / folder).glob("*.csv")) if data else []

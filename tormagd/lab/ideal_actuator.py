@@ -20,7 +20,7 @@ from tormagd.simulation.plant import Plant
 def put_gap(plant: Plant, gap_mm: float) -> None:
     """Move both carriages of `plant` at once, each by half the way, to the gap `gap_mm`; screws and encoders follow.
 
-    No stop holds them, and speeds and currents stay as they are.
+    `gap_mm` is not checked, and no stop holds the carriages. Speeds and currents stay as they are.
     """
     before_mm, lead_mm_rad = plant.gap_mm, plant.parameters.screw.lead_mm / math.tau
     for axis in (plant.left, plant.right):
@@ -64,9 +64,9 @@ class IdealCarriages(Actuator):
         """Put the gap of the simulated device where `plan` wants it at `now_s`, set `reference` to it, and return
         duties of 0.
 
-        It goes no further than the top speed reaches in `dt_s`, above 0; where that falls short, the result has the
-        limit RATE. `plan` None holds the gap within its ends. With or without one it opens while `is_over`, a force
-        over the ceiling. What was measured plays no part.
+        The gap goes no further than the top speed reaches in `dt_s`, above 0, which is not checked. Where that falls
+        short, the result has the limit RATE. `plan` None holds the gap, within the scene's. While `is_over`, a force
+        over the ceiling, it opens, with or without a plan. `measurement` and `measured` play no part.
         """
         before_mm = self._plant.gap_mm
         wanted_mm = self._open_mm if is_over else min(max(before_mm, self._closed_mm), self._open_mm)

@@ -91,10 +91,12 @@ class Drive(NamedTuple):
         return -self._sped_up(-self.pull_mm_s2_N * self.pull_N.at(gap_mm), -speed_mm_s, dt_s)
 
     def _sped_up(self, pull_mm_s2: float, speed_mm_s: float, dt_s: float) -> float:
-        """Return the largest speed, mm/s, `dt_s` after `speed_mm_s`, at full voltage to open against the pull
+        """Return the speed of the gap, mm/s, `dt_s` after `speed_mm_s`, at full voltage to open against the pull
         `pull_mm_s2`.
 
-        A gap that closes may turn round within the step, or stand where friction is more than what is left over.
+        It is the largest that can be reached; opening is positive. A gap that closes brakes, and may turn round within
+        the step. It stands, at 0, where friction is more than what is left over. `dt_s` is above 0 and at most 1 /
+        `per_s`; that is not checked.
         """
         if speed_mm_s < 0.0:
             braking = self._acceleration(pull_mm_s2, speed_mm_s, -1.0)
@@ -110,9 +112,9 @@ class Drive(NamedTuple):
         """Return the gap's acceleration, mm/s^2, at `speed_mm_s` and the full voltage that opens, within the current
         limit.
 
-        `pull_mm_s2` is the magnets' pull alone, below 0 where it helps. Friction and the guides' drag are added here.
-        They act against `direction`, 1 (opening) or -1, in which the gap moves or would move. At rest a result against
-        `direction` means that the gap stands.
+        `pull_mm_s2` is the magnets' pull alone, below 0 where it helps. Friction and the guides' drag are added here,
+        against `direction`: 1 where the gap opens or would open, else -1. At rest a result against `direction` means
+        that the gap stands.
         """
         driving = min(self.stall_mm_s2 - self.per_s * speed_mm_s, self.most_mm_s2)
         nut = pull_mm_s2 + direction * self.drag_mm_s2
@@ -179,8 +181,10 @@ class Brake(NamedTuple):
     sliding_N: Callable[[float, float], float]
 
     def fresh_at_N(self, moment_Tm: float, lag_Tm: float = 0.0) -> float:
-        """Return the force, N, of the fresh insert at a moment with its lag, T m; beyond `strength_Tm` that of its
-        nearer end."""
+        """Return the force, N, of the fresh insert at a moment with its lag, T m.
+
+        Beyond `strength_Tm` it is the force at the nearer end.
+        """
         return float(np.interp(moment_Tm + lag_Tm, self.strength_Tm, self.fresh_N))
 
     def open_N(self, hand_mm_s: float) -> float:
@@ -196,7 +200,8 @@ class Brake(NamedTuple):
         """Return the moment, T m, that together with its lag makes `strength_Tm`, coming from `moment_Tm` with the lag
         `lag_Tm`.
 
-        Found by Newton's method along the branch of the hysteresis, in NEWTON_STEPS steps.
+        It is found by NEWTON_STEPS steps of Newton's method along the branch of the hysteresis. Whether they settled is
+        not checked, and the moment may lie beyond the device's.
         """
         wanted_Tm = moment_Tm
         for _ in range(NEWTON_STEPS):
@@ -223,7 +228,10 @@ def friction_of(plant: PlantParameters) -> Friction:
 
 
 def drive_of(plant: PlantParameters) -> Drive:
-    """Return the drive of a device, both carriages together."""
+    """Return the drive of a device, both carriages together; the guides' drag is the mean of both.
+
+    Raises DomainError for gaps that are too large beside the magnets.
+    """
     motor, gear, screw = plant.motor, plant.gear, plant.screw
     lead_m_rad = screw.lead_mm * 1e-3 / math.tau
     coupling_Nm_A = gear.ratio * motor.back_emf_V_s_rad
@@ -244,9 +252,11 @@ def drive_of(plant: PlantParameters) -> Drive:
 
 
 def brake_of(plant: PlantParameters) -> Brake:
-    """Return the brake of a device, between its switches; that of a second plant is an approximation.
+    """Return the brake of a device between the plant's stops, in steps of GRID_MM at most; of a second plant an
+    approximation.
 
-    Raises `DomainError` outside the force law's domain.
+    A plant with a pad is not refused: the result is of the insert that its file states beside. Raises `DomainError` for
+    a moment outside the force law's domain.
     """
     assumed = plant.assumed
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
@@ -271,7 +281,10 @@ def brake_of(plant: PlantParameters) -> Brake:
 
 
 def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameters) -> Brake:
-    """Return the brake of the second plant over these gaps; an approximation, see `Brake`."""
+    """Return the brake of the second plant over the gaps `gap_mm` (n, rising), mm; an approximation, see `Brake`.
+
+    `second` is the plant's own table of that name. What is called a moment, T m, is here the field at the shaft, T.
+    """
     field_T = np.array([1e-3 * shaft_field_mT(gap, plant, second.concentration) for gap in gap_mm.tolist()])
     shares_T = [1e-3 * share * half_mT for share, half_mT in zip(second.play_shares, second.play_mT, strict=True)]
     branch_T = sum(shares_T, 0.0)
@@ -305,8 +318,9 @@ class Asked(NamedTuple):
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
         """Return the rendered force (n), N, for the gaps `gap_mm` (n) in the steps of this force.
 
-        Before the first step the gap was open. What has relaxed is that of the force asked, not of these gaps. A gap
-        beyond the brake's counts as its nearer end.
+        `brake` has to be the one of `asked_of`. Before the first step the gap was open, and lagged as one that was
+        opened. What has relaxed is that of the force asked, not of these gaps. A gap beyond the brake's counts as its
+        nearer end. Raises ValueError for another number of gaps.
         """
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)
@@ -325,7 +339,8 @@ class Bound(NamedTuple):
         """Return `sd_N`, the asked force's standard deviation, and the RMS errors `no_delay_rms_N` and
         `foresight_rms_N`.
 
-        They are over the times from `start_s` on; NaN where there are none.
+        All are floats, N, over the times from `start_s` on, which counts as `time_s`. They are NaN, with NumPy's
+        RuntimeWarning, where there are none.
         """
         inside = self.time_s >= start_s
         asked_N = self.asked_N[inside]
@@ -344,11 +359,12 @@ def bound(
     is_held: bool = False,
     step_s: float = STEP_S,
 ) -> Bound:
-    """Return the bound for forces at rising times, linear in between, or with `is_held` held until the next.
+    """Return the bound for forces (n), N, at times (n), s, linear in between, or with `is_held` each held until the
+    next.
 
-    Forces are clipped to the device's range and MAX_N; the handle slides at TURNED_MM_S. `step_s` is the step of the
-    result. Times that do not rise are not refused. Raises `DomainError` for under 2 or over MAX_STEPS steps. Raises as
-    `brake_of`, `asked_of` and `foresight_mm`.
+    Times have to rise, which is not checked. Forces are clipped to the device's range and MAX_N. The handle slides at
+    TURNED_MM_S. `step_s` is the step of the result, whose first time is the first of `time_s`. Raises `DomainError` for
+    under 2 or over MAX_STEPS steps, and for a force that is NaN. Raises as `brake_of` and `foresight_mm`.
     """
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MAX_STEPS:
@@ -365,11 +381,12 @@ def bound(
 
 
 def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, step_s: float) -> Asked:
-    """Return the force (n) clipped to the device's range and `most_N`, with the relaxation while exactly that is
+    """Return the force (n), N, clipped to the device's range and `most_N`, with the relaxation while exactly that is
     rendered.
 
-    The steps are `step_s` long, and the handle moves at `hand_mm_s`. Before the first step the insert rested at
-    `brake.rested_mm`. Raises `DomainError` for a force that is NaN.
+    The steps are `step_s` long, and the handle moves at `hand_mm_s` all the time. Before the first step the insert
+    rested at `brake.rested_mm`. Neither `step_s` nor `hand_mm_s` is checked. Raises `DomainError` for a force that is
+    NaN.
     """
     offset_N = brake.sliding_N(0.0, hand_mm_s)
     scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
@@ -394,9 +411,12 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
 
 
 def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """Return the gap at each step, mm, of carriages that follow `asked` without delay or foresight.
+    """Return the gap (n), mm, at the end of each step of `step_s`, of carriages that follow `asked` without delay or
+    foresight.
 
-    They begin at rest at the gap of the first force.
+    They begin at rest at the gap of the first force, so that the first gap is exact. At each step they know the force
+    at its end. Where they are late they approach as fast as they can and still brake in time. `asked` is of `brake`,
+    and has one step at least, else IndexError.
     """
     gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
     moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.lag.branch_Tm
@@ -432,12 +452,14 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
 
 
 def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """Return the gap over the steps with the least RMS error of force that the drive allows.
+    """Return the gap (n), mm, over the steps with the least RMS error of force that the drive allows; the whole force
+    is known.
 
-    Each round linearises about the last round's gap: force over gap, the field's lag, a step's largest speed over the
-    speed before. It then solves a quadratic programme in the gaps and lags. Convexity is not proven, so the optimum is
-    tested against an exhaustive search (`tests/lab/test_bound.py`). Raises RuntimeError where the rounds do not settle,
-    or Clarabel finds no solution; ModuleNotFoundError where Clarabel is not installed.
+    At what gap and speed it begins is free. Steps are `step_s` long; `asked` is of `brake`, and has three steps at
+    least. Each round linearises about the last round's gap, and solves a quadratic programme in gaps and lags.
+    Convexity is not proven, so the optimum is tested against an exhaustive search (`tests/lab/test_bound.py`). Raises
+    RuntimeError where the rounds do not settle, or Clarabel finds no solution; ModuleNotFoundError where Clarabel is
+    not installed.
     """
     steps = len(asked.force_N)
     slope_Tm_mm = np.gradient(brake.moment_Tm, brake.gap_mm)
@@ -492,9 +514,10 @@ def run(options: argparse.Namespace) -> Found:
     """Return how closely ideal carriages can render the forces in the file `options.force`, on the plant
     `options.plant`.
 
-    The figures are the standard deviation of the force asked for, and the RMS errors without delay and with foresight,
-    N. With them come the plant's least and greatest force. Raises DomainError, ForceFileError and
-    PlantError for what is refused, and LabError where no optimum was found.
+    `options.insert` names the insert in it. The figures, N: `sd_N`, the standard deviation of the force asked for,
+    clipped; the RMS errors `no_delay_rms_N` and `foresight_rms_N`; the plant's `least_N` and `most_N`. Raises
+    DomainError, ForceFileError and PlantError for what is refused, LabError where no optimum was found. Raises
+    ModuleNotFoundError where Clarabel is not installed.
     """
     table = read_forces(options.force)
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
@@ -511,10 +534,11 @@ def run(options: argparse.Namespace) -> Found:
 def _reached(
     limit_mm_s: Callable[[float, float, float], float], gap_mm: Array, speeds_mm_s: Array, step_s: float
 ) -> tuple[Array, Array]:
-    """Return the speed limit at the end of each step but the first, mm/s, and its slope over the speed before.
+    """Return the speed limit at the end of each step but the first, mm/s, and its slope over the speed before (n - 2
+    each).
 
-    `limit_mm_s` gives the limit, as `Drive.highest_mm_s` does, for gap, speed and time. The slope is that of a secant,
-    SECANT_MM_S to either side.
+    `limit_mm_s` gives the limit, as `Drive.highest_mm_s` does, for gap, speed and time. `gap_mm` (n) has three gaps at
+    least, `speeds_mm_s` (n - 1) are those between them. The slope is that of a secant, SECANT_MM_S to either side.
     """
     found = []
     for gap, speed in zip(gap_mm[1:-1].tolist(), speeds_mm_s[:-1].tolist(), strict=True):
@@ -525,10 +549,10 @@ def _reached(
 
 
 def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tuple[sparse.spmatrix, sparse.spmatrix]:
-    """Return the lag's law, linearised, as two matrices: one for the changes of gaps, one for those of lags.
+    """Return the lag's law, linearised, as two matrices (n x n): one for the changes of gaps, one for those of lags.
 
-    The products of the matrices with these changes sum to 0 in every step. `moment_Tm` and `lag_Tm` (n each), T m, are
-    those linearised about. `turned` (n) is the moment's slope over the gap, T m/mm, over the unit of a lag's change, T
+    The products of the matrices with these changes sum to 0 in every step. The law is linearised about `moment_Tm` and
+    `lag_Tm` (n each), T m. `turned` (n) is the moment's slope over the gap, T m/mm, over the unit of a lag's change, T
     m. The first lag has no change.
     """
     steps = len(moment_Tm)
@@ -546,10 +570,11 @@ def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tu
 def _least_squares(
     matrix: sparse.spmatrix, error: Array, nothing: sparse.spmatrix, limits: list[tuple[sparse.spmatrix, Array]]
 ) -> Array:
-    """Return the x with the least |matrix x + error|, subject to `nothing` x = 0 and the limits.
+    """Return the x (p) with the least |matrix x + error|, subject to `nothing` x = 0 and the limits.
 
-    Each limit is a matrix whose product with the first elements of x is at most its bounds. Raises RuntimeError where
-    Clarabel finds no solution.
+    `matrix` is n x p, `error` n, `nothing` m x p. Each limit is a matrix and its bounds: its product with the first
+    elements of x is at most these. A solution that Clarabel calls nearly solved counts. Raises RuntimeError where it
+    finds none, ModuleNotFoundError where Clarabel is not installed.
     """
     unit = float(np.abs(matrix).max())
     below = sparse.vstack([limit for limit, _ in limits], format="csc")

@@ -7,7 +7,9 @@ from typing import Any
 def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
     """Yield the lines of text that tell a person what `--json` prints of `result`.
 
-    `path` names what holds these figures; empty for the whole result. A list of records becomes a table.
+    A figure, or a record of plain figures, is one line: its name to 40 columns, then its value as `shown`. A record
+    that holds records or lists is taken apart, and its figures are named by all their names. A list of records becomes
+    its name and a `table`. `path` names what holds these figures; empty for the whole result.
     """
     for key, value in result.items():
         name = f"{path} {key}".strip()
@@ -23,7 +25,7 @@ def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
 def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
     """Yield the lines of a table: one with the names of all columns, then one for each of `rows`.
 
-    Columns are aligned to the right, two spaces apart. Their names are those of all rows together; a row without one
+    Columns are aligned to the right, two spaces apart, and stand in the order in which names come up. A row without one
     has an empty cell. A figure of a nested record is named by both names, as `outer inner`. Lists are left out. Without
     rows there is one empty line.
     """
@@ -36,7 +38,10 @@ def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of each figure in `row`, also of nested records; lists are left out."""
+    """Yield name and value of each figure in `row`, in order; lists are left out.
+
+    A figure of a nested record, at any depth, is named `outer inner`. None is a figure.
+    """
     for key, value in row.items():
         if isinstance(value, Mapping):
             yield from ((f"{key} {name}", inner) for name, inner in _figures(value))
@@ -45,8 +50,11 @@ def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def shown(value: Any) -> str:
-    """Return a figure as text: a float to four digits, a list's elements as they are, a record's figures with their
-    names."""
+    """Return a figure as text: a float to four digits, all else as `str` has it, None too.
+
+    A list's elements stand side by side after commas, floats with all their digits. A record's figures stand after
+    their names.
+    """
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {shown(inner)}" for name, inner in value.items())
     if isinstance(value, float):

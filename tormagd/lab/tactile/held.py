@@ -64,11 +64,12 @@ Moment = tuple[float, float, Plan, str]
 def hold(case: Case) -> dict[str, Any]:
     """Hold a force on the pad of `case` and return how well it was held, as plain data beside the case's own fields.
 
-    Errors are shares of the force asked for, FORCE_N, one a second. `force_error` is the greatest and
-    `mean_force_error` the mean of their magnitudes. `last_force_error` has its sign, positive for too much, and so have
-    `shares`, one in each `every_s`. `last_gap_mm` is the last gap. `limits` has the share of the time that each limit
-    was there, `held_s` the seconds. `fault` names the fault that ended the hold; it is empty where none did. Raises
-    PlantError for a plant that cannot be loaded or has no pad, LabError for a fault in the first second.
+    Errors are shares of the force asked for, FORCE_N, one a second, from the end of learning on. `force_error` is the
+    greatest and `mean_force_error` the mean of their magnitudes. `last_force_error` has its sign, positive for too
+    much, and so have `shares`, one in each `every_s`. `last_gap_mm` is the last gap. `limits` has the share of the time
+    that each limit was there, by its name, `held_s` the seconds. `fault` names the fault that ended the hold; it is
+    empty where none did. Raises PlantError for a plant that cannot be loaded or has no pad. Raises LabError for a fault
+    in the first second, and for under half a second.
     """
     shares, limits, last_mm, fault = [], Counter[str](), math.nan, ""
     for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
@@ -116,7 +117,8 @@ def _whole(case: Case) -> Iterator[Moment]:
     """Yield the moments of a hold by the daemon's loop with the whole device, once a second from the end of learning
     on.
 
-    A moment with a fault may be followed by others: the caller ends the hold.
+    The last element of a moment names the faults that are latched, after commas; it is empty without one. A moment with
+    a fault may be followed by others: the caller ends the hold. Raises as `_Prepared`, at the first step.
     """
     made = _Prepared(case)
     planner, device = made.core.planner(), VirtualDevice(made.plant, made.hand, seed=1)
@@ -139,7 +141,8 @@ def _whole(case: Case) -> Iterator[Moment]:
 def _coarse(case: Case) -> Iterator[Moment]:
     """Yield the moments of a hold by the plans alone: one plan each COARSE_S, and the gap is where the last one leads.
 
-    They come once a second from the end of learning on. The only fault they can have is SENSOR.
+    They come once a second from the end of learning on. The only fault that a moment can name is SENSOR; it does not
+    end the moments. Raises as `_Prepared`, at the first step.
     """
     made = _Prepared(case)
     planner = made.core.planner()
@@ -165,7 +168,7 @@ def _coarse(case: Case) -> Iterator[Moment]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab tactile-hold`."""
+    """Add the options of `tormag-lab tactile-hold`: `--seconds`, 1..1e6, `--plant`, `--coarse` and `--workers`."""
     seconds = within(1.0, 1e6, "s")
     parser.add_argument("--seconds", type=seconds, default=3600.0, help="of each hold, virtual (default: 3600)")
     parser.add_argument("--plant", nargs="+", default=PLANTS, metavar="PLANT", help="default: pad_1 pad_2 pad_3")
@@ -174,9 +177,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Hold a force on every plant of `options`, with relaxation and without, learning and frozen, and return all holds.
+    """Hold a force on every plant of `options.plant`, with relaxation and without, learning and frozen, and return all
+    holds.
 
-    Raises as `hold`.
+    Holds last `options.seconds` of virtual time and run in `options.workers` processes. Keys: `synthetic`, `force_N`,
+    and `holds`, as `hold`, four for each plant in the order of MODES. Raises PlantError and LabError as `hold`.
     """
     cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
     with ProcessPoolExecutor(options.workers) as pool:

@@ -63,8 +63,9 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
     """Train the network on made cycles of the three pads, and the relaxation-aware model on those of the pad in use.
 
     The latter also learns from relaxation tests of its pad. Both learn from the training part of the random split.
-    `noise_N`, N, is the sensor's noise. `seed` draws that of the cycles only: the noise of the relaxation tests and the
-    split are the same for every `seed`. Returns the cycles and both models.
+    `noise_N`, N, is the sensor's noise, and not checked. `seed` draws that of the cycles only: the noise of the
+    relaxation tests and the split are the same for every `seed`. Returns the cycles and both models. Nothing is
+    written.
     """
     cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
     data = cycles.data
@@ -86,8 +87,9 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
     """Return table 4.1 per class on the random split, with the noise floor, whole groups left out, and monotonicity.
 
     Keys: `synthetic`, `sensor_noise_N`, `random` (`r2`, `mae_N`, `noise_mae_N`). `leave_one_field_out`,
-    `leave_one_class_out` and `leave_cycles_out` are as `left_out`. `monotonicity` has `network` and `relaxation_aware`,
-    as the function of that name. `rows` has a dict for each class, and for All at the end: `class`, `train` and `test`.
+    `leave_one_class_out` and `leave_cycles_out` are as `left_out`, of every `effort.thin`-th row. `monotonicity` has
+    `network` and `relaxation_aware`, each as the function `monotonicity`. `rows` has a dict for each class, and for All
+    at the end: `class`, `train` and `test`. These have `mae_N`, `sd_N`, `mae_percent` of the class's span, and `r2`.
     Trains one network for each group left out.
     """
     data = trained.cycles.data
@@ -131,8 +133,9 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
 def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) -> dict[str, Any]:
     """Train a network without the rows of each fold, judge it on them, and return the errors, N.
 
-    A fold is a label and the mask (n) of its rows. The result has `r2` and `mae_N` over all folds together, and
-    `folds`, `left_out` and `mae_N` each. At least one fold with rows is needed.
+    A fold is a label, which stands in the result, and the mask (n) of its rows. Networks take `epochs` steps at most.
+    The result has `r2` and `mae_N` over all folds together, and `folds`: a dict of `left_out`, the label, and `mae_N`
+    for each. At least one fold with rows is needed, with two rows beside it.
     """
     predicted = np.empty(len(data))
     judged = np.zeros(len(data), dtype=np.bool_)
@@ -171,9 +174,11 @@ def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, 
 
 
 def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
-    """Return dF/dB, N/mT (n), of a worked pad at (displacement, mm, rate, mm/s, field, mT) (n x 3), without relaxation.
+    """Return dF/dB, N/mT (n), of a worked pad at places (n x 3), without relaxation: a secant over 0.5 mT to either
+    side.
 
-    It is a secant over 0.5 mT to either side, above 0 mT. Raises DomainError for a place outside the pad's law.
+    A place is displacement, mm, rate, mm/s, and field, mT. At 0 mT the secant is over the upper side. Raises
+    DomainError for a place outside the pad's law.
     """
     pad = worked_pad(parameters)
     displacement, rate, field = places.T
@@ -184,9 +189,9 @@ def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
 
 
 def plant_force_N(pad: Any, places: Array) -> Array:
-    """Return the force, N (n), of a `TactilePad` at (displacement, mm, rate, mm/s, field, mT) (n x 3), without
-    relaxation.
+    """Return the force, N (n), of a pad at places (n x 3), without relaxation; its state stays.
 
-    The pad's state stays. Raises DomainError for a place outside its law.
+    A place is displacement, mm, rate, mm/s, and field, mT. `pad` is a `TactilePad`. Raises DomainError for a place
+    outside its law.
     """
     return np.array([sum(pad.elastic_parts_N(*place)) for place in places.tolist()])

@@ -45,10 +45,10 @@ that table 4.1 implies."""
 
 
 def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
-    """Draw another pad of the same recipe: moduli, saturation, relaxation and rate gain 3..15% about `parameters`.
+    """Draw another pad of the same recipe: moduli, saturation, relaxation and rate gain 3..15 % about `parameters`.
 
-    The same seed gives the same pad. The bounds of a plant file are not checked again. Raises ValueError where the
-    drawn shares of relaxation sum to 1 or more.
+    The same seed gives the same pad. Size and iron stay. The bounds of a plant file are not checked again. Raises
+    ValueError where the drawn shares of relaxation sum to 1 or more.
     """
     draw = np.random.default_rng(seed)
 
@@ -106,11 +106,12 @@ def cyclic_records(
     samples_per_cycle: int = SAMPLES_PER_CYCLE,
     pads: Iterable[PadParameters] = tuple(PADS.values()),
 ) -> PadRecord:
-    """Return the data of figure 4.3: three pads, eleven fields, twelve cycles of 175 samples, 69,300 rows without
+    """Return the data of figure 4.3: eleven fields, twelve cycles of `samples_per_cycle` rows at four rates, without
     holds.
 
-    Each field is a record of its own after a rest, preceded by three unrecorded passes of the same cycles. `noise_N` is
-    the standard deviation of the sensor's noise, drawn by `seed`.
+    By default these are 69,300 rows of the three pads; `pads` takes others. They stand pad after pad, field after
+    field. Each field is a record of its own after a rest, preceded by three unrecorded passes of the same cycles.
+    `noise_N`, N, is the standard deviation of the sensor's noise, drawn by `seed`; below 0 it raises ValueError.
     """
     time_s, displacement_mm, rate_mm_s, cycle = cycling_program(samples_per_cycle)
     passes: list[Pass] = []
@@ -136,8 +137,9 @@ def holding_records(
 ) -> PadRecord:
     """Return relaxation tests, one at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely.
 
-    Each has `samples` rows, of a worked pad, with the sensor's noise `noise_N`, N, drawn by `seed`. The thesis did not
-    have these. Raises ValueError for under RISE_SAMPLES or a noise under 0, DomainError for a field outside 0..500 mT.
+    Each has `samples` rows, of a worked pad, with the sensor's noise `noise_N`, N, drawn by `seed`. `cycle` numbers the
+    tests from 0. The thesis did not have these. Raises ValueError for under RISE_SAMPLES or a noise under 0,
+    DomainError for a field outside 0..500 mT.
     """
     rise_s = FULL_INDENTATION_MM
     held_s = np.geomspace(0.05, HOLD_S, samples - RISE_SAMPLES)
@@ -151,7 +153,8 @@ def holding_records(
 def _recorded(passes: list[Pass], cycle: NDArray[np.int64], noise_N: float, seed: int) -> PadRecord:
     """Return the passes one after the other as a record, with the sensor's noise `noise_N`, N, drawn by `seed`.
 
-    `cycle` numbers the cycles of one pass. In the record each pass has numbers of its own.
+    `cycle` numbers the cycles of one pass from 0, and has as many rows as each pass. In the record each pass has
+    numbers of its own. Raises ValueError without a pass, or for a noise below 0.
     """
     features = np.concatenate([program.features(pad.cip_percent) for pad, program, _ in passes])
     true_N = np.concatenate([force_N for *_, force_N in passes])

@@ -20,7 +20,10 @@ def pictures(trained: Trained, traces: dict[str, Array]) -> dict[str, Figure]:
 
 
 def _last_cycle(cycles: Dataset, cip_percent: float, field_mT: float) -> Dataset:
-    """Return the rows of the last cycle at 1 mm/s of this class and field."""
+    """Return the rows of the last cycle at 1 mm/s, both ways, of the class with this iron and of this field.
+
+    Both have to be values of the data, exactly. Raises ValueError where no row is of them.
+    """
     _, rate_mm_s, fields_mT, classes = cycles.features.T
     is_slow = np.isclose(np.abs(rate_mm_s), SHOWN_RATE_MM_S)
     rows = cycles.subset((classes == cip_percent) & (fields_mT == field_mT) & is_slow)
@@ -29,7 +32,8 @@ def _last_cycle(cycles: Dataset, cip_percent: float, field_mT: float) -> Dataset
 
 
 def _fit(trained: Trained) -> Figure:
-    """Draw data and network at 1 mm/s for each class and some fields."""
+    """Draw forces over displacement, data as dots and the network as a line: an axis for each class, at four of the
+    fields."""
     figure, axes = subplots((11.0, 3.8), 1, 3)
     axes[0].set_ylabel("force, N")
     figure.suptitle("Data and network at 1 mm/s (synthetic; like figures 4.3 and 4.4)")
@@ -49,8 +53,10 @@ def _fit(trained: Trained) -> Figure:
 
 
 def _pulse(traces: dict[str, Array]) -> Figure:
-    """Draw the pulse experiment over time: force and displacement, the fields found, their errors, and where those are
-    not scored."""
+    """Draw the pulse experiment over time in three axes: force and displacement, the fields found, and their errors.
+
+    `traces` are those of `pulse.pulse_on`. Where errors are not scored the third axis is grey.
+    """
     time_s = traces["time_s"]
     figure, (inputs, fields, errors) = subplots((11.0, 9.0), 3, 1, sharex=True)
     inputs.plot(time_s, traces["force_N"], color="C3", lw=1, label="force, N")

@@ -36,7 +36,8 @@ def errata() -> list[dict[str, str]]:
 def table_2_4_errors() -> list[dict[str, object]]:
     """Return the lines of table 2.4 whose printed error does not follow from the printed ranges, within their rounding.
 
-    Each has the insert, and its error printed and recomputed, in N and in percent.
+    Each is a dict: `insert`, and the error `printed_N`, `recomputed_N`, `printed_percent` and `recomputed_percent`.
+    Errors are magnitudes, the percents of the measured range.
     """
     wrong = []
     for name, (printed_N, printed_percent) in TABLE_2_4_ERRORS.items():
@@ -62,7 +63,10 @@ Row = tuple[str, str, str, str]
 
 
 def _chapter_2() -> list[Row]:
-    """Return the errata of chapter 2 but for Eq. 25, as rows of KEYS, with figures computed from what is printed."""
+    """Return the errata of chapter 2 but for Eq. 25, as rows of KEYS, with figures computed from what is printed.
+
+    They stand in the order of the thesis. Nothing is read, and the rows are the same each time.
+    """
     eq7, power = ThesisFieldLaw(), PowerFieldLaw()
     closed_Tm, open_Tm = eq7.radial_moment_Tm(CLOSED_MM), eq7.radial_moment_Tm(OPEN_MM)
     stretched = (1.206 * (200.0 - CLOSED_MM) ** 1.867 + 1256.0) * 1e-6
@@ -163,7 +167,10 @@ def _chapter_2() -> list[Row]:
 
 
 def _eq_25() -> Row:
-    """Return the erratum of Eq. 25: Eq. 9..27 with the kinematics of Eq. 33, at the closed gap, with free ends."""
+    """Return the erratum of Eq. 25, a row of KEYS: the stress of the insert at the closed gap, true and nominal.
+
+    It is by Eq. 9..27 with the kinematics of Eq. 33, and with free ends.
+    """
     moment_Tm = ThesisFieldLaw().radial_moment_Tm(CLOSED_MM)
     radial = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     stretch = constitutive.stretches(radial, 1.0)
@@ -182,7 +189,8 @@ def _eq_25() -> Row:
 
 
 def _chapter_3() -> list[Row]:
-    """Return the errata of chapter 3, as rows of KEYS."""
+    """Return the errata of chapter 3, as rows of KEYS, in the order of the thesis; starts and optima are counted from
+    `values`."""
     low, high = APPENDIX_B_BOUNDS
     lines = [line for case in USE_CASES.values() for line in case.starts]
     outside = [f"R_o {line.start.outer_radius_mm:g}" for line in lines if not _inside(line.start, low, high)]
@@ -211,7 +219,10 @@ def _chapter_3() -> list[Row]:
 
 
 def _appendices() -> list[Row]:
-    """Return the errata of the appendices, as rows of KEYS."""
+    """Return the errata of the appendices, as rows of KEYS: of field, traction, gap speed, stress and cost.
+
+    Fields and stresses are computed at the closed gap, of the insert SAMPLE.
+    """
     exponent_T = 0.44 * CLOSED_MM ** (-1.3 / 6.0 * APPENDIX_MU_R) / 0.004
     sixth_T = 0.44 * CLOSED_MM**-1.3 / 6.0 * APPENDIX_MU_R / 0.004
     used_T = 0.44 * CLOSED_MM**-1.3 / 4.0 * APPENDIX_MU_R / 0.004
@@ -255,7 +266,8 @@ def _appendices() -> list[Row]:
 
 
 def _chapter_4() -> list[Row]:
-    """Return the errata of chapter 4, as rows of KEYS."""
+    """Return the errata of chapter 4, as rows of KEYS: the full scale that its errors imply, and the least rate of its
+    search."""
     return [
         (
             "Abstract and section 4.3",
@@ -273,7 +285,7 @@ def _chapter_4() -> list[Row]:
 
 
 def _eq_28(moment_Tm: float) -> float:
-    """Return the force by Eq. 28 as printed, N."""
+    """Return the force, N, by Eq. 28 as printed, for SAMPLE in TORMAG at a radial moment, T m."""
     stretch = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     magnetic = MU0_H_M * SAMPLE.relative_permeability * (moment_Tm / TORMAG.inner_radius_m) ** 2 / stretch**2
     area = 2.0 * math.pi * TORMAG.thickness_m * TORMAG.inner_radius_m**2 * SAMPLE.friction_coefficient
@@ -281,8 +293,10 @@ def _eq_28(moment_Tm: float) -> float:
 
 
 def _literal_stretch(moment_Tm: float, *, appendix: bool = False) -> float:
-    """Return lambda1 by Eq. 29 as printed, or with Gamma_1 and Gamma_2 of the appendix; NaN where the root is not
-    real."""
+    """Return lambda1 of SAMPLE in TORMAG by Eq. 29 as printed, at a radial moment, T m; NaN where the root is not real.
+
+    With `appendix` Gamma_1 and Gamma_2 are those of the appendix, else of Eq. 30 and Eq. 31.
+    """
     inner, outer, t = TORMAG.inner_radius_m, TORMAG.outer_radius_m, TORMAG.thickness_m
     mu_r, g0 = SAMPLE.relative_permeability, SAMPLE.shear_modulus_Pa
     over = moment_Tm**2 / (MU0_H_M * mu_r)

@@ -18,8 +18,11 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
-    """Draw every picture of the page, from the `result` of `reproduction.run`, and return figures by the names of
-    files, without an ending. Raises ModuleNotFoundError without matplotlib."""
+    """Draw every picture of the page, and return figures by the names of files, without an ending; nothing is written.
+
+    `result` is of `reproduction.run`, `tests` are the three step tests that it was made of, in the same order. Raises
+    ModuleNotFoundError without matplotlib.
+    """
     return {
         "table_2_4": _table_2_4(result["table_2_4"]),
         "figure_2_5": _figure_2_5(result["figure_2_5"]),
@@ -55,7 +58,10 @@ def _table_2_4(table: Json) -> Figure:
 
 
 def _figure_2_5(data: Json) -> Figure:
-    """Draw the least and greatest force over shear modulus and permeability; `data` is of `reproduction.figure_2_5`."""
+    """Draw the least and greatest force, by Eq. 7, as surfaces over shear modulus and permeability.
+
+    `data` is of `reproduction.figure_2_5`. Two dots are the thesis's working point.
+    """
     figure = Figure(figsize=(7.5, 5.4), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
     moduli, permeabilities = np.meshgrid(data["shear_modulus_kPa"], data["relative_permeability"])
@@ -71,7 +77,10 @@ def _figure_2_5(data: Json) -> Figure:
 
 
 def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
-    """Draw the step tests beside the force law, and the force ranges; `data` is of `reproduction.figure_2_7`."""
+    """Draw the step tests over time beside the force law, and on a second axis the force ranges of all inserts.
+
+    `data` is of `reproduction.figure_2_7`, made of `tests`, three exactly; others raise ValueError.
+    """
     figure, (axes, ranges) = subplots((12.0, 4.2), 1, 2)
     for test, row, colour in zip(tests, data["rows"], (OURS, FREE, THESIS), strict=True):
         axes.plot(test.time_s, test.force_N, color=colour, linewidth=0.9, label=f"{test.insert}, simulated device")
@@ -88,7 +97,7 @@ def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
 
 
 def _force_ranges(axes: Axes, rows: list[Json]) -> None:
-    """Draw each insert's least and greatest force over its share of iron, one colour a matrix.
+    """Draw on `axes` each insert's least and greatest force over its share of iron, one colour a matrix.
 
     `rows` are the `ranges` of `reproduction.figure_2_7`, of three matrices exactly; others raise ValueError. A mark
     shows where the range that the thesis measured would end above our least force.
@@ -107,7 +116,11 @@ def _force_ranges(axes: Axes, rows: list[Json]) -> None:
 
 
 def _figure_3_2(table: Json) -> Figure:
-    """Draw the portrait of the device as built over both use cases; `table` is of `reproduction.table_3_2`."""
+    """Draw the portrait of the device as built over both use cases, an axis each, at the thesis's gap speed and the
+    controller's.
+
+    `table` is of `reproduction.table_3_2`, which knows these speeds.
+    """
     figure, axes = subplots((9.5, 4.0), 1, 2)
     speeds = (table["gap_speed_mm_s"]["true_thesis_speed"], table["gap_speed_mm_s"]["true"])
     for axis, (number, case) in zip(axes, USE_CASES.items(), strict=True):
@@ -119,9 +132,10 @@ def _figure_3_2(table: Json) -> Figure:
 
 
 def _figure_3_4(table: Json) -> Figure:
-    """Draw our best and the thesis's best portrait over both use cases, at two gap speeds.
+    """Draw our best and the thesis's best portrait: a row for each use case, a column for each gap speed.
 
-    `table` is of `reproduction.table_3_2`.
+    Ours are the best starts of `table`, of `reproduction.table_3_2`. The thesis's is the design of the greatest printed
+    coverage; its label has the true coverage. Raises ValueError where a use case has no start.
     """
     figure, axes = subplots((9.5, 7.6), 2, 2)
     for row, (number, case) in zip(axes, USE_CASES.items(), strict=True):
@@ -145,7 +159,8 @@ def _region(axis: Axes, region: Region) -> None:
 
 
 def _portrait(axis: Axes, problem: Problem, design: Design, colour: str, label: str) -> None:
-    """Draw on `axis` a design's true boundary solid, labelled `label`, and its trapezoid's edges dotted."""
+    """Draw on `axis` a design's true boundary solid, labelled `label`, and its trapezoid's upper and lower edge
+    dotted."""
     portrait = problem.portrait(design)
     force, rate = portrait.outline()
     axis.plot([*force, *force[::-1], force[0]], [*rate, *-rate[::-1], rate[0]], color=colour, label=label)

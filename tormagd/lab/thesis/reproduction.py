@@ -48,7 +48,7 @@ PULSE_S, PULSE_HZ = 20.0, 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab reproduce-thesis`."""
+    """Add the options of `tormag-lab reproduce-thesis`: out, gap speed, workers, seed, quick, and table 2.5 alone."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="write reproduction.md and its pictures there")
     parser.add_argument("--gap-speed", type=GAP_SPEED, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=WORKERS, default=os.cpu_count() or 1)
@@ -58,11 +58,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return all tables and figures of the reproduction, for a person as the page.
+    """Return all tables and figures of the reproduction by name, for a person as the page.
 
-    The folder `options.out`, if given, gets the page and its pictures, and is made where missing. With
-    `options.table_2_5` only that table is made, and nothing is written. Raises ModuleNotFoundError where a package is
-    missing, OSError where `out` cannot be written, RuntimeError where a simulated device faults.
+    The folder `options.out`, if given, gets reproduction.md and its pictures, in `reproduction`; both are made where
+    missing, and files there replaced. With `options.table_2_5` only that table is made, and nothing is written. Runs go
+    to `options.workers` processes. Raises ModuleNotFoundError where a package is missing, OSError where `out` cannot be
+    written, RuntimeError where a simulated device faults. Raises DomainError as `phase_portrait`.
     """
     if options.table_2_5:
         found = table_2_5()
@@ -95,9 +96,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def chapter_4(is_quick: bool) -> Json:
-    """Return table 4.1, the pulse and what relaxes, as `experiment.contract`; none of what was trained is pickled.
+    """Run chapter 4's experiment and return its figures, as `experiment.contract`; none of what was trained is pickled.
 
-    Raises ModuleNotFoundError where heartpy is not installed.
+    `is_quick` takes few rows and epochs: then the figures show only that it runs. Limits torch to one thread in this
+    process. Raises ModuleNotFoundError where heartpy or torch is not installed.
     """
     from tormagd.lab.tactile.experiment import contract
     from tormagd.lab.tactile.models import FULL, QUICK
@@ -107,8 +109,12 @@ def chapter_4(is_quick: bool) -> Json:
 
 
 def table_2_3() -> Json:
-    """Return each insert's masses, g in 100 cc, from volume fractions and densities, beside the printed ones, and the
-    greatest difference."""
+    """Return each insert's masses, g in 100 cc, from volume fractions and densities, beside the printed ones.
+
+    Keys: `rows`, `max_error_g` of all, and `note`. A row has `insert`, `thesis_g` and `ours_g` by component,
+    `max_error_g`, the greatest difference, and `G0_kPa`. Components that the thesis does not print are in `ours_g`
+    only.
+    """
     rows: list[Json] = []
     for item in INSERTS.values():
         printed = TABLE_2_3_MASSES_G[round(100 * item.cip_fraction)]
@@ -132,8 +138,8 @@ def table_2_4() -> Json:
     """Return friction per matrix fitted to the measured ranges, with Eq. 7 and, beside it, with the power law.
 
     The fit with Eq. 7 stands on top, as `_range_fit`, that of the power law in `power_field_law`, without `rows`.
-    `thesis` has the printed errors, as shares, and `registry` those of the friction in use. Besides `thesis_errors`, as
-    `table_2_4_errors`, and `measure`.
+    `thesis` has the printed `mean_rel_error` and `max_rel_error`, as shares, and `registry` is as `_registry_errors`.
+    Besides `thesis_errors`, as `table_2_4_errors`, and `measure`, a sentence.
     """
     ours, beside = _range_fit(ThesisFieldLaw()), _range_fit(PowerFieldLaw())
     return {
@@ -150,7 +156,10 @@ def table_2_4() -> Json:
 def _range_fit(law: FieldLaw) -> Json:
     """Return the fits of friction under one field law, with a fixed and a free exponent, and their relative errors.
 
-    Beside them are the errors for inserts that were left out of the fit.
+    Keys with a fixed exponent: `friction` by Shore hardness, `mean_rel_error`, `max_rel_error` and
+    `leave_one_out_mean_rel_error`. With `_free_exponent` behind each they are of the other fit, whose `exponent` stands
+    beside. `rows` are as `_range_row`. Errors are shares of the measured range. *Left out*: predicted by the fit to all
+    other inserts.
     """
     known = list(INSERTS.values())
     fixed, free = fit_friction(known, law), fit_exponent(known, law)
@@ -173,6 +182,7 @@ def _range_fit(law: FieldLaw) -> Json:
 def _registry_errors() -> Json:
     """Return the errors of range with the registry's friction, the one that inserts and simulated device have.
 
+    Keys: `friction` by Shore hardness, `mean_rel_error` and `max_rel_error`, shares of the measured range, by Eq. 7.
     This friction is the least-squares fit of the relative errors.
     """
     known = list(INSERTS.values())
@@ -186,7 +196,11 @@ def _registry_errors() -> Json:
 
 
 def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -> Json:
-    """Return one insert's measured and fitted ranges, N, and their relative errors."""
+    """Return one insert's measured and fitted ranges, N, and their relative errors, shares of the measured one.
+
+    `fixed` and `free` are the fits with a fixed and a free exponent. `left_out` is the insert's error where the fixed
+    fit was made without it, and stands in the row as `leave_one_out_rel_error`.
+    """
     ranges = item.force_range
     return {
         "insert": item.name,
@@ -206,8 +220,8 @@ def figure_2_5() -> Json:
     """Return the least and greatest force, N, over permeability and shear modulus, with mu_d = 0.2, by both field laws.
 
     `eq_7` and `power` have `least_N` and `most_N` each, a row for each of `relative_permeability`, a column for each of
-    `shear_modulus_kPa`. They also have the forces at the thesis's working point, `working_point_N`, and their errors,
-    `error_N`.
+    `shear_modulus_kPa`. They also have `working_point_N`, least and greatest force at the thesis's working point, and
+    `error_N`, these less the thesis's. Besides `thesis_working_point_N`, `measured_earlier_N` and `note`.
     """
     permeabilities = np.linspace(2.0, 4.0, 9)
     moduli_kPa = np.linspace(80.0, 280.0, 11)
@@ -240,8 +254,9 @@ def figure_2_7(tests: list[StepTest]) -> Json:
     """Return the settled force at each gap on the simulated device, beside the force law, and all inserts' ranges.
 
     `rows` has a dict for each of `tests`: `insert`, and `gap_mm`, `simulated_N`, `analytic_N` and `rel_error` by step.
-    `simulated_range_N` and `measured_range_N` are single numbers. `ranges` has `matrix`, `cip_percent`, `least_N`,
-    `most_N` and `measured_range_N` of every insert.
+    `simulated_range_N`, last less first, and `measured_range_N` are single numbers. `ranges` has `insert`, `matrix`,
+    `cip_percent`, `least_N`, `most_N` and `measured_range_N` of every insert. Besides `rpm` and `note`. Raises
+    DomainError for a test of an unknown insert.
     """
     rows = []
     for test in tests:
@@ -284,9 +299,9 @@ def figure_2_7(tests: list[StepTest]) -> Json:
 def phase_portrait(*gap_speeds_mm_s: float) -> Json:
     """Return how much of both use cases, and of a measured pulse's points, the device as built covers.
 
-    `as_built` has a row for each use case and gap speed, with the shares `trapezoid`, `true` and `thesis`. `pulse` is
-    as `_pulse_cloud`. Raises DomainError for a gap speed out of range, ModuleNotFoundError where heartpy is not
-    installed.
+    `as_built` has a row for each use case and gap speed: `use_case`, `gap_speed_mm_s`, and the shares `trapezoid`,
+    `true` and `thesis`, the last as printed. `pulse` is as `_pulse_cloud`. Besides `note`. Raises DomainError for a gap
+    speed out of range, ModuleNotFoundError where heartpy is not installed.
     """
     rows = []
     for number, case in USE_CASES.items():
@@ -311,10 +326,12 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
 
 
 def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
-    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed, and the five fastest that it
-    misses.
+    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed; a point is force and force rate.
 
-    Points are force and force rate. Raises ModuleNotFoundError where heartpy is not installed.
+    `rows` has a dict for each speed: `gap_speed_mm_s`, the shares `true` and `trapezoid`, and the numbers `points`,
+    `too_fast`, `below_least_force` and `above_most_force`. `worst` are the five fastest points that it misses: `t_s`,
+    `force_N` and `rate_N_s`. Besides `insert`, `range_N` and `note`. Raises ModuleNotFoundError where heartpy is not
+    installed.
     """
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
     rates_N_s = np.gradient(forces_N, times_s)
@@ -355,7 +372,8 @@ RunKey = tuple[int, int, str, str]
 def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
     """Return the runs of table 3.2 by use case, start from 1, objective and solver, which is `global` and `local`.
 
-    `starts` is the number of starts of each use case; None: all. `gap_speed_mm_s` is the controller's.
+    Nothing is run yet. `starts` is the number of starts of each use case; None: all. `gap_speed_mm_s` is the
+    controller's. Objectives are those of `_problems`. Raises DomainError for a seed outside 0..2^31.
     """
     runs = {}
     for number, case in USE_CASES.items():
@@ -367,9 +385,10 @@ def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = Non
 
 
 def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
-    """Return the problems of a use case by objective: trapezoid, true, true_thesis_speed and corners.
+    """Return the problems of a use case, 1 or 2, by objective: trapezoid, true, true_thesis_speed and corners.
 
     `gap_speed_mm_s` is the controller's, with which `true` is judged; the others are with the thesis's gap speed.
+    Raises KeyError for another use case.
     """
     region = USE_CASES[use_case].region
     return {
@@ -384,9 +403,11 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
     """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's designs.
 
     `outcomes` holds the outcome of each of `runs`; one that is missing raises KeyError. `gap_speed_mm_s` is the
-    controller's. `starts`, `local_starts` and `corner_cost_starts` have a row for each run. `thesis_designs` has the
-    coverage of each design by objective, `best` the greatest coverage and its spread by use case and objective. Besides
-    `gap_speed_mm_s` by objective, `max_seconds` and `note`. Raises ValueError without a global run.
+    controller's. `starts`, `local_starts` and `corner_cost_starts` have a row for each run, in their order. A row has
+    `use_case`, `start`, `objective`, `design`, `coverage`, `corner_cost`, `volume_cm3` and `seconds`; of the thesis's
+    cost `solver`, too. `thesis_designs` has the coverage of each design by objective, `best` the greatest coverage and
+    its spread by use case and objective. Besides `gap_speed_mm_s` by objective, `max_seconds` and `note`. Raises
+    ValueError without a global run.
     """
     rows: dict[RunKey, Json] = {}
     for (use_case, start, objective, solver), run in runs.items():

@@ -46,9 +46,10 @@ class StepTest(NamedTuple):
 
 
 def step_test(fitted: Insert, seed: int) -> StepTest:
-    """Run one insert through all gaps in virtual time, HOLD_S each, and return the record.
+    """Run one insert through GAPS_MM in virtual time, HOLD_S each, and return the record; times count from its start.
 
-    Levels are means of the last SETTLED_S of each hold. Raises RuntimeError where the device faults, or does not arm.
+    The record is thinned to every EVERY-th ms. Levels are means of the last SETTLED_S of each hold. `seed` draws the
+    device's noise. Raises RuntimeError where the device faults, or does not arm.
     """
     config, scene = load_config(None), load_scene("coronary")
     scene = msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N))

@@ -82,7 +82,8 @@ class Course(NamedTuple):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab bench-sweep`."""
+    """Add the options of `tormag-lab bench-sweep`: plant, scene, inserts, the file to write, which is needed, and the
+    seed."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
     parser.add_argument("--scene", default="coronary", help="whose insert and gap range are swept")
     parser.add_argument("--insert", nargs="+", metavar="NAME", help="other inserts, one after the other")
@@ -105,8 +106,10 @@ def run(options: argparse.Namespace) -> Found:
 def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int) -> Dataset:
     """Record a hold of the last insert and SWEEPS sweeps of each, in processes, and return the rows of all.
 
-    `cycle` is the number of the record, `time_s` counts from its start. `inserts` None or empty: the scene's own.
-    Raises PlantError, ConfigError and DomainError for what cannot be used, RuntimeError where the device faults.
+    `cycle` is the number of the record: 0 is the hold, then come the sweeps, insert after insert. `time_s` counts from
+    when the device was switched on, anew in each record. `inserts` None or empty: the scene's own. `seed` draws hands
+    and noise; the same arguments give the same rows. Raises PlantError, ConfigError and DomainError for what cannot be
+    used, RuntimeError where the device faults.
     """
     scene = load_scene(scene_name)
     names = inserts or [scene.insert.name]
@@ -123,7 +126,8 @@ def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int
 def sweep_course(scene: Scene, name: str, seed: int) -> Course:
     """Return the course of a sweep of the insert `name`, from the open gap down and up again, in steps of GAP_STEP_MM.
 
-    `seed` draws where the steps lie. Both ends, BEYOND_MM beyond the scene's gaps, are reached.
+    `seed` draws where the steps lie, and goes into the course. Both ends, BEYOND_MM beyond the scene's gaps, are
+    reached. `name` is not checked.
     """
     closed_mm, open_mm = scene.insert.gap_closed_mm - BEYOND_MM, scene.insert.gap_open_mm + BEYOND_MM
     offset_mm = np.random.default_rng(seed).uniform(0.0, GAP_STEP_MM)
@@ -135,7 +139,8 @@ def sweep_course(scene: Scene, name: str, seed: int) -> Course:
 def swept(plant: str, scene_name: str, course: Course) -> Array:
     """Record one course in virtual time and return its rows (n x 6): time_s, the features, force_N along the motion.
 
-    Raises RuntimeError where the device faults or does not arm; PlantError, ConfigError and DomainError as `record`.
+    `plant` and `scene_name` are names or files. Times count from when the device was switched on. Raises RuntimeError
+    where the device faults or does not arm; PlantError, ConfigError and DomainError as `record`.
     """
     scene = bench_scene(load_scene(scene_name), course.insert)
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
@@ -161,8 +166,9 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
     """Return the training rows (n x 6) that are kept of all ticks (m x 4, 1 ms apart), in order of time.
 
     A tick is time_s, handle_mm, gap_mm and the force, N, with the sign of the handle's way. A row is time_s, the four
-    features, and the force along the motion. Of the ticks of steady sliding one in EVERY is kept, of those due before
-    mobilisation one in LOADED_EVERY.
+    features, and the force along the motion. Its field is that of the gap by the field law, in the insert of `scene`.
+    Of the ticks of steady sliding one in EVERY is kept, of those due before mobilisation one in LOADED_EVERY. Raises
+    DomainError for an insert that is not in the registry.
     """
     _, handle_mm, gap_mm, signed_N = ticks.T
     sliding_mm_s, slides = sliding(handle_mm, gap_mm)
@@ -182,9 +188,9 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
 def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Array]:
     """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick (n) of 1 ms.
 
-    `signed_N` is the force with the sign of the handle's last way; the rate, over the RATE_TICKS that follow, has a
-    sign, the way none. The way is NaN where no row is due. Rows are due after a turn, at one speed and a resting gap,
-    every LOADED_STEP_MM up to LOADED_MM.
+    `signed_N` is the force with the sign of the handle's last way. The rate is that over the RATE_TICKS that follow,
+    with its sign; it is 0 at the end. The way has no sign, and is NaN where no row is due. Rows are due after a turn,
+    at one speed and a resting gap, every LOADED_STEP_MM up to LOADED_MM. Over RATE_TICKS ticks are needed.
     """
     gap_mm_s, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     is_resting &= np.abs(gap_mm_s) <= RESTING_GAP_MM_S
@@ -215,7 +221,7 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
     """Return the handle's rate, mm/s with its sign, at each tick (n) of 1 ms, and a mask (n) of steady sliding.
 
     Sliding counts at a steady gap, after SETTLED_MM since rate or gap last changed, and MOBILISED_AFTER_MM since the
-    handle turned.
+    handle turned. The rate is as `_even` has it. Over RATE_TICKS ticks are needed.
     """
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
@@ -237,8 +243,8 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
 def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
     """Return the rate at each tick of 1 ms over a window around it, mm/s (n), and a mask (n) of where it is even.
 
-    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE. Beyond the ends
-    of the record the rate counts as 0.
+    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE. Each half has
+    RATE_TICKS ticks, and the record needs more. Beyond its ends the rate counts as 0.
     """
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)
@@ -268,7 +274,8 @@ def bench_scene(scene: Scene, name: str) -> Scene:
 def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
     """Return `plant` on the bench of `scene`, which `bench_scene` made: with its switches at that scene's gaps.
 
-    The inner switches stand a little further in. Both carriages start just short of the open gap.
+    The inner switches stand half a millimetre of gap further in. Both carriages start just short of the open gap. The
+    bounds of a plant file are not checked again.
     """
     home_mm = scene.insert.gap_open_mm / 2.0
     stops = msgspec.structs.replace(
@@ -287,10 +294,11 @@ def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan
 
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:
-    """Return the hand's motion from BEGIN_S on, and when each of its `count` strokes ends.
+    """Return the hand's motion from BEGIN_S on, and when each of its `count` strokes ends, s.
 
-    A stroke goes there and back at speeds drawn evenly over their logarithm. The second speed of either way is fast
-    enough to mobilise friction before a creep.
+    A stroke goes there and back, with a rest of STOP_S after either way; it ends before its last rest. Speeds are drawn
+    by `seed` evenly over their logarithm. The second speed of either way is fast enough to mobilise friction before a
+    creep. Until BEGIN_S, and after all strokes, the handle stands.
     """
     random = np.random.default_rng(seed)
     times, positions, ends_s = [BEGIN_S], [0.0], []

@@ -76,10 +76,9 @@ class Dataset:
         return {name: (float(columns[name].min()), float(columns[name].max())) for name in COLUMNS}
 
     def scaling(self) -> Scaling:
-        """Return the scaling that maps each feature's range, and the force's, onto -1..1; a constant feature gets gain
-        0.
+        """Return the scaling that maps each feature's range, and the force's, onto -1..1.
 
-        Raises `DomainError` where the force does not vary.
+        A constant feature gets gain 0, so that it has no effect. Raises `DomainError` where the force does not vary.
         """
         low, high = self.features.min(axis=0), self.features.max(axis=0)
         span = high - low
@@ -97,7 +96,11 @@ class Dataset:
         )
 
     def sha256(self) -> str:
-        """Return the digest of names and values: the same whatever the file's number format or line ends."""
+        """Return the digest, in hexadecimal, of names and values: the same whatever the file's number format or line
+        ends.
+
+        The order of rows counts, that of a file's columns does not.
+        """
         digest = hashlib.sha256()
         for name, column in self.columns().items():
             digest.update(f"{name} {len(column)} ".encode())
@@ -105,15 +108,18 @@ class Dataset:
         return digest.hexdigest()
 
     def subset(self, rows: NDArray[np.integer] | Mask) -> "Dataset":
-        """Return the chosen `rows`, indices or a mask, as data of their own."""
+        """Return the chosen `rows`, indices or a mask (n), as data of their own, in the order of the indices.
+
+        Raises `LabError` for fewer than two, IndexError for an index that is no row.
+        """
         return Dataset.of({name: column[rows] for name, column in self.columns().items()})
 
     def split(self, validation_share: float, seed: int) -> tuple["Dataset", "Dataset"]:
-        """Split at random into (training, validation), the same way for the same seed.
+        """Split at random into (training, validation), the same way for the same seed; rows keep their order.
 
-        With cycle labels whole cycles go to one side. Neighbours in a time series are nearly copies of each other, and
-        a validation that holds copies of the training rows proves nothing. Raises `LabError` for a share outside 0..1,
-        or one that leaves fewer than two rows on a side.
+        `validation_share` is of the rows, or with cycle labels of the cycles: whole cycles go to one side. Neighbours
+        in a time series are nearly copies of each other, and a validation that holds copies of the training rows proves
+        nothing. Raises `LabError` for a share outside 0..1, or one that leaves fewer than two rows on a side.
         """
         if not 0 < validation_share < 1:
             raise LabError(f"validation_share = {validation_share} is not allowed, only between 0 and 1")
@@ -131,9 +137,12 @@ class Dataset:
 
 
 def read_csv(path: Path) -> Dataset:
-    """Read training data: header `displacement_mm,rate_mm_s,field_mT,cip_percent,force_N` (+ `cycle`, `time_s`).
+    """Read training data: header `displacement_mm,rate_mm_s,field_mT,cip_percent,force_N` (+ `cycle`, `time_s`), in any
+    order.
 
-    Raises `LabError` naming the row of the file, the column, the value and what is allowed.
+    Raises `LabError` for a file that cannot be read, another column, and a value outside ALLOWED. It names the row of
+    the file, from 1, the column, the value and what is allowed. Also for fewer than two rows, and a `cycle` that is no
+    whole number.
     """
     named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, allowed=ALLOWED, is_exact=True)
     cycle = named.get("cycle", np.zeros(0))
@@ -145,7 +154,8 @@ def read_csv(path: Path) -> Dataset:
 def write_csv(path: Path | str, dataset: Dataset) -> None:
     """Write `dataset` to `path`, replacing a file, so that `read_csv` gives back the same numbers to the last bit.
 
-    `cycle` and `time_s` are written where the data have them. Raises OSError.
+    `cycle` and `time_s` are written where the data have them. Values outside ALLOWED are written, too, and `read_csv`
+    refuses them. Raises OSError; then a part of the file may be there.
     """
     columns = dataset.columns()
     with Path(path).open("w", newline="", encoding="utf-8") as file:

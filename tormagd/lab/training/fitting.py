@@ -40,11 +40,12 @@ def fit_model(
 ) -> tuple[ForceModel, Training]:
     """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went.
 
-    The data are of the `inserts`, told apart by their iron. `memory` is what was taken out of the data before. The
-    network is scaled by the ranges of `scaled_by` (None: of `training`), and begins with the weights of `start` (None:
-    random ones by `seed`). With `rising` its force rises with the field everywhere. Deterministic for given data and
-    seed. Raises `DomainError` for a name or count that a model file may not have, an insert without rows, or a force
-    that does not vary.
+    The data are of the `inserts`, told apart by their iron; a single name is not looked up. `memory` is what was taken
+    out of the data before. `data_sha256` and `created` go into the file. The network has `hidden` units, and takes
+    `epochs` steps at most. It is scaled by the ranges of `scaled_by` (None: of `training`), and begins with the weights
+    of `start` (None: random ones by `seed`). With `rising` its force rises with the field everywhere. Deterministic for
+    given data and seed. Raises `DomainError` for a name or count that a model file may not have, an insert without
+    rows, or a force that does not vary.
     """
     ranging = scaled_by or training
     scaling = ranging.scaling()
@@ -79,8 +80,8 @@ def fit_network(
     """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` in the mask `known` (n).
 
     A tenth of these rows, chosen at random, decides when the training stops. `start` gives the first weights; None:
-    random ones. The seeds are fixed: the same data give the same network. Returns as `fit_model`; raises DomainError as
-    that.
+    random ones. The seeds are fixed: the same data give the same network, but for today's date in it. Returns as
+    `fit_model`. Raises DomainError as that, LabError for too few rows.
     """
     rows = data.subset(known)
     stop = random_split(len(rows), 0, VALIDATION_SHARE)
@@ -108,7 +109,11 @@ def _box(data: Dataset, name: str) -> Ranges:
 
 @torch.no_grad()
 def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> None:
-    """Give `network`, in place, the weights of `start`, folded from its scaling into `scaling`."""
+    """Give `network`, in place, the weights of `start`, folded from its scaling into `scaling`, that of `network`.
+
+    It then gives the same forces as `start`. A feature that is constant in `scaling` loses its weights. Both have to
+    have the same number of hidden units, else RuntimeError.
+    """
     weight, bias, output, constant = start.physical
     gain = np.array(scaling.input_gain)
     network.hidden_weight.copy_(torch.tensor(np.divide(weight, gain, out=np.zeros_like(weight), where=gain != 0)))

@@ -54,7 +54,9 @@ class GreyBoxMemory:
     def elastic_N(self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float) -> float:
         """Return the network's force, N, with which the pad gives `force_N` at the end of the next step.
 
-        The step comes to `displacement_mm` and `rate_mm_s`, on a pad with `cip_percent` of iron. The state stays.
+        The step comes to `displacement_mm` and `rate_mm_s`, on a pad with `cip_percent` of iron. The state stays:
+        `advance` takes the step. Whether any field gives this force is not checked. Raises DomainError for what is not
+        finite.
         """
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         rest_N, _ = self._step.advance(self._state, free_N)
@@ -66,7 +68,10 @@ class GreyBoxMemory:
 
     def advance(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
         """Take one step, which ends at this motion and field, and return the force, N, that the model expects at its
-        end."""
+        end.
+
+        The state goes on by it. Raises DomainError for what is not finite; then the state may have gone on in part.
+        """
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         whole_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
         rest_N, self._state = self._step.advance(self._state, free_N)
@@ -90,9 +95,9 @@ def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries,
     """Fit the relaxation of two parts of the force to `holds`, and return a series for each part, with the same times.
 
     `parts` are the forces (n each), N, that the rows of `holds` would have without memory. The first is that without
-    field, the second what the field adds. Each record is scaled to fit. The scales are free because a network that has
-    never seen a hold is off by some percent there, which must not pass for relaxation. For this reason only rows at
-    rest count; the others make the state that they begin in. Raises `DomainError` without `time_s`.
+    field, the second what the field adds. Each record is scaled to fit: a network that never saw a hold is off by some
+    percent, which must not pass for relaxation. For this reason only rows at rest, a rate of 0, count; the others make
+    the state that they begin in. Each record needs one. Raises `DomainError` without `time_s`.
     """
     at_rest = holds.features[:, RATE] == 0.0
     still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(times_of(holds))]
@@ -131,10 +136,12 @@ def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries,
 def fit_grey_box(
     data: Dataset, known: Mask, holds: Dataset, *, hidden: int = 30, epochs: int = 100, settling_epochs: int = 30
 ) -> GreyBox:
-    """Fit the model to the rows of cycles (n) in `known` (n, mask), and to relaxation tests, `holds`.
+    """Fit the model to the rows of cycles, `data`, in the mask `known` (n), and to relaxation tests, `holds`; return
+    it.
 
-    The network learns for `epochs` as if there were no memory, then for `settling_epochs` in each of `ROUNDS` rounds.
-    Raises `DomainError` without `time_s`.
+    Both begin each record as `relaxed_N` says. The network, of `hidden` units, learns for `epochs` as if there were no
+    memory, then for `settling_epochs` in each of `ROUNDS` rounds. Raises `DomainError` without `time_s`,
+    ModuleNotFoundError without torch.
     """
     from tormagd.lab.training.fitting import fit_network  # with torch, which a fitted model does without
 

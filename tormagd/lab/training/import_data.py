@@ -95,7 +95,10 @@ class Imported(NamedTuple):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab import-data`."""
+    """Add the options of `tormag-lab import-data`; only the files and `--out` are needed.
+
+    `--column` may be given again and again. What it states is not checked here.
+    """
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.csv", help="several are one cycle each")
     parser.add_argument("--out", type=Path, required=True, metavar="ROWS.csv", help="for train-model, a new file")
     parser.add_argument("--cip", type=within(0.0, 100.0, "%"), metavar="PERCENT", help="iron, where no column has it")
@@ -112,8 +115,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Write `options.out` from `options.files` and return what was taken for what, left out, and missing.
 
-    Raises LabError for input that is refused, OSError where a file cannot be written, ModuleNotFoundError for a picture
-    without matplotlib.
+    Keys: `out`, `rows`, `taken`, `made`, `left_out`, `ranges` and `missing`. `taken`, `made` and `left_out` are as in
+    `Imported`, of all files together. `ranges` has least and greatest of each quantity, `missing` is as `_missing`.
+    With several files each is a `cycle` of its own, from 0. `options.picture` gets a picture of fields and rates.
+    Raises LabError for input that is refused, also an `out` that exists; nothing is written then. Raises OSError where
+    a file cannot be written, ModuleNotFoundError for a picture without matplotlib, after `out` was written.
     """
     if options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
@@ -146,7 +152,8 @@ def run(options: argparse.Namespace) -> Found:
 def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | None, cycle: int | None) -> Imported:
     """Return the rows of a file as training data; `cip_percent` and `cycle` stand for columns that it lacks.
 
-    Raises LabError for input that is refused.
+    `stated` has the columns that a person states, by quantity. `cip_percent` None: a column has to have it. `cycle`
+    None: without a column there are no cycles. Raises LabError, naming the file, for input that is refused.
     """
     columns, quantities, missing = _read(path, stated)
     if cip_percent is None and "cip_percent" not in quantities:
@@ -171,7 +178,7 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
 
 
 def _stated(text: str) -> tuple[str, Stated]:
-    """Return the quantity, the column's name and unit of `QUANTITY=NAME[:UNIT]`; no unit is None.
+    """Return the quantity, and the column's name and unit, of the option `QUANTITY=NAME[:UNIT]`; no unit is None.
 
     A name with a colon needs a unit. Raises LabError for an unknown quantity, no `=`, or a unit that is not the
     quantity's; the name is not checked.
@@ -189,8 +196,9 @@ def _stated(text: str) -> tuple[str, Stated]:
 def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], dict[str, Array], int]:
     """Return the columns of a file by quantity, their values in our units, and how many rows lacked one.
 
-    Raises LabError for a file that cannot be read, has no header or too few columns. Also for a cell that is no number,
-    and for values that cannot be so.
+    Values (n each) are finite, and stand in the order of the file; rows that lack one are left out. A first row that is
+    all words is taken for units. Raises LabError for a file that cannot be read, has no header or too few columns. Also
+    for a cell that is no number, for under MIN_ROWS rows, and as `_refuse_unlikely`.
     """
     rows = _rows(path)
     header, columns = _header(path, rows, stated)
@@ -225,7 +233,8 @@ def _header(
 ) -> tuple[list[str], dict[str, Column]]:
     """Take rows until one names MIN_NAMED quantities; return its cells, and the columns by quantity.
 
-    Raises LabError where no row does, or force or field is not among them.
+    `rows` are line and cells, as `_rows` yields them; those behind the header are left. Raises LabError where no row
+    does, force or field is not among them, or as `_columns`.
     """
     header: list[str] = []
     columns: dict[str, Column] = {}
@@ -243,6 +252,7 @@ def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[s
     """Raise LabError for fields of no stated unit that are more likely in tesla, and for a time that falls in a cycle.
 
     From cycle to cycle time may begin anew, where a column says which cycle a row is of. Each has two rows at least.
+    `columns` and `found` are by quantity; the message names `path`.
     """
     field, most_mT = columns["field_mT"], found["field_mT"].max()
     if not field.has_unit and most_mT < MIN_FIELD_MT:
@@ -264,9 +274,10 @@ def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[s
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line and the cells of each row, with decimal points; comments and empty rows are left out.
+    """Yield the line, from 1, and the cells of each row, with decimal points; comments and empty rows are left out.
 
-    Cells are parted by the semicolon, tab or comma, whichever is most frequent in the file. Raises LabError.
+    Cells are parted by the semicolon, tab or comma, whichever is most frequent in the file. A comment begins with # or
+    %. Raises LabError for a file that cannot be read, is too large, or no text in UTF-8.
     """
     try:
         text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8-sig")
@@ -284,10 +295,11 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _columns(path: Path, header: list[str], stated: Mapping[str, Stated]) -> dict[str, Column]:
-    """Return which column of `header` is which quantity, stated ones first.
+    """Return which column of `header` is which quantity, stated ones first; a cell that no name fits is passed over.
 
-    Raises LabError for a unit that is not known, and for two columns of one quantity. In a row with known columns it is
-    raised for a stated one that is not there, too.
+    The unit stands behind the name in brackets, or after an underscore. Raises LabError for a unit that is not known,
+    and for two columns of one quantity. In a row with MIN_NAMED known columns it is raised for a stated one that is not
+    there, too.
     """
     found: dict[str, Column] = {}
     for cell in header:
@@ -332,7 +344,11 @@ def _without_duplicates(quantities: Mapping[str, Array]) -> tuple[dict[str, Arra
 
 
 def _outliers(path: Path, force_N: Array) -> Mask:
-    """Return which forces are far from the median of their neighbours. Raises LabError where over MAX_OUTLIERS are."""
+    """Return a mask (n) of the forces that are far from the median of their neighbours, in order of time.
+
+    No force is, where most differ from their neighbours as much as in a table without order. Raises LabError, naming
+    `path`, where over MAX_OUTLIERS are.
+    """
     half = NEIGHBOURS // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(force_N, half, mode="edge"), NEIGHBOURS)
     off_N = np.abs(force_N - np.median(around, axis=1))
@@ -349,8 +365,8 @@ def _sign(path: Path, quantities: dict[str, Array]) -> str:
     """Turn `quantities["force_N"]` so that it is positive against the motion, and return in words what was done.
 
     The motion is `rate_mm_s` with its sign, or else the change of `displacement_mm`; call it before `_motion`. A force
-    of one sign needs neither. Raises LabError, naming `path`, where under SIGN_SHARE of the rows beyond the noise
-    follow one sign, or the rate's.
+    of one sign needs neither. Rows without motion keep their force. Raises LabError, naming `path`, where under
+    SIGN_SHARE of the rows beyond the noise follow one sign, or the rate's.
     """
     force_N, rate = quantities["force_N"], quantities.get("rate_mm_s")
     if rate is None:
@@ -373,7 +389,8 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
     """Give the rate its magnitude and the displacement its meaning, travel since the turn; return in words what was
     made of what.
 
-    Sets `rate_mm_s` and `displacement_mm` of `quantities`, and makes the one that is missing. Raises LabError where
+    Sets `rate_mm_s` and `displacement_mm` of `quantities`, and makes the one that is missing. A displacement within
+    0..MOBILISED_MM is taken as it is. Without one every row counts as sliding. Raises LabError, naming `path`, where
     neither a rate nor time and displacement are there.
     """
     made = []
@@ -401,7 +418,7 @@ def _missing(data: Dataset) -> list[str]:
     """Return in words what the data lack: gaps in field and rate, and rates at the ends of what a handle meets.
 
     Empty where nothing is lacking. Of each the widest gap is told, where it is over GAP_OF_RANGE of the data's own
-    range. The ends of the field are not judged. `data` need a row.
+    range; rates count by their logarithm. The ends of the field are not judged. `data` need a row.
     """
     fields_mT = np.unique(data.features[:, 2])
     rates = np.log10(np.unique(np.clip(data.features[:, 1], RATES_MM_S[0], None)))
@@ -422,7 +439,11 @@ def _missing(data: Dataset) -> list[str]:
 
 
 def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
-    """Write a picture of field and rate of all rows, coloured by force, with what is missing as its title."""
+    """Write a picture of field and rate of all rows, coloured by force, to `path`, with what is missing as its title.
+
+    A file there is replaced. Raises OSError, ModuleNotFoundError without matplotlib, ValueError for an ending that
+    matplotlib does not know.
+    """
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)
     title = "\n".join(missing) or "fields and rates are covered"

@@ -54,6 +54,7 @@ def jacobian(network: ForceNetwork, inputs: Tensor) -> tuple[Tensor, Tensor]:
     """Return scaled force (n) and its derivatives (n x p) by every weight, for scaled `inputs` (n x 4).
 
     Columns: hidden_weight row by row, hidden_bias, output_weight, output_bias: the order of `network.parameters()`.
+    Forces are from -1 to 1 over the range of the scaling.
     """
     hidden = torch.sigmoid(torch.addmm(network.hidden_bias, inputs, network.hidden_weight.T))
     by_bias = hidden * (1 - hidden) * network.output_weight
@@ -136,7 +137,8 @@ def _made_rising(network: ForceNetwork) -> Tensor:
     """Turn each unit of `network`, in place, so that it rises with the field; return which parameters must stay
     positive.
 
-    The result is a mask in the order of `network.parameters()`. The constant output is set to the middle of the forces.
+    The result is a mask (p) in the order of `network.parameters()`: weights of the field and of the output. These are
+    MIN_POSITIVE at least. The constant output is set to the middle of the forces.
     """
     weight, output = network.hidden_weight, network.output_weight
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
@@ -163,7 +165,7 @@ def _mean_square(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> floa
 def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
     """Return J'J / n (p x p) and J'r / n (p) of the scaled force over p parameters, with r = output - target.
 
-    The n rows of `inputs` and `targets` are scaled, and taken in batches.
+    The n rows of `inputs` (n x 4) and `targets` (n) are scaled, and taken in batches.
     """
     size = sum(parameter.numel() for parameter in network.parameters())
     normal = torch.zeros(size, size, dtype=inputs.dtype)
@@ -176,7 +178,10 @@ def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) ->
 
 
 def _step(normal: Tensor, gradient: Tensor, damping: float) -> Tensor | None:
-    """Return the step -(J'J + damping I)^-1 J'r, or None where rounding has cost the matrix its definiteness."""
+    """Return the step (p), -(J'J + damping I)^-1 J'r; None where rounding has cost the matrix its definiteness.
+
+    `normal` is J'J (p x p), `gradient` J'r (p); neither is changed.
+    """
     damped = normal + damping * torch.eye(len(gradient), dtype=normal.dtype)
     factor, failed = torch.linalg.cholesky_ex(damped)
     if int(failed):

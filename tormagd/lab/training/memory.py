@@ -24,11 +24,11 @@ def times_of(data: Dataset) -> Array:
 
 
 def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
-    """Return the force with memory (n), N, from the force without (n), along the records of `data`.
+    """Return the force with memory (n), N, from the force without, `elastic_N` (n), along the records of `data`.
 
-    `time_s` counts from the last rest. A record that begins later counts as having been run before, from the rest on,
-    as often as the time allows. Laboratories cycle a specimen until it repeats and then record. Raises `DomainError`
-    without `time_s`.
+    Of `data` only the times count. `time_s` counts from the last rest. A record that begins later counts as having been
+    run before, from the rest on, as often as the time allows. Laboratories cycle a specimen until it repeats and then
+    record. Raises `DomainError` without `time_s`.
     """
     times = times_of(data)
     # records with the same times run side by side: a laboratory repeats one program, and rows are slow one by one
@@ -44,9 +44,10 @@ def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
 
 
 def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
-    """Return the force with memory (n x r), N, of r records with the same times `time_s` (n).
+    """Return the force with memory (n x r), N, of r records with the same times `time_s` (n), s from the last rest.
 
-    `driving_N` (n x r) is the force without memory.
+    `driving_N` (n x r) is the force without memory. A first time above 0 makes the first step a ramp as long as the
+    second; from 0 it is a jump.
     """
     first_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 and time_s[0] > 0 else 0.0
     # rounded, so that steps that are equal but for the rounding of the time share one update

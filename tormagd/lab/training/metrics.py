@@ -11,9 +11,11 @@ from tormagd.model.model_file import ForceModel
 
 
 def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
-    """Return a mask (rows), True for the rows held out: `share` of them, drawn by `seed`. The thesis's is 70 : 30.
+    """Return a mask (rows), True for the rows held out: `share` of them, rounded, drawn by `seed`. The thesis's is 70 :
+    30.
 
     Rows of a time series are nearly copies of their neighbours: this split flatters, and is for comparison only.
+    `share` is not checked: 0 holds out none, 1 all.
     """
     held = np.zeros(rows, dtype=np.bool_)
     held[np.random.default_rng(seed).permutation(rows)[: round(share * rows)]] = True
@@ -28,9 +30,10 @@ def leave_one_out(dataset: Dataset, feature: str) -> Iterator[tuple[float, Mask]
 
 
 def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[int, Mask]]:
-    """Yield the number of each of `folds` folds, and the mask (n) of its rows.
+    """Yield the number of each of `folds` folds, from 0, and the mask (n) of its rows, True for those held out.
 
-    A fold has whole cycles, drawn by `seed`, and every cycle is in one fold. The data must have cycles.
+    A fold has whole cycles, drawn by `seed`, and every cycle is in one fold. The data must have cycles. More folds than
+    cycles leave some without a row.
     """
     assert dataset.cycle is not None
     parts = np.array_split(np.random.default_rng(seed).permutation(np.unique(dataset.cycle)), folds)
@@ -39,7 +42,10 @@ def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[
 
 
 def trained_metrics(model: ForceModel, training: Dataset, validation: Dataset) -> dict[str, float]:
-    """Return what a model file says of its training: errors on both data sets, their rows, and `not_rising_share`."""
+    """Return what a model file says of its training: errors on both data sets, their rows, and `not_rising_share`.
+
+    Keys are those of `fit_metrics` behind `train_` and `validation_`, and `train_rows` and `validation_rows`, floats.
+    """
     return {
         **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},
         **{f"validation_{name}": value for name, value in fit_metrics(model, validation).items()},
@@ -55,9 +61,10 @@ def fit_metrics(model: ForceModel, dataset: Dataset) -> dict[str, float]:
 
 
 def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str, float]:
-    """Return mae_N, rmse_N, max_N, mae_percent (of `span_N`) and r2 of forces (n) predicted by any model.
+    """Return mae_N, rmse_N, max_N, mae_percent (of `span_N`) and r2 of forces (n), N, predicted by any model.
 
-    There is no r2 where all measured forces are equal.
+    There is no r2 where all measured forces are equal. Raises ZeroDivisionError for a `span_N` of 0, ValueError without
+    rows.
     """
     error_N = predicted_N - force_N
     variance = float(np.var(force_N))
@@ -75,7 +82,7 @@ def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str
 
 
 def not_rising_share(model: ForceModel, points: int = 17) -> float:
-    """Return the share of a grid over the training box (`points` per feature that varies) where dF/dB <= 0.
+    """Return the share, 0..1, of a grid over the training box (`points` per feature that varies) where dF/dB <= 0.
 
     In these places no single field gives a force, or the force does not depend on the field. A model of several inserts
     gets the greatest share of one.

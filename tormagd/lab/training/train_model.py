@@ -24,7 +24,10 @@ from tormagd.output import write_line
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab train-model`."""
+    """Add the options of `tormag-lab train-model`; data, element, insert and the file to write are needed.
+
+    Numbers are not checked here, but for the seed.
+    """
     parser.add_argument(
         "data", type=Path, metavar="DATA.csv", help="training CSV; a `cycle` column keeps cycles together"
     )
@@ -52,10 +55,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Train a model on the CSV `options.data`, write it to `options.out` and return its metrics.
+    """Train a model on the CSV `options.data`, write it to `options.out` and return `out`, `data_sha256` and its
+    metrics.
 
-    Raises LabError for data or an option that is refused, DomainError as `fit`, OSError where the model cannot be
-    written.
+    A file there is replaced. Of a network `stopped_by` is returned, too. Raises LabError for data or an option that is
+    refused, DomainError and ModuleNotFoundError as `fit`, OSError where the model cannot be written. Nothing is written
+    then.
     """
     if options.out.is_dir() or not options.out.parent.is_dir():
         raise LabError(f"cannot write {options.out}: allowed is a file in a folder that exists")
@@ -70,9 +75,11 @@ def run(options: argparse.Namespace) -> Found:
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, dict[str, str]]:
     """Train on `data` as `options` say, and return the model with its metrics, and of a network `stopped_by`.
 
-    With `options.without_memory` the memory is taken out of the data first, told on stderr, and kept in the model.
-    Raises DomainError as `fit_model` and `fit_law_model`, and LabError for a share that leaves too few rows on a side.
-    Raises ModuleNotFoundError for a network without torch, before anything is computed.
+    With `options.law` it is the law of a brake with one insert, else a network; the former returns an empty dict. With
+    `options.without_memory` the memory is taken out of the data first, told on stderr, and kept in the model.
+    `options.created` None means today. Raises DomainError as `fit_model`, `fit_law_model` and `identify`, LabError for
+    a share that leaves too few rows on a side. Raises ModuleNotFoundError for a network without torch, before anything
+    is computed.
     """
     if not options.law:
         from tormagd.lab.training.fitting import fit_model  # with torch, which a law does without

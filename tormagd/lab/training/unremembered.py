@@ -40,7 +40,9 @@ ROBUST_N = 0.05
 def identify(data: Dataset) -> tuple[Memory, Dataset]:
     """Identify the memory in the records of `data`; return it, and the rows with the forces of a device without memory.
 
-    Every record begins after a long rest. Deterministic. Raises `DomainError` without `time_s`.
+    The rows returned are all of `data`, in order, with other forces. Every record begins after a long rest, and a new
+    one wherever time goes back. Fields are above 0, rates are magnitudes; that is not checked. How well the fit does is
+    not judged. Deterministic. Raises `DomainError` without `time_s`.
     """
     every = max(1, len(data) // FITTED_ROWS)
     kept = data.subset(np.arange(0, len(data), every))
@@ -111,7 +113,7 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
 
     The element's field is `field_mT` less the lag. While the field rises, the lag goes to `memory.lag_mT`, while it
     falls, to the negative of that. A change by `memory.turn_mT` takes it most of the way; time has no effect. Each
-    record of `rows` begins without a lag.
+    record of `rows`, of which only the times count, begins without a lag. Raises DomainError without `time_s`.
     """
     lag_mT = np.zeros_like(field_mT)
     for record in records(times_of(rows)):
@@ -128,7 +130,8 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
 def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:
     """Return how much of the force `driving_N` (n) has relaxed away at each row, N (n).
 
-    Each record of `rows` begins as after a long rest under its first force.
+    Each record of `rows`, of which only the times count, begins as after a long rest under its first force. Between
+    rows the force counts as the mean of both. Raises DomainError without `time_s`.
     """
     times, away_N = times_of(rows), np.zeros_like(driving_N)
     fractions = np.array(memory.fractions)

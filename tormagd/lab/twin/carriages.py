@@ -39,13 +39,18 @@ MIN_MOVING = 200
 
 
 def lag_s(plant: PlantParameters) -> float:
-    """Return the time constant with which a carriage's speed follows the voltage, s."""
+    """Return the time constant, s, with which a motor's speed follows the voltage; gearbox and screw do not count."""
     motor = plant.motor
     return motor.inertia_kg_m2 * motor.resistance_Ohm / motor.back_emf_V_s_rad**2
 
 
 def priors_of(plant: PlantParameters, supply_V: float, tick_ms: float) -> list[Prior]:
-    """Return what is believed of carriages before, about `plant`: the spread of the plant card's devices."""
+    """Return what is believed of carriages before, about `plant`: the spread of the plant card's devices.
+
+    Of the keys of the plant file, and at the end of `supply` and `pull`, factors of what was told, and `delay_s`.
+    `supply_V` is what the recording tells of the supply, `tick_ms` the time between two control ticks; neither is
+    checked.
+    """
     ripple = RIPPLE_MS * tick_ms
     shares = {
         "motor.resistance_Ohm": (0.15, 0.0),
@@ -68,10 +73,11 @@ def priors_of(plant: PlantParameters, supply_V: float, tick_ms: float) -> list[P
 
 
 def fit_carriages(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Driven:
-    """Fit both motors, gearboxes and screws to all moving rows of `ways`.
+    """Fit both motors, gearboxes and screws to all moving rows of `ways`, and return them as told beside `prior`.
 
-    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Raises LabError where the carriages
-    hardly moved.
+    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Keys that carriages do not have are
+    passed over. Supply and rate of ticks are those of the first of `ways`, which has to be there. Raises LabError where
+    either carriage moved in under MIN_MOVING rows.
     """
     tick_ms = 1e3 / GRID_HZ / float(np.median(ways[0].ticks))
     priors = [
@@ -108,6 +114,10 @@ def fit_carriages(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequenc
 
 
 def _volts_off(plant: PlantParameters, seen: Moves, told: Mapping[str, float]) -> Array:
+    """Return by how much each row (n) of one carriage misses the law of volts, V; above 0 where too much was applied.
+
+    `told` has `supply`, the supply's factor, and `delay_s`, s.
+    """
     motor, omega = plant.motor, _screw(plant, seen.speed_m_s)
     applied = told["supply"] * (seen.volts - told["delay_s"] * seen.volts_s)
     return (
@@ -119,6 +129,11 @@ def _volts_off(plant: PlantParameters, seen: Moves, told: Mapping[str, float]) -
 
 
 def _amps_off(plant: PlantParameters, seen: Moves, pull_N: Array, side: str) -> Array:
+    """Return by how much each row (n) of one carriage misses the law of torque, A; above 0 where the current is too
+    much.
+
+    `pull_N` (n) is the magnets' pull at the rows' gaps, `side` one of SIDES. A row that stands has no friction.
+    """
     gear, screw = plant.gear, plant.screw
     coupling = gear.ratio * plant.motor.back_emf_V_s_rad
     way = np.sign(seen.speed_m_s)

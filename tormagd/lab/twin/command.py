@@ -38,10 +38,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Fit a plant to the recordings `options.files` and return what is told, what is not, and the model error.
+    """Fit a plant to the recordings `options.files`, and return what is told, what is not, and the model error.
 
-    The exit code is 1 where the laws do not explain the device. Raises LabError for recordings or a sensor that are
-    refused, PlantError for the prior, OSError where a file cannot be written.
+    The figures are as `figures_of`. The exit code is 1 where the laws do not explain the device. The plant is written
+    to `options.out`, and drawn to `options.plot`, all the same. A picture that is there is replaced, a plant is
+    refused. Raises LabError for recordings or a sensor that are refused, PlantError for the prior. Raises OSError where
+    a file cannot be written, ModuleNotFoundError for a picture without matplotlib.
     """
     if options.out is not None and options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
@@ -62,7 +64,13 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> dict[str, Any]:
-    """Return a twin as plain data: numbers with half the width of their 95 % intervals, and sentences."""
+    """Return a twin as plain data: numbers with half the width of their 95 % intervals, and sentences.
+
+    `prior` and `ways` are those of `twin_of`. `says` are sentences for a person, `cut_out` those of the sensor,
+    `field_law` the law's name. `told` has `name`, `value` and `half_width` of combinations and keys, `unknown` the
+    other keys with `name`, `prior` and `motion`, in words. `sensors` has `file`, `zero_mN` and `drift_mN_min` of each
+    recording. `model_error` has `force_mN`, `sensor_noise_mN`, `gap_mm` and `is_explained`.
+    """
     strength = value_at(twin.plant, STRENGTH) / value_at(prior, STRENGTH)
     error_mN, noise_mN = 1e3 * twin.force.error_N, 1e3 * twin.noise_N
     says = [
@@ -97,7 +105,12 @@ def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> d
 
 
 def draw(path: Path, twin: Twin, way: Excerpt) -> None:
-    """Draw the measured force of one recording, what the plant explains of it, and the difference, to `path`."""
+    """Draw the measured force of one recording, what the plant explains of it, and the difference, to the PNG file
+    `path`.
+
+    `way` has to be the first recording of the twin: its zero and memory are taken. A file there is replaced. Raises
+    OSError, and ModuleNotFoundError where matplotlib is not installed.
+    """
     figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
     zero_N = 1e-3 * (twin.force.zeros[0]["zero_mN"] + twin.force.zeros[0]["drift_mN_min"] * way.minute)
     explained_N = along(twin.plant, way, twin.force.memory_N, fresh_along(twin.plant, way)) + zero_N

@@ -56,12 +56,19 @@ class Estimate(NamedTuple):
         return self.plant_of(named(self.priors, self.values))
 
     def width_of(self, key: str) -> float:
-        """Return half the width of the 95 % interval of the values at a key, told or not: the widest."""
+        """Return half the width of the 95 % interval of the values at a key, told or not: the widest.
+
+        Floors do not count. Raises ValueError for a key that no prior has.
+        """
         places = [place for place, each in enumerate(self.priors) if each.key == key]
         return self.deviations * math.sqrt(float(np.diag(self.covariance)[places].max()))
 
     def half_width(self, function: Callable[[PlantParameters], float]) -> float:
-        """Return half the width of the 95 % interval of a number of the plant; NaN where the data do not tell it."""
+        """Return half the width of the 95 % interval of a number of the plant, in its unit.
+
+        `function` gives the number for a plant. NaN where the data do not tell it: where the interval is over TOLD of
+        the prior's, or the number depends on no value. The floors of the priors count, too.
+        """
         widths = np.array([each.half_width for each in self.priors])
 
         def at(values: Array) -> float:
@@ -82,9 +89,12 @@ def named(priors: Sequence[Prior], values: Array) -> Values:
 def estimated(
     residuals: Callable[[Array], Array], priors: Sequence[Prior], blocks: Array, noise: float, plant_of: PlantOf
 ) -> Estimate:
-    """Return the values that make `residuals` (n, of the values) small beside `noise`, and stay near their priors.
+    """Return the values that make `residuals` (n, of the p values) small beside `noise`, and stay near their priors
+    (p).
 
-    Residuals of one number in `blocks` (n) may be correlated in any way. `plant_of` makes a plant of values by key.
+    Values are in the priors' order and units, and not under their least. Residuals of one number in `blocks` (n) may be
+    correlated in any way. `plant_of` makes a plant of values by key. At most ROUNDS evaluations with their slopes are
+    made, and whether they settled is not told. Raises ValueError where the residuals are not finite at the priors.
     """
     middle, widths = (np.array([getattr(each, name) for each in priors]) for name in ("value", "half_width"))
     least = (np.array([each.least for each in priors]) - middle) / widths

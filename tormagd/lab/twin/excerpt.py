@@ -117,7 +117,11 @@ ROWS = ("gap_mm", "handle_mm", "force_N", "temperature_C", "readings", "ticks")
 
 
 def excerpt_of(path: Path) -> Excerpt:
-    """Read the recording in `path`. Raises LabError where it is none, or of another length or rate than is allowed."""
+    """Read the recording in `path`, once from its beginning, and return its excerpt.
+
+    Raises LabError, naming the file, where it is none or damaged, too short, too long, or has too few ticks a second.
+    Also where time falls, or a needed quantity is never told.
+    """
     taking = Taking(str(path))
     try:
         read_recording(path, Tick, taking.see)
@@ -143,7 +147,8 @@ class Taking:
     def see(self, seen: Seen) -> None:
         """Take a message of a recording; snapshots, and ticks without a time, are passed over.
 
-        Time that falls, or a recording over LONGEST_S, is refused by `done`; what follows is passed over.
+        The message of a tick is a `Tick`. Time that falls, or more than LONGEST_S, is refused by `done`; what follows
+        is passed over.
         """
         if not seen.is_tick or self._refusal or math.isnan(now_s := seen.message.monotonic_s):
             return
@@ -160,7 +165,11 @@ class Taking:
         self._rows.append((*numbers, float(mode == "RUN")))
 
     def done(self) -> Excerpt:
-        """Return what all ticks said. Raises LabError, which names the recording, where they do not serve."""
+        """Return what all ticks said; to be called once, after the last. It ends the chunk that is begun.
+
+        Gap, handle and temperature that are not known are the last known ones. Raises LabError, naming the recording,
+        where the ticks do not serve: what `see` refused, too short, too rare, or a quantity that is never told.
+        """
         if self._rows:
             self._end_chunk()
         grid = np.concatenate(self._grids, axis=1) if self._grids else np.zeros((6, 1))
@@ -195,7 +204,10 @@ class Taking:
         )
 
     def _end_chunk(self) -> None:
-        """Reduce the waiting ticks to their rows, and drop them."""
+        """Reduce the waiting ticks, one at least, to rows, noise, supply, clock and moves of a chunk, and drop them.
+
+        A row without a tick has NaN, and counts of 0. Under MIN_TICKS ticks give no moves.
+        """
         columns = dict(zip((*NUMBERS, "runs"), np.array(self._rows).T, strict=True))
         columns["gap_mm"] = columns["left_mm"] + columns["right_mm"]
         self._rows = []
@@ -234,7 +246,13 @@ class Taking:
 
 
 def _moving(columns: dict[str, Array], side: str, times_s: Array, period_s: float) -> Array:
-    """Return the rows of `Moves` of a chunk (10 x n) while the duties drive this carriage."""
+    """Return the rows of `Moves` of a chunk (10 x n), in order of its fields, while the duties drive the carriage
+    `side`.
+
+    `columns` has NUMBERS, `runs` and `gap_mm` by tick, `times_s` the ticks' times from the recording's first. Rows
+    stand MOVING_EVERY_S apart at least, and keep off gaps in time, other modes, and the chunk's ends. There may be
+    none.
+    """
     seen = smoothed(period_s, columns, side)
     margin = 2 * seen.window
     even = np.ones(len(times_s))

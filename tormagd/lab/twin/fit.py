@@ -81,10 +81,11 @@ STANDS_FOR = {STRENGTH: strength_N, EXPONENT: slope}
 
 
 def twin_of(prior: PlantParameters, ways: Sequence[Excerpt]) -> Twin:
-    """Fit a plant about `prior` to the recordings `ways` of one device.
+    """Fit a plant about `prior` to the recordings `ways` of one device, one at least, and return it with what is told.
 
-    Raises LabError for a prior without an insert, a force sensor that is not to be believed, and a device whose
-    carriages hardly moved.
+    The field law is the one that explains the first two minutes better. Keys are fitted twice: all, and then those that
+    were told alone. Nothing is judged: see `is_explained`. Raises LabError for a prior with [pad] or [second], a force
+    sensor that is not to be believed, and a device whose carriages hardly moved.
     """
     if prior.pad is not None or prior.second is not None:
         raise LabError("--prior: allowed is a plant with an insert, without [pad] and [second]")
@@ -115,7 +116,10 @@ def twin_of(prior: PlantParameters, ways: Sequence[Excerpt]) -> Twin:
 
 
 def _told(estimate: Estimate) -> dict[str, float]:
-    """Return half the width of the interval of each key that the data tell."""
+    """Return half the width of the interval of each key of the plant file that the data tell; the others are absent.
+
+    The width of a key of STANDS_FOR is that of its combination, in the key's unit.
+    """
     found, plant = {}, estimate.plant
     for key in (each.key for each in estimate.priors if "." in each.key):
         function = STANDS_FOR.get(key, lambda plant, key=key: value_at(plant, key))
@@ -127,13 +131,19 @@ def _told(estimate: Estimate) -> dict[str, float]:
 
 
 def _noise_N(ways: Sequence[Excerpt]) -> tuple[float, float]:
+    """Return the noise of one reading, N, as the median of all chunks of `ways`, and half the width of its interval,
+    N."""
     noise_N = np.concatenate([way.noise_N for way in ways])
     spread = 2.0 * float(noise_N.std()) / math.sqrt(len(noise_N))
     return float(np.median(noise_N)), math.hypot(spread, NOISE_SHARE * float(np.median(noise_N)))
 
 
 def _of_sensor(ways: Sequence[Excerpt], force: Fitted) -> dict[str, Told]:
-    """Return what is seen without a law: the sensor's noise, drift and rate, the supply, and the device's clock."""
+    """Return by key what is seen without a law: the sensor's noise, drift and rate, the supply, and the device's clock.
+
+    Values are means over `ways`; the drift has no sign. The drift is absent where its interval is too wide, the rate
+    where the sensor is as fast as the ticks.
+    """
     noise_N, width_N = _noise_N(ways)
     drift_mN_min = float(np.mean([abs(zero["drift_mN_min"]) for zero in force.zeros]))
     rows, readings, ticks = (

@@ -49,10 +49,11 @@ class Fitted(NamedTuple):
 
 
 def made(prior: PlantParameters, values: Values) -> PlantParameters:
-    """Return the plant with values at keys of the element.
+    """Return the plant with values at keys of the element; the others stay as in `prior`. Bounds are not checked.
 
-    The strength is that of the prior times how much its kinetic friction grows, whatever else changes. The exponent
-    turns the field about PIVOT_MM. Magnets, modulus and friction share what is left.
+    The strength, at STRENGTH, is that of the prior times how much its kinetic friction grows, whatever else changes.
+    The exponent turns the field about PIVOT_MM. Magnets, modulus and friction share what is left. `values` without a
+    key leave it; an exponent needs the power law.
     """
     field, own_N = prior.field, strength_N(prior)
     exponent = values.get(EXPONENT, field.exponent)
@@ -63,7 +64,11 @@ def made(prior: PlantParameters, values: Values) -> PlantParameters:
 
 
 def priors_of(plant: PlantParameters) -> list[Prior]:
-    """Return what is believed of an element before, about `plant`: the spread of the plant card's devices."""
+    """Return what is believed of an element before, about `plant`: the spread of the plant card's devices.
+
+    All are keys of the plant file, as `value_at` takes them. The field's exponent is among them only under the power
+    law.
+    """
 
     def about(key: str, share: float = 0.0, plain: float = 0.0, least: float = 0.0, floor: float = 0.0) -> Prior:
         value = value_at(plant, key)
@@ -85,10 +90,11 @@ def priors_of(plant: PlantParameters) -> list[Prior]:
 
 
 def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Fitted:
-    """Fit the element, under the field law of `prior`, to the forces along `ways`.
+    """Fit the element, under the field law of `prior`, to the forces along `ways`, one at least, and return it.
 
-    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Raises LabError for a sensor that
-    stands still or drifts.
+    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Zero, drift and memory of each
+    recording are fitted besides. The first BURN_S of each do not count. Raises LabError for a sensor that says nothing
+    for too long, whose zero is far off, drifts or wanders.
     """
     shared = [each for each in priors_of(prior) if only is None or each.key in only]
     branches = [Prior(f"memory_{place}", 0.0, 0.5) for place in range(len(prior.relaxation.fractions))]
@@ -141,9 +147,11 @@ def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[st
 
 
 def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mask], list[str]]:
-    """Return which rows of each way count, and a sentence for each stretch in which the sensor stands still.
+    """Return a mask of the rows of each way that count, and a sentence for each stretch in which the sensor stands
+    still.
 
-    Raises LabError where too much of a way has no force.
+    It stands still where its reading stays for FROZEN_S while `prior` expects a change of over FROZEN_N. Rows without a
+    force and those of the first BURN_S do not count. Raises LabError where over MAX_LOST of a way has no force.
     """
     kept, cut_out = [], []
     for way in ways:
@@ -169,7 +177,11 @@ def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mas
 def _require_steady(
     way: Excerpt, zero_mN: float, drift_mN_min: float, width_mN_min: float, residual_N: Array, time_s: Array
 ) -> None:
-    """Raise LabError for a sensor whose zero surely drifts, or jumps, by more than one does that may be believed."""
+    """Raise LabError for a sensor whose zero is far off, surely drifts, or wanders; else do nothing.
+
+    `zero_mN` and `drift_mN_min` are as fitted, `width_mN_min` is half the width of the drift's interval. `residual_N`
+    (n), at `time_s` (n), is what the law leaves: its means of WANDER_S each show the wandering.
+    """
     part = np.floor(time_s / WANDER_S).astype(np.int64)
     sums, counts = np.bincount(part, residual_N), np.bincount(part)
     wander_mN = 1e3 * float(np.ptp(sums[counts > 0] / counts[counts > 0]))

@@ -25,7 +25,10 @@ PIVOT_MM = 67.0
 
 
 def value_at(plant: PlantParameters, key: str) -> float:
-    """Return the number at a key of the plant file, as `motor.resistance_Ohm`; `.0` is the first of a list."""
+    """Return the number at a key of the plant file, as `motor.resistance_Ohm`; `.0` is the first of a list.
+
+    Raises AttributeError or IndexError for a key that is none, ValueError or TypeError for one of no number.
+    """
     found: Any = plant
     for name in key.split("."):
         found = found[int(name)] if name.isdigit() else getattr(found, name)
@@ -33,7 +36,11 @@ def value_at(plant: PlantParameters, key: str) -> float:
 
 
 def keys_of(plant: PlantParameters) -> list[str]:
-    """Return the keys of all numbers in a plant file, as `value_at` takes them; not of what is assumed."""
+    """Return the keys of all numbers in a plant file, as `value_at` takes them; not of what is assumed, of [pad] or
+    [second].
+
+    They stand in the order of the file; each number of a list has its own key.
+    """
     tables = msgspec.to_builtins(plant)
     named = ((f"{title}.{name}", value) for title in PARTS for name, value in tables[title].items())
     listed = (
@@ -45,7 +52,11 @@ def keys_of(plant: PlantParameters) -> list[str]:
 
 
 def with_values(plant: PlantParameters, values: Mapping[str, float]) -> PlantParameters:
-    """Return the plant with other numbers at some keys, unchecked."""
+    """Return the plant with other numbers at some keys, as `value_at` takes them; `plant` itself stays.
+
+    Neither numbers nor bounds are checked. A key of a name that the table has not raises TypeError, of a table
+    AttributeError.
+    """
     for key, value in values.items():
         table, name, *index = key.split(".")
         part = getattr(plant, table)
@@ -76,7 +87,10 @@ def strength_N(plant: PlantParameters, gap_mm: float = PIVOT_MM) -> float:
 
 
 def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
-    """Return the fresh insert's kinetic friction (n) along the way, N, as warm as it is."""
+    """Return the fresh insert's kinetic friction (n), N, along the way, as warm as it is, with the lag of its field.
+
+    At the first row the field does not lag.
+    """
     moment_Tm = moments_Tm(plant, way.gap_mm)
     warmer_K = way.temperature_C - plant.assumed.ambient_C
     lag_Tm = lag_of(plant).along_Tm(moment_Tm, 0.0, float(moment_Tm[0]))
@@ -86,8 +100,8 @@ def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
 def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh: Array) -> Array:
     """Return the friction (n), N, with the sign of the handle's motion, as the sensor shows it after its delay.
 
-    `memory_N` is what each branch of the elastomer still remembers at the first row, N; 0 after a long rest. `fresh` is
-    `fresh_along`.
+    `memory_N` is what each branch of the elastomer still remembers at the first row, N; 0 after a long rest. It has an
+    element for each branch, else ValueError. `fresh` (n) is `fresh_along`. The handle stands before the first row.
     """
     series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
     step = series.discretise(1.0 / GRID_HZ)
@@ -101,7 +115,11 @@ def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh
 
 
 def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
-    """Return the friction at the roller (n), N, for kinetic levels (n) and handle speeds (n)."""
+    """Return the friction at the roller (n), N, for kinetic levels (n), N, and handle speeds (n), mm/s, at rows of
+    GRID_HZ.
+
+    It has the sign of the motion. Bristles are unbent before the first row.
+    """
     friction, bristles_mm, forces = friction_of(plant), 0.0, []
     for speed, level_N in zip(speed_mm_s.tolist(), kinetic_N.tolist(), strict=True):
         force_N, bristles_mm = friction.advance(bristles_mm, speed, level_N, 1.0 / GRID_HZ)

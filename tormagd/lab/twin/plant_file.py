@@ -43,14 +43,16 @@ MOTIONS: Mapping[str, str] = {
 
 
 def motion_for(key: str) -> str:
-    """Return, in words, what would tell a key that the recordings do not."""
+    """Return, in words, what would tell a key that the recordings do not; for a key without a motion, that a data sheet
+    does."""
     return MOTIONS.get(key) or MOTIONS.get(key.split(".")[0], DATASHEET)
 
 
 def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
-    """Write the plant to the new file `path`, with the lines of `head` as comments above.
+    """Write the plant to the new file `path`, with the lines of `head` as comments above, and read it again.
 
-    Raises LabError where the file exists, or what was fitted is no plant; OSError.
+    Lines of `head` have no line ends. Raises LabError where the file exists, or what was fitted is no plant; then there
+    is no new file. Raises OSError, which may leave a part of the file.
     """
     text = "\n".join([*(f"# {line}" for line in head), *_lines(twin)]) + "\n"
     try:
@@ -65,6 +67,11 @@ def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
 
 
 def _lines(twin: Twin) -> Iterator[str]:
+    """Yield the lines of the plant file: each table's head after an empty line, then `key = value # comment` for each
+    key.
+
+    Numbers have six digits. Tables that the plant has not, and what is assumed as usual, are left out.
+    """
     tables: dict[str, Any] = msgspec.to_builtins(twin.plant)
     usual = msgspec.to_builtins(Assumed())
     for title in PlantParameters.__struct_fields__:
@@ -85,6 +92,10 @@ def _short(value: Any) -> Any:
 
 
 def _comment(twin: Twin, key: str, value: Any) -> str:
+    """Return the comment of a key: how sure it is, or what would tell it.
+
+    `value` is a number, a list of them or a name. Of a list each number's half width is told.
+    """
     if isinstance(value, list | tuple):
         told = [twin.keys.get(f"{key}.{place}") for place in range(len(value))]
         if any(told):
