@@ -126,7 +126,7 @@ def test_several_files_are_a_cycle_each_and_what_is_missing_is_said_and_drawn(tm
 
 
 RANDOM_SIGN = renamed(USUAL) | {"force_N": measured()["force"] * np.where(np.arange(600) % 3 == 0, -1.0, 1.0)}
-REFUSED: dict[str, tuple[str, str]] = {
+REFUSED: dict[str, tuple[str, ...]] = {
     "no force": (text(renamed({"rate": "rate", "field": "field"})), "no column is force_N (force, load, f)"),
     "tesla, unsaid": (text(renamed({"rate": "v", "field": "B", "force": "F"}, field=1e-3)), "field_mT=B:T"),
     "a strange unit": (text(renamed({"rate": "v", "field": "B", "force": "F [lbf]"})), "unit 'lbf' of force_N"),
@@ -139,14 +139,15 @@ REFUSED: dict[str, tuple[str, str]] = {
     "a cycle of one row": ("t,cycle,F,B,v\n5,0,1,90,1\n0,1,1,91,1\n1,1,1,92,1\n", "a cycle of one row"),
     "newtons of a press": (text(renamed(USUAL, force=1e6)), "is its unit another?"),
     "nothing": ("", "no column is"),
+    "a picture of sound": (text(renamed(USUAL)), "p.mp3: allowed is a name that ends with .png", "--picture", "p.mp3"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_told_is_refused_with_the_cause(case: str, tmp_path: Path, capsys) -> None:
-    content, why = REFUSED[case]
+    content, why, *options = REFUSED[case]
     (tmp_path / "given.csv").write_text(content)
     out = tmp_path / "rows.csv"
-    assert main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out)]) == 2
+    assert main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), *options]) == 2
     assert why in capsys.readouterr().err
     assert not out.exists()

@@ -123,6 +123,8 @@ def run(options: argparse.Namespace) -> Found:
     """
     if options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
+    if options.picture is not None and options.picture.suffix != ".png":
+        raise LabError(f"--picture {options.picture}: allowed is a name that ends with .png")
     stated = dict(_stated(text) for text in options.column)
     parts: list[Imported] = []
     for cycle, path in enumerate(options.files):
@@ -439,10 +441,10 @@ def _missing(data: Dataset) -> list[str]:
 
 
 def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
-    """Write a picture of field and rate of all rows, coloured by force, to `path`, with what is missing as its title.
+    """Write a picture of field and rate of all rows, coloured by force, to the PNG file `path`, with what is missing as
+    title.
 
-    A file there is replaced. Raises OSError, ModuleNotFoundError without matplotlib, ValueError for an ending that
-    matplotlib does not know.
+    A file there is replaced. Raises OSError, and ModuleNotFoundError without matplotlib.
     """
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)
