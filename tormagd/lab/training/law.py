@@ -87,8 +87,17 @@ class Law(NamedTuple):
         over = 1.0 + self.static * np.exp(-np.square(rate_mm_s / np.exp(self.log_stribeck_mm_s)))
         over += self.by_rate * np.log((rate_mm_s + SLOW_MM_S) / (REFERENCE_MM_S + SLOW_MM_S))
         level_N = np.maximum(kinetic_N * over + self.viscous_N_s_mm * rate_mm_s, MIN_N)
-        borne_N: Array = level_N * -np.expm1(-np.exp(self.log_stiffness_N_mm) * displacement_mm / level_N)
-        return np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
+        return mobilised_N(level_N, displacement_mm, np.exp(self.log_stiffness_N_mm))
+
+
+def mobilised_N(level_N: Array, displacement_mm: Array, stiffness_N_mm: float) -> Array:
+    """Return the force (n), N, at displacements (n) of an element whose friction has the level (n), N, above 0.
+
+    Before mobilisation the elastomer bears `stiffness_N_mm` at first, and less and less; from MOBILISED_MM on it is the
+    level. Nothing is checked.
+    """
+    borne_N: Array = level_N * -np.expm1(-stiffness_N_mm * displacement_mm / level_N)
+    return np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
 
 
 START = Law(0.0, 0.0, 1.0, 0.0, 0.1, np.log(10.0), 0.0, 1e-4, np.log(5.0), 0.3)

@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.law import mobilised_N
 from tormagd.lab.training.memory import records, times_of
-from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.features import CIP, FIELD
 from tormagd.model.memory import Memory
 
@@ -79,9 +79,7 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
 
         def given_N(kinetic_N: Array) -> Array:
             over = 1.0 + static * np.exp(-np.square(rate / speed_mm_s)) + viscous * rate
-            level = np.maximum(kinetic_N * over, MIN_N)
-            borne: Array = level * -np.expm1(-stiffness_N_mm * displacement_mm / level)
-            return np.where(displacement_mm < MOBILISED_MM, borne, level)
+            return mobilised_N(np.maximum(kinetic_N * over, MIN_N), displacement_mm, stiffness_N_mm)
 
         lagging_N = level_N(common_mT - _lag_mT(memory, common_mT, rows))
         return given_N(level_N(common_mT)), given_N(lagging_N - _relaxed_away_N(memory, lagging_N, rows))

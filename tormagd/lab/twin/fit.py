@@ -9,6 +9,7 @@ import numpy as np
 
 from tormagd.lab.arrays import rms
 from tormagd.lab.errors import LabError
+from tormagd.lab.ideal_carriage import friction_of
 from tormagd.lab.twin.carriages import SUPPLY_STEP_V, fit_carriages, lag_s
 from tormagd.lab.twin.estimate import TOLD, Estimate
 from tormagd.lab.twin.excerpt import EVERY_TICK, GRID_HZ, Excerpt
@@ -64,8 +65,7 @@ def slope(plant: PlantParameters) -> float:
 
 def low_speed_factor(plant: PlantParameters) -> float:
     """Return the friction at SLOW_MM_S over that of a fast handle."""
-    friction = plant.friction
-    return 1.0 + (friction.static_to_kinetic - 1.0) * math.exp(-((SLOW_MM_S / friction.stribeck_speed_mm_s) ** 2))
+    return friction_of(plant).level_N(SLOW_MM_S, 1.0)
 
 
 OF_FORCE: dict[str, Callable[[PlantParameters], float]] = {
