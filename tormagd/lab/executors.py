@@ -58,9 +58,9 @@ def finished(
     """Run `function` on every item; yield each item with its done future, in order of completion, beside a progress
     bar.
 
-    All items are handed to `executor` at the first step. An error of a run, also of a process that dies, stays in its
-    future: `result()` raises it, and the other runs go on. A caller that stops iterating cancels the runs that have not
-    begun. The bar counts `unit`, on stderr, and only on a terminal.
+    All items are handed to `executor` at the first step. An error of a run stays in its future: `result()` raises it,
+    and the other runs go on. A process here that dies fails all runs that are left. A caller that stops iterating
+    cancels the runs that have not begun. The bar counts `unit`, on stderr, and only on a terminal.
     """
     pending = {executor.submit(function, item): item for item in items}
     try:

@@ -22,7 +22,7 @@ def pictures(trained: Trained, traces: dict[str, Array]) -> dict[str, Figure]:
 def _last_cycle(cycles: Dataset, cip_percent: float, field_mT: float) -> Dataset:
     """Return the rows of the last cycle at 1 mm/s, both ways, of the class with this iron and of this field.
 
-    Both have to be values of the data, exactly. Raises ValueError where no row is of them.
+    Both have to be values of the data, exactly. Raises LabError where under two rows are of them.
     """
     _, rate_mm_s, fields_mT, classes = cycles.features.T
     is_slow = np.isclose(np.abs(rate_mm_s), SHOWN_RATE_MM_S)

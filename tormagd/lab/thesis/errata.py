@@ -28,7 +28,10 @@ KEYS = ("place", "printed", "found", "used")
 
 
 def errata() -> list[dict[str, str]]:
-    """Return all errata in the order of the thesis: a dict with KEYS for each, of plain text."""
+    """Return all errata in the order of the thesis: a dict of plain text for each.
+
+    Its keys are `place` in the thesis, `printed` there, `found` here, and the reading `used`.
+    """
     found = (*_chapter_2(), _eq_25(), *_chapter_3(), *_appendices(), *_chapter_4())
     return [dict(zip(KEYS, row, strict=True)) for row in found]
 
@@ -63,9 +66,10 @@ Row = tuple[str, str, str, str]
 
 
 def _chapter_2() -> list[Row]:
-    """Return the errata of chapter 2 but for Eq. 25, as rows of KEYS, with figures computed from what is printed.
+    """Return the errata of chapter 2 but for Eq. 25, in order: place, what is printed, what was found, and the reading
+    used.
 
-    They stand in the order of the thesis. Nothing is read, and the rows are the same each time.
+    Figures are computed from what is printed. Nothing is read, and the rows are the same each time.
     """
     eq7, power = ThesisFieldLaw(), PowerFieldLaw()
     closed_Tm, open_Tm = eq7.radial_moment_Tm(CLOSED_MM), eq7.radial_moment_Tm(OPEN_MM)
@@ -167,9 +171,10 @@ def _chapter_2() -> list[Row]:
 
 
 def _eq_25() -> Row:
-    """Return the erratum of Eq. 25, a row of KEYS: the stress of the insert at the closed gap, true and nominal.
+    """Return the erratum of Eq. 25: place, what is printed, what was found, and the reading used.
 
-    It is by Eq. 9..27 with the kinematics of Eq. 33, and with free ends.
+    Found are the true and the nominal stress of SAMPLE at the closed gap, by Eq. 9..27 with the kinematics of Eq. 33,
+    and with free ends.
     """
     moment_Tm = ThesisFieldLaw().radial_moment_Tm(CLOSED_MM)
     radial = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
@@ -189,8 +194,10 @@ def _eq_25() -> Row:
 
 
 def _chapter_3() -> list[Row]:
-    """Return the errata of chapter 3, as rows of KEYS, in the order of the thesis; starts and optima are counted from
-    `values`."""
+    """Return the errata of chapter 3, in order: place, what is printed, what was found, and the reading used.
+
+    How many starts lie outside appendix B's bounds, and optima at them, is counted from table 3.2.
+    """
     low, high = APPENDIX_B_BOUNDS
     lines = [line for case in USE_CASES.values() for line in case.starts]
     outside = [f"R_o {line.start.outer_radius_mm:g}" for line in lines if not _inside(line.start, low, high)]
@@ -219,9 +226,10 @@ def _chapter_3() -> list[Row]:
 
 
 def _appendices() -> list[Row]:
-    """Return the errata of the appendices, as rows of KEYS: of field, traction, gap speed, stress and cost.
+    """Return the errata of the appendices: place, what is printed, what was found, and the reading used.
 
-    Fields and stresses are computed at the closed gap, of the insert SAMPLE.
+    They are of field, traction, gap speed, stress and cost. Fields and stresses are computed at the closed gap, of
+    SAMPLE.
     """
     exponent_T = 0.44 * CLOSED_MM ** (-1.3 / 6.0 * APPENDIX_MU_R) / 0.004
     sixth_T = 0.44 * CLOSED_MM**-1.3 / 6.0 * APPENDIX_MU_R / 0.004
@@ -266,8 +274,10 @@ def _appendices() -> list[Row]:
 
 
 def _chapter_4() -> list[Row]:
-    """Return the errata of chapter 4, as rows of KEYS: the full scale that its errors imply, and the least rate of its
-    search."""
+    """Return the errata of chapter 4: place, what is printed, what was found, and the reading used.
+
+    They are of the full scale that its field errors imply, and of the rate of its search.
+    """
     return [
         (
             "Abstract and section 4.3",

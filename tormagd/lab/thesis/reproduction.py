@@ -60,10 +60,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Return all tables and figures of the reproduction by name, for a person as the page.
 
-    The folder `options.out`, if given, gets reproduction.md and its pictures, in `reproduction`; both are made where
-    missing, and files there replaced. With `options.table_2_5` only that table is made, and nothing is written. Runs go
-    to `options.workers` processes. Raises ModuleNotFoundError where a package is missing, OSError where `out` cannot be
-    written, RuntimeError where a simulated device faults. Raises DomainError as `phase_portrait`.
+    Each is as the function of its name here; `table_4_1` and `pulse` are `chapter_4`'s, `errata` are a list. The folder
+    `options.out`, if given, gets reproduction.md and its pictures, in `reproduction`; both are made where missing, and
+    files there replaced. With `options.table_2_5` only that table is made, and nothing is written. Runs go to
+    `options.workers` processes. Raises ModuleNotFoundError where a package is missing, OSError where `out` cannot be
+    written. Raises RuntimeError where a simulated device faults, DomainError as `phase_portrait`.
     """
     if options.table_2_5:
         found = table_2_5()
@@ -199,7 +200,8 @@ def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -
     """Return one insert's measured and fitted ranges, N, and their relative errors, shares of the measured one.
 
     `fixed` and `free` are the fits with a fixed and a free exponent. `left_out` is the insert's error where the fixed
-    fit was made without it, and stands in the row as `leave_one_out_rel_error`.
+    fit was made without it. Keys: `insert`, `measured_N`, `deviation_N`, `thesis_N` with `thesis_rel_error`, `ours_N`
+    with `rel_error`, `ours_free_exponent_N` with `rel_error_free_exponent`, and `leave_one_out_rel_error`.
     """
     ranges = item.force_range
     return {

@@ -94,8 +94,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     """Record all sweeps, write the training CSV `options.out`, and return `out`, `rows` (their number) and `synthetic`.
 
-    A missing folder is made, and a file that is there replaced. Raises PlantError, ConfigError, DomainError, OSError,
-    and RuntimeError where the device faults: nothing is written then.
+    A missing folder is made, and a file that is there replaced. Raises PlantError, ConfigError, DomainError, and
+    RuntimeError where the device faults: nothing is written then. Raises OSError where the file cannot be written.
     """
     data = record(options.plant, options.scene, options.insert, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)

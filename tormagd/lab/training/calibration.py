@@ -305,11 +305,11 @@ def read_sweep(path: Path) -> Array:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the calibration from the command line, print one JSON object and return the exit code.
+    """Run the calibration from the command line, print one JSON object on stdout and return the exit code.
 
     `arguments` None: those of the process. Code 0: the model was written, or without a sweep the insert is known and
     the needed packages are there. Code 1: there is no model, and the object holds `error` with `code`, `message` and
-    `hint`. Usage exits with 2. A RuntimeError is not caught.
+    `hint`. Usage ends the process with 2.
     """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(

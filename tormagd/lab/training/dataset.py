@@ -50,8 +50,8 @@ class Dataset:
     def of(cls, columns: Mapping[str, NDArray[Any]]) -> "Dataset":
         """Return the data of columns by name, as the method `columns` gives them; `cycle` is cut to whole numbers.
 
-        Columns of other names are passed over, and values are not checked. Raises KeyError without one of COLUMNS,
-        LabError as the class, ValueError for columns of different lengths.
+        Columns of other names are passed over. Neither values nor that all columns have the same length is checked.
+        Raises KeyError without one of COLUMNS, LabError as the class.
         """
         cycle = columns["cycle"].astype(np.int64) if "cycle" in columns else None
         features = np.column_stack([columns[name] for name in FEATURES])

@@ -55,8 +55,8 @@ class GreyBoxMemory:
         """Return the network's force, N, with which the pad gives `force_N` at the end of the next step.
 
         The step comes to `displacement_mm` and `rate_mm_s`, on a pad with `cip_percent` of iron. The state stays:
-        `advance` takes the step. Whether any field gives this force is not checked. Raises DomainError for what is not
-        finite.
+        `advance` takes the step. Whether any field gives this force is not checked. Raises DomainError for a motion or
+        iron that is not finite; a `force_N` of NaN gives NaN.
         """
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         rest_N, _ = self._step.advance(self._state, free_N)
