@@ -173,8 +173,8 @@ def _chapter_2() -> list[Row]:
 def _eq_25() -> Row:
     """Return the erratum of Eq. 25: place, what is printed, what was found, and the reading used.
 
-    Found are the true and the nominal stress of SAMPLE at the closed gap, by Eq. 9..27 with the kinematics of Eq. 33,
-    and with free ends.
+    Found are both stresses of SAMPLE at the closed gap, the true and the nominal one, with the kinematics of Eq. 33 and
+    free ends.
     """
     moment_Tm = ThesisFieldLaw().radial_moment_Tm(CLOSED_MM)
     radial = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
