@@ -1,14 +1,13 @@
 """What a hand feels that pushes into a wall and draws back: run and bound, in virtual time.
 
-    contact.py [--quick] [--draws N] [--json] [--picture FILE.png]
+    contact.py [--json] [--picture FILE.png]
 
 Onset: from when the wall's force at the handle's place reaches the waiting level W and 0.2 N to when the kinetic force
 does. W is what carriages without inertia leave of the open gap, the scene's least force and its standby. RMS: kinetic
 force less the wall's, at least W, from the wall's place until the hand turns; less W after that. Held: how long the
 handle is held back by more than W and 0.1 N while the hand draws it back. Devices are simulated: sample 1 was tuned on,
-the others judge. `--draws` are random walls, pushes and hands behind a network with jitter of 30 ms and 5 % loss in
-bursts. The band of the picture is the just noticeable difference of force, 10 % (Jones 1989); that of stiffness is 22 %
-(Jones and Hunter 1990).
+the others judge. The band of the picture is the just noticeable difference of force, 10 % (Jones 1989); that of
+stiffness is 22 % (Jones and Hunter 1990).
 """
 
 import argparse
@@ -40,13 +39,11 @@ from tormagd.lab.arrays import Json, Mask, rms
 from tormagd.lab.pages import subplots, table
 
 DEVICES = (*SAMPLES, "draw 100", "draw 103", SECOND)
-QUICK_DEVICES = ("sample_2", SECOND)
-HANDS_N_MM, QUICK_HANDS_N_MM = (0.1, 0.3, 1.0), (0.3,)
+HANDS_N_MM = (0.1, 0.3, 1.0)
 TOUCHES = ((0.05, 60.0), (0.25, 10.0), (0.25, 30.0), (1.0, 30.0))
 "Walls, N/mm, and pushes, mm/s."
 ROUND_TRIPS_MS = (0.0, 100.0, 400.0)
 MODES = ("force", "force_standby", "way", "way_standby", "law", "law_standby")
-JITTER_MS, LOSS = 30.0, 0.05
 EARLY_TICKS = 20
 "Before the wall, what is exceeded for no longer does not count."
 LATER_MS, WORSE, WORSE_N = 40.0, 1.1, 0.015
@@ -61,30 +58,11 @@ DRAWN = {
 FORCE_JND = 0.10
 
 
-def cases(is_quick: bool) -> list[Case]:
+def cases() -> list[Case]:
     """The matrix."""
-    devices, hands = (QUICK_DEVICES, QUICK_HANDS_N_MM) if is_quick else (DEVICES, HANDS_N_MM)
     return [
         Case(device, hand, *touched, round_trip_ms, mode)
-        for device, hand, touched, round_trip_ms, mode in product(devices, hands, TOUCHES, ROUND_TRIPS_MS, MODES)
-    ]
-
-
-def drawn(count: int) -> list[Case]:
-    """Random touches behind a bad network."""
-    random = np.random.default_rng(2037)
-    return [
-        Case(
-            str(random.choice(DEVICES)),
-            float(np.exp(random.uniform(math.log(0.1), 0.0))),
-            float(np.exp(random.uniform(math.log(0.05), 0.0))),
-            float(random.uniform(10.0, 60.0)),
-            float(random.uniform(0.0, 400.0)),
-            str(random.choice(MODES)),
-            JITTER_MS,
-            LOSS,
-        )
-        for _ in range(count)
+        for device, hand, touched, round_trip_ms, mode in product(DEVICES, HANDS_N_MM, TOUCHES, ROUND_TRIPS_MS, MODES)
     ]
 
 
@@ -97,7 +75,7 @@ def judged(case: Case) -> Json:
     force = core_of(case).scene.force
 
     def lag_ms(touch: Touch) -> float | None:
-        return onset_lag_ms(touch, case.wall_N_mm, waiting_N) if is_counted else None
+        return reached_ms(touch, case.wall_N_mm, waiting_N + ONSET_N) if is_counted else None
 
     return {
         **{key: value for key, value in case._asdict().items() if key != "hand_N_mm"},
@@ -132,13 +110,7 @@ def free_drag_N(touch: Touch) -> float:
 
 def pushing(touch: Touch) -> Mask:
     """The rows before the hand turns."""
-    found: Mask = touch.time_s < touch.time_s[-1] / 2.0
-    return found
-
-
-def onset_lag_ms(touch: Touch, wall_N_mm: float, waiting_N: float) -> float | None:
-    """The same of what shows a wall."""
-    return reached_ms(touch, wall_N_mm, waiting_N + ONSET_N)
+    return np.asarray(touch.time_s < touch.time_s[-1] / 2.0)
 
 
 def rms_N(touch: Touch, wall_N_mm: float, waiting_N: float) -> float:
@@ -260,12 +232,10 @@ def draw(picture: Path) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Exit code 0: all that has to hold does; else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two devices, one hand")
-    parser.add_argument("--draws", type=int, default=0, metavar="N", help="random touches instead of the matrix")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--picture", type=Path, metavar="FILE.png")
     options = parser.parse_args(arguments)
-    played = drawn(options.draws) if options.draws else cases(options.quick)
+    played = cases()
     with ProcessPoolExecutor() as pool:
         rows = list(tqdm(pool.map(judged, played), total=len(played), disable=options.json))
     result = {"cases": rows, "kept": kept(rows), "energy_error": max(row["energy_error"] for row in rows)}

@@ -229,15 +229,13 @@ def conclude(
     from rendering.pictures import show_picture, touch_picture
 
     if isinstance(touched, dict):
-        picture = RUN_DIR / "touch.png"
-        touch_picture(picture, touched, touch_told(scene, touched)[1])
-        written = [f"picture {picture}", *written]
+        touch_picture(RUN_DIR / "touch.png", touched, touch_told(scene, touched)[1])
+        written = [f"picture {RUN_DIR / 'touch.png'}", *written]
     if isinstance(shown, Shown):
         print_timing(shown)
         met = checks(scene, shown) | in_virtual_time
-        picture = RUN_DIR / "pulse.png"
-        show_picture(picture, scene, shown, rehearsals, force_table(shown, rehearsals))
-        written = [f"recording {RECORDING}", f"picture {picture}", *written]
+        show_picture(RUN_DIR / "pulse.png", scene, shown, rehearsals, force_table(shown, rehearsals))
+        written = [f"recording {RECORDING}", f"picture {RUN_DIR / 'pulse.png'}", *written]
         summary |= {
             "tracking": scored(shown.time_s, shown.asked_N, shown.rendered_N)._asdict(),
             "rates": shown.status["rates"],
@@ -302,9 +300,8 @@ def force_table(shown: Shown | Aborted, rehearsals: Rehearsals) -> list[str]:
     if isinstance(shown, Shown):
         rows[f"real time, plant {shown.plant}"] = numbers(scored(shown.time_s, shown.asked_N, shown.rendered_N))
     for case, found in rehearsals.items():
-        is_steady = case.hand == "steady"
-        line = numbers(found.since(PULSE_START_S)) if is_steady else "  (a brake: see the picture)"
-        rows[f"virtual time, {case.label}"] = line
+        told = numbers(found.since(PULSE_START_S)) if case.hand == "steady" else "  (a brake: see the picture)"
+        rows[f"virtual time, {case.label}"] = told
     width = max(map(len, rows), default=0)
     heading = f"  {'':{width}s} {'RMS':>8s} {'worst':>8s}  variance accounted for"
     return [heading, *(f"  {label:{width}s} {line}" for label, line in rows.items())]

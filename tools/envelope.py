@@ -1,6 +1,6 @@
 """What the whole path does at the corners: handles x devices x forces x what setpoints may say, in virtual time.
 
-    envelope.py [--quick] [--json] [--picture FILE.png]
+    envelope.py [--json] [--picture FILE.png]
     envelope.py --models [--json]
 
 Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this device
@@ -14,11 +14,10 @@ a loop around it. These are samples 2 and 3 and draws 100 to 119.
 import argparse
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from itertools import starmap
+from itertools import product, starmap
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,7 +35,7 @@ from tormagd.lab.pages import stamp, subplots
 from tormagd.lab.told import lines
 from tormagd.safety.codes import Limit
 
-DRAWS, QUICK_DRAWS = 40, 2
+DRAWS = 40
 SETPOINT_S = 0.002
 ARRIVED_S = 0.2
 OVER_S = 0.05
@@ -51,7 +50,7 @@ GAP_MM_S, GAP_MM_S2, STROKE_MM = 38.0, 1600.0, 30.0
 BOUNDS = {"over_N": 0.25, "over_sample_1_N": 0.15, "peak_N": 2.6, "settled_N": 0.1, "low_hold_faults": 0}
 """What has to hold: bounds of the excess over what was asked, on any device and on sample 1. Then come the greatest
 force at all (1.25 times the scene's and 0.1 N), the error after SETTLED_S of sliding, and the faults below F_min."""
-LOW_HOLD_S, QUICK_LOW_HOLD_S = 600.0, 20.0
+LOW_HOLD_S = 600.0
 LOW_N = (0.2, 0.5)
 "Forces under F_min."
 HELD_DRAWS = 20
@@ -104,9 +103,9 @@ class Figures(NamedTuple):
     limits: dict[str, float]
 
 
-def cases(draws: int) -> Iterator[Case]:
+def cases() -> Iterator[Case]:
     """Every run."""
-    for name in judging(draws):
+    for name in judging(DRAWS):
         for hand in HANDS:
             for forces in FORCES_OF_HANDS.get(hand, ("steps",)):
                 yield Case(name, hand, forces)
@@ -200,23 +199,21 @@ def sliding(handle_mm: Array, speed_mm_s: Array) -> Mask:
     return found
 
 
-def low_hold(name: str, asked_N: float, lasts_s: float) -> tuple[str, ...]:
+def low_hold(name: str, asked_N: float) -> tuple[str, ...]:
     """What is wrong with a force below F_min that is held for long: its faults, or that F_MIN was not shown."""
     loop = armed_at_rest(device(name), [(60.0, TURNED_MM_S)] * 11)
     is_shown = False
-    for sample in loop.run(lasts_s, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)):
+    for sample in loop.run(LOW_HOLD_S, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)):
         is_shown = is_shown or Limit.F_MIN in sample.plan.limits
         if sample.safety.faults:
             return tuple(map(str, sample.safety.faults))
     return () if is_shown else ("F_MIN was not shown",)
 
 
-def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures]]]:
+def measure() -> tuple[Json, list[tuple[Case, Figures]]]:
     """Everything; the keys are those of the public contract, and `peak_N`, `settled_N`, `rows`."""
-    draws, lasts_s = (QUICK_DRAWS, QUICK_LOW_HOLD_S) if options.quick else (DRAWS, LOW_HOLD_S)
-    asked = list(cases(draws))
-    holds = [(name, force_N, lasts_s) for name in judging(min(draws, HELD_DRAWS)) for force_N in LOW_N]
-    with ProcessPoolExecutor(max_workers=options.jobs) as pool:
+    asked, holds = list(cases()), list(product(judging(HELD_DRAWS), LOW_N))
+    with ProcessPoolExecutor() as pool:
         low = pool.map(low_hold, *zip(*holds, strict=True))
         runs = tqdm(pool.map(run, asked), desc="runs", total=len(asked), unit="run", disable=None)
         every = list(zip(asked, runs, strict=True))
@@ -235,9 +232,8 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
         "slow_error_N": max(abs(error) for case, figures in found if case.hand == "1 mm/s" for error in figures.slow_N),
         "cases": len(every) + len(holds),
         "second": {name: figure for name, figure in worst(second).items() if name != "peak_N"},
-        "low_holds": [f"{name} at {force} N: {', '.join(wrong)}" for name, force, _, wrong in faults if wrong],
-        "draws": draws,
-        "low_hold_s": lasts_s,
+        "low_holds": [f"{name} at {force} N: {', '.join(wrong)}" for name, force, wrong in faults if wrong],
+        "draws": DRAWS,
         "rows": list(starmap(row, every)),
     }
     return result, found
@@ -297,17 +293,15 @@ def main() -> int:
     """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted. Of models it is 0 if none falls
     with the field anywhere in its box."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a sample of it: two draws, short holds")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     parser.add_argument("--models", action="store_true", help="the shipped models, an insert a row")
     options = parser.parse_args()
     if options.models:
         result = models()
         print(json.dumps(result) if options.json else models_table(result))
         return 1 if any(row["not_rising_share"] > 0.0 for row in result["rows"]) else 0
-    result, found = measure(options)
+    result, found = measure()
     shown = sorted(result["rows"], key=lambda row: -row["over_N"])[:6]
     print(json.dumps(result) if options.json else "\n".join(lines(result | {"rows": shown})))
     if options.picture is not None:

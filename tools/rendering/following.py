@@ -13,8 +13,6 @@ from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
-from tormagd.control.believe.slow_friction import believable
-from tormagd.control.believe.strength import device_bounds
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.ideal_actuator import ideal_stepper
@@ -38,7 +36,6 @@ VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2
 "Time between enabling and the first setpoint of a rehearsal."
-BOUNDS = device_bounds(Config().trim)
 
 
 class Tracking(NamedTuple):
@@ -47,7 +44,6 @@ class Tracking(NamedTuple):
     rms_N: float
     variance_accounted_for: float
     worst_N: float
-    mean_N: float
     reference_sd_N: float
 
 
@@ -59,16 +55,14 @@ def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
         rms_N=rms(error),
         variance_accounted_for=float(1.0 - np.sum(error**2) / np.sum(deviation**2)),
         worst_N=float(np.abs(error).max()),
-        mean_N=float(error.mean()),
         reference_sd_N=float(deviation.std()),
     )
 
 
 class Followed(NamedTuple):
     """What a run showed, a row for each control tick. `time_s` is since its beginning, s. Forces are those asked and
-    truly rendered, signed as the handle moves, N. Then come where the handle is, mm and mm/s, and whether a learned
-    value stood at its rail. And the share of time that each limit was held, the faults that ended it, what the device
-    had shown by then.
+    truly rendered, signed as the handle moves, N. Then comes where the handle is, mm and mm/s. And the share of time
+    that each limit was held, the faults that ended it, what the device had shown by then.
     """
 
     time_s: Array
@@ -76,11 +70,9 @@ class Followed(NamedTuple):
     rendered_N: Array
     handle_mm: Array
     handle_mm_s: Array
-    is_railed: Array
     limits: dict[str, float]
     faults: tuple[str, ...] = ()
     shown: Learned = NOTHING_LEARNED
-    trim: float = 1.0
 
     @property
     def along_N(self) -> Array:
@@ -139,39 +131,31 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float,
     rows: list[tuple[float, ...]] = []
     held: Counter[str] = Counter()
     faults: tuple[str, ...] = ()
-    trim, asked_N = 1.0, 0.0
+    asked_N: list[float] = []
 
     def newest(now_s: float) -> TimedSetpoint | None:
-        nonlocal asked_N
         setpoint = publish(now_s)
-        asked_N = 0.0 if setpoint is None else setpoint.force_N
+        asked_N.append(0.0 if setpoint is None else setpoint.force_N)
         return setpoint
 
     for sample in loop.run(lasts_s, newest):
-        truth, trim = sample.truth, sample.plan.trim
+        truth = sample.truth
         since_s = truth.time_s - start_s - lead_s
         if since_s >= 0.0:
-            rows.append((since_s, asked_N, truth.force_N, truth.handle_mm, truth.handle_mm_s, is_railed(loop)))
+            rows.append((since_s, asked_N[-1], truth.force_N, truth.handle_mm, truth.handle_mm_s))
             held.update({str(limit) for limit in (*sample.plan.limits, *sample.output.limits)})
         faults = tuple(map(str, sample.safety.faults))
         if faults:
             break
     shares = {limit: count / len(rows) for limit, count in sorted(held.items())}
-    time_s, asked, rendered, handle, speed, railed = np.array(rows).reshape(-1, 6).T
-    return Followed(time_s, asked, rendered, handle, speed, railed, shares, faults, taught(loop).learned(), trim)
+    time_s, asked, rendered, handle, speed = np.array(rows).reshape(-1, 5).T
+    return Followed(time_s, asked, rendered, handle, speed, shares, faults, taught(loop).learned())
 
 
 def taught(loop: ClosedLoop) -> Believe:
     """What is believed of the loop's device."""
     assert loop.planner is not None, "this loop plans"
     return loop.planner.believe
-
-
-def is_railed(loop: ClosedLoop) -> bool:
-    """Whether a learned value stands at its bound."""
-    fit, slow = taught(loop).strength.fit, taught(loop).slow
-    is_creep_railed = slow.learned > 0.0 and slow.factor in believable(fit, slow.followed_N, BOUNDS)
-    return fit.scale in (BOUNDS.min_scale, BOUNDS.max_scale) or is_creep_railed
 
 
 def asked_at(levels: Levels) -> Callable[[float], float]:

@@ -1,9 +1,8 @@
 """Recorded signals as force profiles within the device's range, from the folder that TORMAG_DATA names.
 
-Shape and rhythm are measured; where a signal is not a force, the newtons are chosen, as `scaled` says.
+Shape and rhythm are measured, the newtons are chosen.
 """
 
-from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,22 +31,13 @@ TRIM_S = 10.0
 "The time the trim is given before the figures of other devices than sample 1 begin."
 
 
-class Kind(StrEnum):
-    """What a signal is judged as: a pulse, or the force of a hand that moves as it likes."""
-
-    PULSE = "pulse"
-    HAND = "hand"
-
-
 class Signal(NamedTuple):
     """A force profile. `is_known_ahead`: it comes from a file, so that a publisher can send a preview."""
 
     name: str
-    scaled: str
     time_s: Array
     force_N: Array
     is_known_ahead: bool = True
-    kind: Kind | None = None
 
 
 def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
@@ -61,7 +51,7 @@ def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float
 
 def pulse_signal(duration_s: float) -> Signal:
     """The demonstration's pulse."""
-    return Signal("pulse", f"{PULSE_N[0]}..{PULSE_N[1]} N", *pulse_profile(duration_s, *PULSE_N, RATE_HZ))
+    return Signal("pulse", *pulse_profile(duration_s, *PULSE_N, RATE_HZ))
 
 
 def recorded_signals() -> list[Signal]:
@@ -84,7 +74,7 @@ def palpation(seed: int) -> Signal:
         more_N = random.uniform(*TOUCHES_N) - SCALED_N[0]
         force_N += more_N * (_rising(time_s - begins_s) - _rising(time_s - ends_s))
         begins_s = ends_s + RISE_S + random.uniform(*LASTS_S)
-    return Signal(f"palpation {seed}", f"touches within {RISE_S:g} s", time_s, force_N, kind=Kind.HAND)
+    return Signal(f"palpation {seed}", time_s, force_N)
 
 
 def _rising(since_s: Array) -> Array:
@@ -102,8 +92,7 @@ def _pulse(path: Path, what: str) -> Signal:
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1.0 / period_s, output="sos"), values)
     time_s = np.arange(round(PULSE_S * RATE_HZ)) / RATE_HZ
     part = np.interp(time_s, np.arange(len(smooth)) * period_s, smooth)
-    told = f"least..most to {PULSE_N[0]}..{PULSE_N[1]} N, {LOW_PASS_HZ:g} Hz"
-    return Signal(f"{what} {path.stem}", told, time_s, scaled(part, *PULSE_N), kind=Kind.PULSE)
+    return Signal(f"{what} {path.stem}", time_s, scaled(part, *PULSE_N))
 
 
 def _haptic(path: Path) -> Signal:
@@ -111,7 +100,6 @@ def _haptic(path: Path) -> Signal:
     raw = np.loadtxt(path, delimiter=",", skiprows=1)
     sent_s, first = np.unique(raw[:, 0], return_index=True)
     sent_s, sent_N = sent_s[sent_s <= HAPTIC_S], np.linalg.norm(raw[first, 1:4], axis=1)[sent_s <= HAPTIC_S]
-    least_N, most_N = SCALED_N
     time_s = np.arange(0.0, sent_s[-1], 1.0 / RATE_HZ)
     forces = np.interp(time_s, sent_s, scaled(sent_N, *SCALED_N))
-    return Signal(f"haptic scaled {path.stem}", f"|F| to {least_N}..{most_N} N", time_s, forces, kind=Kind.HAND)
+    return Signal(f"haptic scaled {path.stem}", time_s, forces)
