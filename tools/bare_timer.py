@@ -20,7 +20,7 @@ from tormagd.daemon.realtime import prepare
 from tormagd.headroom.bare_timer import NS, beat
 
 
-async def stalls_until_ended(realtime: RealTime, period_ns: int) -> list[Stall]:
+async def stalls_until_ended(realtime: RealTime) -> list[Stall]:
     """Whatever kept a beat back for longer than a period, until SIGTERM or SIGINT."""
     prepare(realtime)
     ended = asyncio.Event()
@@ -29,11 +29,11 @@ async def stalls_until_ended(realtime: RealTime, period_ns: int) -> list[Stall]:
     found: list[Stall] = []
 
     def on_beat(heartbeat: Heartbeat, beats: int, now_ns: int) -> None:
-        first_due_ns = heartbeat.due_ns - (beats - 1) * period_ns
-        if now_ns - first_due_ns > period_ns:
+        first_due_ns = heartbeat.due_ns - (beats - 1) * PERIOD_NS
+        if now_ns - first_due_ns > PERIOD_NS:
             found.append(Stall(first_due_ns / NS, now_ns / NS))
 
-    await beat(period_ns, on_beat, ended)
+    await beat(PERIOD_NS, on_beat, ended)
     return found
 
 
@@ -44,7 +44,7 @@ def main() -> int:
     parser.add_argument("--fifo", type=int, default=0, help="SCHED_FIFO priority; 0, or refused: ordinary scheduling")
     options = parser.parse_args()
     realtime = RealTime(fifo_priority=options.fifo, cpus=(options.cpu,))
-    print(json.dumps(uvloop.run(stalls_until_ended(realtime, PERIOD_NS))))
+    print(json.dumps(uvloop.run(stalls_until_ended(realtime))))
     return 0
 
 

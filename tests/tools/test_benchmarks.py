@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import io
 import json
+import math
 import os
 import subprocess
 import time
@@ -18,7 +19,7 @@ from benchmarks.inverse_report import ROOT
 
 from firmware_protocol.c.build import BuildError
 from tormagd.assembly.build import build_core
-from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG, corner_margins
+from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG
 from tormagd.config import Config, RealTime, load_config
 from tormagd.lab.told import lines
 from tormagd.scenes.scene import shipped_scenes
@@ -68,13 +69,9 @@ def test_the_solver_error_is_that_of_the_method(result):
 
 
 def test_no_search_is_better_than_its_network(result):
-    errors = [
-        row["plant_mae_mT"]
-        for row in [*rows(result, "newton"), *rows(result, "torch"), *rows(result, "nearest")]
-        if row["step_mT"] <= 2.0
-    ]
-    assert np.ptp(errors) < 1e-3
-    assert min(errors) > 0.01
+    searches = [*rows(result, "newton"), *rows(result, "torch"), *rows(result, "nearest")]
+    errors = [row["plant_mae_mT"] for row in searches if row["step_mT"] <= 2.0]
+    assert 0.01 < min(errors) <= max(errors) < min(errors) + 1e-3
 
 
 def test_a_scene_gets_a_search_that_is_measured_and_exact_enough(result):
@@ -108,10 +105,9 @@ def test_the_plant_of_the_workload_is_the_plant():
     )
     gap, speed, travel, dt = 60.0, 20.0, 1.8, 1e-4
     element = TorqueElement(still, gap, dt)
-    for tick in range(20_000):
-        element.advance(tick * dt, gap, -speed)
-    for tick in range(round(travel / speed / dt)):
-        element.advance(tick * dt, gap, speed)
+    for ticks, rate in ((20_000, -speed), (round(travel / speed / dt), speed)):
+        for tick in range(ticks):
+            element.advance(tick * dt, gap, rate)
     field = inverse_workload.NOMINAL.field_mT(gap)
     (expected,) = inverse_workload.plant_force_N(plant, np.array([travel]), np.array([speed]), np.array([field]))
     assert element.force_N == pytest.approx(expected, abs=2e-3)
@@ -149,7 +145,8 @@ def test_every_scene_has_the_keys_of_the_contract_and_costs_no_more_than_the_usu
 @pytest.fixture(scope="module")
 def measured():
     """One run on the sample the loop was tuned on."""
-    return step.run("sample_1")
+    found = step.measure(argparse.Namespace(plant="sample_1"))
+    return found | {f"{name}, worst corner": margin for name, margin in found["corners"].items()}
 
 
 @pytest.mark.parametrize(
@@ -165,6 +162,8 @@ def measured():
         # the stroke is limited by the motors, and the transfer function is the plant's
         ("stroke_ratio", 1.0, 1.15),
         ("model_nrmse", 0.0, 0.05),
+        ("gain_margin_dB, worst corner", MIN_GAIN_MARGIN_DB, math.inf),
+        ("phase_margin_deg, worst corner", MIN_PHASE_MARGIN_DEG, math.inf),
     ],
 )
 def test_a_millimetre_is_nearly_time_optimal_and_the_figures_are_those_promised(measured, figure, least, most):
@@ -175,12 +174,6 @@ def test_a_wrong_motor_is_noticed_in_the_comparison():
     """With twice the inertia the same comparison fails: it can."""
     heavy = msgspec.structs.replace(Config().motor, inertia_kg_m2=1.6e-6)
     assert step.nrmse(*step.model_step(heavy, load_plant("sample_1"), step.MODEL_DUTY)) > 0.1
-
-
-def test_the_shipped_gains_are_robust():
-    corners = corner_margins(Config())
-    assert corners["gain_margin_dB"] >= MIN_GAIN_MARGIN_DB
-    assert corners["phase_margin_deg"] >= MIN_PHASE_MARGIN_DEG
 
 
 # -- timing, on made-up measurements -----------------------------------------------------------------------------------
@@ -196,18 +189,17 @@ def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
     lateness = [(30.0, 20.0), (900.0, 300.0), (44.0, 40.0)]
     pairs = [loop.Pair(block(daemon, 10), block(bare, 0)) for daemon, bare in lateness]
     result = loop.summary(pairs, RealTime(fifo_priority=50))
-    assert (result["ratio"], result["rate_hz"], result["ticks"], result["merged_ticks"]) == (
-        {"p50": 1.5, "p99": 1.5, "p999": 1.5},
-        pytest.approx(999.0),
-        29_970,
-        30,
-    )
-    assert (result["lateness_us"], result["control_exec_us"]["mean"], result["bare"]["merged_share"]) == (
-        {"p50": 44.0, "p99": 900.0, "p999": 900.0, "max": 900.0},
-        50.0,
-        0.0,
-    )
-    assert result["merged_share"] == pytest.approx(30 / 29_970)
+    expected = {
+        "ratio": {"p50": 1.5, "p99": 1.5, "p999": 1.5},
+        "rate_hz": pytest.approx(999.0),
+        "ticks": 29_970,
+        "merged_ticks": 30,
+        "merged_share": pytest.approx(30 / 29_970),
+        "lateness_us": {"p50": 44.0, "p99": 900.0, "p999": 900.0, "max": 900.0},
+        "control_exec_us": {"mean": 50.0, "p50": 50.0, "p99": 50.0, "p999": 50.0, "max": 50.0},
+    }
+    assert {name: result[name] for name in expected} == expected
+    assert result["bare"]["merged_share"] == 0.0
 
 
 def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
@@ -240,13 +232,6 @@ def test_wake_ups_are_counted_by_thread_and_a_beat_is_drawn(tmp_path: Path) -> N
     assert (tmp_path / "beat.png").stat().st_size > 1_000
 
 
-def test_the_bound_is_the_hops_and_a_period_and_less_than_half_a_millisecond() -> None:
-    for whole_us, kept in ((1_500.0, True), (1_501.0, False)):
-        found_us = {latency.WHOLE: np.array([whole_us]), latency.HOP: np.array([100.0])}
-        result = latency.summary(found_us, 1, RealTime())
-        assert (result["bound_us"], result["kept"]) == (1_500.0, kept)
-
-
 def test_the_first_tick_that_used_a_setpoint_counts() -> None:
     rows = [{"setpoint_cf": force, "t_ns": number} for number, force in enumerate((None, 1.0, 1.0, 1.5, 9.0))]
     made = [row | dict.fromkeys(latency.COLUMNS[1:], 0.0) for row in rows]
@@ -271,9 +256,12 @@ def test_stages_add_up_to_the_whole() -> None:
 
 
 def test_virtual_time_is_measured() -> None:
-    found = virtual_time.measure(argparse.Namespace(seconds=0.2, plant="sample_1"))["interpreted"]
-    expected = {name: pytest.approx(1e3 / found["tick_us"][name], rel=0.01) for name in virtual_time.LOOPS}
-    assert {name: found[name] for name in virtual_time.LOOPS} == expected
+    found = virtual_time.measure(argparse.Namespace(seconds=0.2))["interpreted"]
+    assert found.keys() == virtual_time.LOOPS.keys()
+    assert min(found.values()) > 0.0
+    stretches = {"interpreted": {"whole_core": [90.0, 200.0, 900.0], "position_loop": [125.0]}}
+    factors = {"whole_core": 5.0, "position_loop": 8.0}
+    assert virtual_time.summary(stretches, 1e3) == {"compiled": None, "interpreted": factors}
 
 
 def test_a_result_is_told_by_lines_and_tables() -> None:

@@ -48,7 +48,7 @@ the simulated element gives the force. *Force* is the plant's at the answer less
 - `torch`: the network over the grid in torch, the k nearest, then interpolation. `nearest`: the same in NumPy, from the
   curve of this state of the handle.
 - `newton`: Newton's method from the last field, the whole range its bracket. It wants a force that rises with the
-  field, as the brake's does. On the same network it is {speedup[thesis-linear]:.0f} times as fast as the thesis's
+  field, as the brake's does. On the same network it is {speedup_vs_thesis_linear:.0f} times as fast as the thesis's
   search.
 
 Times are from several rounds over all variants; what else ran shows in p99. *Pareto* marks the variants that no

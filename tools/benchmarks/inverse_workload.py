@@ -126,7 +126,5 @@ def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
 
 
 def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields_mT: Array) -> Array:
-    rows = np.full((len(fields_mT), 4), CIP_PERCENT)
-    rows[:, 0], rows[:, 1], rows[:, 2] = displacement_mm, rate_mm_s, fields_mT
-    forces: Array = model.predict(rows)
-    return forces
+    of_all = [np.full(len(fields_mT), value) for value in (displacement_mm, rate_mm_s, CIP_PERCENT)]
+    return model.predict(np.column_stack((*of_all[:2], fields_mT, of_all[2])))

@@ -36,21 +36,21 @@ import uvloop
 import zmq
 from machines.host import processor_s
 from machines.own import own_machine
-from machines.processes import begun, first_line, is_linked
-from matplotlib.figure import Figure
+from machines.processes import begun, first_line, is_linked, received
 
 from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compiler
 from tormagd.config import Config, RealTime, load_config
+from tormagd.ctl.scene import as_toml
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.headroom.bare_timer import beat
 from tormagd.lab.arrays import Array
-from tormagd.recording.ticks import decode_ticks
+from tormagd.lab.pages import subplots
+from tormagd.recording.ticks import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request
-from tormagd_client.wire import keys_of, opened
 
 TOOLS = Path(__file__).parents[1]
 LOG = "tormagd.log"
@@ -63,7 +63,6 @@ STARTS_MS = 20_000
 "Until the first tick, at most."
 WARM_UP_S = 1.0
 TELEMETRY_EVERY = 20
-PLAN_QUANTILES = ("p50", "p99")
 SHARES = ("core_share", "alone_share")
 COLUMNS = ("t_ns", "lateness_us", "exec_us", "received_s")
 "What is read of a recorded tick; a stub has not all of them."
@@ -95,13 +94,13 @@ class Pair(NamedTuple):
 
 class Stand(NamedTuple):
     """What is measured: scheduling, how often setpoints come, of which checkout daemon and device are, and the rates of
-    control and of plans. An empty scene is the default."""
+    control and of plans."""
 
     realtime: RealTime
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
     rates_hz: tuple[int, int] = (CONTROL_HZ, CONTROL_HZ)
-    scene: str = ""
+    scene: str = Config().scene
 
 
 T = TypeVar("T")
@@ -181,7 +180,8 @@ def block(started: Started, seconds: float) -> Block:
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, started(Path(folder)) as (config, pid):
         time.sleep(WARM_UP_S)
         _, *alone = spent(pid, lambda: time.sleep(seconds))
-        with recording(config.endpoints) as recorder:
+        # while somebody listens, ticks are encoded and sent
+        with zmq.Context() as context, listening(context, config.endpoints.recording, None) as recorder:
             stop = multiprocessing.Event()
             load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
             load.start()
@@ -227,8 +227,7 @@ def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
         port = first_line(start(*own_machine(0, "tormagd.simulation", "--pty")))
         words = [port, str(1_000_000 // stand.rates_hz[0]), str(seconds), str(stand.realtime.fifo_priority)]
         ran = subprocess.run([str(host), *words], check=True, capture_output=True, text=True)
-        found: dict[str, Any] = json.loads(ran.stdout)
-        return found
+        return dict(json.loads(ran.stdout))
     return None
 
 
@@ -239,22 +238,13 @@ def built_host(folder: Path) -> Path:
     return host
 
 
-@contextlib.contextmanager
-def recording(endpoints: Endpoints) -> Iterator["zmq.Socket[bytes]"]:
-    """A subscriber of the tick rows; while there is one, they are encoded and sent."""
-    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-        yield opened(socket, endpoints.recording, keys_of(endpoints.curve))
-
-
 def collect(socket: "zmq.Socket[bytes]", seconds: float, config: Config) -> Block:
     """Reads tick rows for a while. Raises RuntimeError where there are none."""
     until_s = time.monotonic() + seconds
     rows: list[list[Any]] = []
     while time.monotonic() < until_s:
         if socket.poll(100):
-            batch = decode_ticks(socket.recv())
-            columns = [batch.columns.index(name) if name in batch.columns else None for name in COLUMNS]
-            rows.extend([None if column is None else row[column] for column in columns] for row in batch.rows)
+            rows.extend([tick.get(name) for name in COLUMNS] for tick in received(socket))
     if len(rows) < 2:
         raise RuntimeError(f"no ticks within {seconds:g} s")
     return as_block(rows, config.rates.control_hz)
@@ -274,7 +264,7 @@ def reported(address: str) -> dict[str, Any]:
     with contextlib.closing(Client(Endpoints(control=address), 5.0)) as client:
         status = client.request("status")
     found = status.get("phases_us", {}) | {"plan_us": status.get("rates", {}).get("inference", {}).get("exec_us")}
-    told = {name: {key: float(each[key]) for key in PLAN_QUANTILES} for name, each in found.items() if each}
+    told = {name: {key: float(each[key]) for key in ("p50", "p99")} for name, each in found.items() if each}
     plan_us = told.pop("plan_us", None)
     return {} if plan_us is None else {"plan_us": plan_us, "phases_us": told}
 
@@ -295,8 +285,7 @@ def merge(blocks: list[Block]) -> Block:
 
 def draw(path: Path, phases_us: dict[str, dict[str, float]], control_hz: int) -> None:
     """A PNG of one beat: a bar for each phase, to its p50 and on to its p99."""
-    figure = Figure(figsize=(9, 0.5 * len(phases_us) + 1.5), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots((9, 0.5 * len(phases_us) + 1.5))
     names = list(phases_us)[::-1]
     axes.barh(names, [phases_us[name]["p99"] for name in names], color="#d8dee9", label="p99")
     axes.barh(names, [phases_us[name]["p50"] for name in names], color="#2a6f97", label="p50")
@@ -326,17 +315,15 @@ def hammer(address: str, stop: Event) -> None:
 
 def write_config(folder: Path, port: str, stand: Stand) -> Path:
     """A configuration with its sockets in `folder`."""
-    path = folder / "tormagd.toml"
-    sockets = "".join(f'{name} = "ipc://{folder}/{name}"\n' for name in ENDPOINTS)
-    realtime, (control_hz, inference_hz) = stand.realtime, stand.rates_hz
-    scene = f'scene = "{stand.scene}"\n' if stand.scene else ""
-    path.write_text(
-        f'{scene}[device]\nport = "{port}"\n[endpoints]\n{sockets}'
-        f"[rates]\ncontrol_hz = {control_hz}\ninference_hz = {inference_hz}\n"
-        f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
-        f"lock_memory = {str(realtime.lock_memory).lower()}\n"
-        f"cpus = {list(realtime.cpus)}\n"
-    )
+    path, realtime, (control_hz, inference_hz) = folder / "tormagd.toml", stand.realtime, stand.rates_hz
+    tables = {
+        "scene": stand.scene,
+        "device": {"port": port},
+        "endpoints": {name: f"ipc://{folder}/{name}" for name in ENDPOINTS},
+        "rates": {"control_hz": control_hz, "inference_hz": inference_hz},
+        "realtime": {name: getattr(realtime, name) for name in ("fifo_priority", "keep_awake", "lock_memory")},
+    }
+    path.write_text(as_toml(tables), encoding="utf-8")
     return path
 
 
@@ -448,7 +435,6 @@ def asked_for(realtime: RealTime) -> dict[str, Any]:
     return {
         "fifo_priority": realtime.fifo_priority,
         "keep_awake": realtime.keep_awake,
-        "cpus": list(realtime.cpus),
     }
 
 

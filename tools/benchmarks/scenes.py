@@ -52,7 +52,8 @@ THESIS = OperatingPoint(500, 83, "thesis")
 FIRST_DECIDING, FIRST_JUDGING = 80, 100
 "Of the draws of the plant card; twice as many judge as decide."
 DRAWS = 10
-SETTLES_S = 3.0
+PAIRS, SETTLES_S, LASTS_S = 5, 3.0, 5.0
+"Of shares: how many turns, and how long each."
 SHARED_SCENE, FIFO = "coronary", 50
 KEYS = "daemon", "tick_us", "plan_us"
 
@@ -62,10 +63,7 @@ Runs = Callable[[Collection[Case]], dict[Case, float]]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What is measured again."""
     parser.add_argument("--live", nargs="*", metavar="NAME", help="measure these scenes (names, files; none: all)")
-    parser.add_argument("--draws", type=int, default=DRAWS, help="so many decide, twice as many judge (%(default)s)")
     parser.add_argument("--shares", action="store_true", help="measure what each way takes of a processor")
-    parser.add_argument("--pairs", type=int, default=5, help="of those, how many turns (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=5.0, help="and how long each (%(default)s)")
     parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
     executors.add_options(parser, 1, needed="tormagd, and tools/ on their path")
 
@@ -75,19 +73,17 @@ def measure(options: argparse.Namespace) -> Json:
     file = measured()
     if options.shares:
         ways = [*(OperatingPoint(*hz, search) for hz in RATES_HZ for search in SEARCHES), THESIS]
-        shares = tuple(shares_of(ways, options.pairs, options.seconds))
-        file = msgspec.structs.replace(file, shares=shares, pairs=options.pairs, machine_us=round(machine_us(), 1))
+        shares = tuple(shares_of(ways))
+        file = msgspec.structs.replace(file, shares=shares, pairs=PAIRS, machine_us=round(machine_us(), 1))
         store(file, options.store)
     if options.live is not None:
         known: dict[Case, float] = {}
         with executors.chosen(options) as executor:
             runs = partial(run_all, executor=executor, known=known)
             for name in options.live or shipped_scenes():
-                found = measured_scene(name, runs, options.draws)
+                found = measured_scene(name, runs)
                 scenes = {scene.name: scene for scene in (*file.scenes, found)}
-                file = msgspec.structs.replace(
-                    file, draws=options.draws, scenes=tuple(scenes[name] for name in sorted(scenes))
-                )
+                file = msgspec.structs.replace(file, draws=DRAWS, scenes=tuple(scenes[name] for name in sorted(scenes)))
                 store(file, options.store)
     return {"scenes": [figures(scene, file) for scene in file.scenes], "measured_machine_us": file.machine_us}
 
@@ -120,9 +116,8 @@ def figures(scene: MeasuredScene, file: Measurements) -> Json:
     }
 
 
-def measured_scene(name: str, runs: Runs, draws: int = DRAWS) -> MeasuredScene:
-    """Measure one scene, whole, on so many draws; `runs` gives the outcomes of cases. Raises ConfigError for a scene
-    without a signal."""
+def measured_scene(name: str, runs: Runs) -> MeasuredScene:
+    """Measure one scene, whole; `runs` gives the outcomes of cases. Raises ConfigError for a scene without a signal."""
     scene = load_scene(name)
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
@@ -131,12 +126,12 @@ def measured_scene(name: str, runs: Runs, draws: int = DRAWS) -> MeasuredScene:
     tried = [tried_way(name, way, runs) for way in ways]
     tolerance_N = scene.force.tolerance_rms_N
     usual, *others = tried
-    chosen, judged = usual.way, judge(name, scene, usual.way, usual.way, runs, draws)
+    chosen, judged = usual.way, judge(name, scene, usual.way, usual.way, runs)
     for other in sorted(others, key=lambda each: each.way.control_hz + each.way.inference_hz):
         pairs = zip(other.rms_N, usual.rms_N, strict=True)
         if usual.worst_N > tolerance_N or any(error_N > allowed_N(usual_N, tolerance_N) for error_N, usual_N in pairs):
             continue
-        found = judge(name, scene, other.way, usual.way, runs, draws)
+        found = judge(name, scene, other.way, usual.way, runs)
         if all(item.rms_N <= allowed_N(item.usual_N, tolerance_N) for item in found if item.group == "deciding"):
             chosen, judged = other.way, found
             break
@@ -154,13 +149,11 @@ def tried_way(name: str, way: OperatingPoint, runs: Runs) -> Tried:
     return Tried(way, tuple(found[case] for case in cases))
 
 
-def judge(
-    name: str, scene: Scene, way: OperatingPoint, usual: OperatingPoint, runs: Runs, draws: int
-) -> tuple[WorstDevice, ...]:
+def judge(name: str, scene: Scene, way: OperatingPoint, usual: OperatingPoint, runs: Runs) -> tuple[WorstDevice, ...]:
     """The worst device of each group in each situation, beside the usual way."""
     tolerance_N = scene.force.tolerance_rms_N
     worst = []
-    for group, situation, devices, learns in groups(scene, draws):
+    for group, situation, devices, learns in groups(scene):
         ours, theirs = ([case_of(name, each, device, situation, learns) for device in devices] for each in (way, usual))
         found = runs([*ours, *theirs])
         outcomes = [
@@ -171,14 +164,14 @@ def judge(
     return tuple(worst)
 
 
-def groups(scene: Scene, draws: int) -> list[tuple[str, str, tuple[str, ...], bool]]:
+def groups(scene: Scene) -> list[tuple[str, str, tuple[str, ...], bool]]:
     """Group, situation, devices, and whether they are learned: what decides, then what judges."""
     if scene.element == "tactile":
         stays = [each for each in SITUATIONS if each not in OF_A_HANDLE]
         return [*(("deciding", each, SAMPLES, True) for each in stays), ("deciding", "signal", SAMPLES, False)]
     deciding, judging = (
         tuple(f"draw {first + number}" for number in range(count))
-        for first, count in ((FIRST_DECIDING, draws), (FIRST_JUDGING, 2 * draws))
+        for first, count in ((FIRST_DECIDING, DRAWS), (FIRST_JUDGING, 2 * DRAWS))
     )
     # the second plant is an element of its own: no other insert fits into it
     second = (SECOND,) if scene.insert.name == PLANTS_INSERT else ()
@@ -196,19 +189,19 @@ def case_of(name: str, way: OperatingPoint, device: str, situation: str, is_lear
     return Case(name, device, situation, way.search, is_learning, way.control_hz, way.inference_hz)
 
 
-def shares_of(ways: list[OperatingPoint], pairs: int, seconds: float) -> list[Share]:
+def shares_of(ways: list[OperatingPoint]) -> list[Share]:
     """What each way takes, in the median of turns over all of them."""
     found: dict[OperatingPoint, list[Share]] = {way: [] for way in ways}
-    for turn in range(pairs):
+    for turn in range(PAIRS):
         for way in ways if turn % 2 == 0 else ways[::-1]:
-            found[way].append(share_of(way, seconds))
+            found[way].append(share_of(way))
     return [
         Share(way, *(round(statistics.median(getattr(each, key) for each in found[way]), 4) for key in KEYS))
         for way in ways
     ]
 
 
-def share_of(way: OperatingPoint, seconds: float) -> Share:
+def share_of(way: OperatingPoint) -> Share:
     """One run of a daemon that serves SHARED_SCENE in this way, with setpoints as often as plans."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
         scene = Path(folder) / "scene.toml"
@@ -216,13 +209,9 @@ def share_of(way: OperatingPoint, seconds: float) -> Share:
         scene.write_text(f'{stated}\n[solver]\nname = "{way.search}"\n', encoding="utf-8")
         rates_hz = way.control_hz, way.inference_hz
         stand = loop.Stand(RealTime(FIFO, lock_memory=True), way.inference_hz, None, rates_hz, str(scene))
-        return _share_of(way, stand, Path(folder), seconds)
-
-
-def _share_of(way: OperatingPoint, stand: loop.Stand, folder: Path, seconds: float) -> Share:
-    with loop.daemon(stand, folder) as (config, pid):
-        time.sleep(SETTLES_S)
-        _, daemon, _ = loop.spent(pid, partial(time.sleep, seconds))
-        with contextlib.closing(Client(config.endpoints, 5.0)) as client:
-            rates = client.request("status")["rates"]
+        with loop.daemon(stand, Path(folder)) as (config, pid):
+            time.sleep(SETTLES_S)
+            _, daemon, _ = loop.spent(pid, partial(time.sleep, LASTS_S))
+            with contextlib.closing(Client(config.endpoints, 5.0)) as client:
+                rates = client.request("status")["rates"]
     return Share(way, daemon, rates["control"]["exec_us"]["p50"], rates["inference"]["exec_us"]["p50"])

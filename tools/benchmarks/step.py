@@ -20,7 +20,7 @@ from tormagd.control.core import Stepper
 from tormagd.control.move.motor import margins, zero_order_hold
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.bench_sweep import gap_plan
-from tormagd.scenes.scene import EVERY_TERM, load_scene
+from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
@@ -49,9 +49,9 @@ class Step(NamedTuple):
     skew_um: float
 
 
-def run(plant_name: str = "sample_1") -> dict[str, Any]:
+def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The contract's keys, for steps that open and that close; the worse of both is what counts."""
-    config, parameters = Config(), load_plant(plant_name)
+    config, parameters = Config(), load_plant(options.plant)
     gc.collect()
     gc.disable()  # what is kept here is no garbage, and need not be looked through again and again
     started_s = time.thread_time()
@@ -64,7 +64,7 @@ def run(plant_name: str = "sample_1") -> dict[str, Any]:
     fastest_s = [time_optimal(parameters, START_MM, length_mm)[0] for length_mm in (STEP_MM, -STEP_MM)]
     nominal = margins(config.motor, config.position, TICK_S)
     return {
-        "plant": plant_name,
+        "plant": options.plant,
         **{name: max(getattr(found, name) for found in steps) for name in Step._fields},
         "overshoot_over_stroke": over_stroke,
         "rise_over_time_optimal": max(found.rise_s / s for found, s in zip(steps, fastest_s, strict=True)),
@@ -77,12 +77,11 @@ def run(plant_name: str = "sample_1") -> dict[str, Any]:
     }
 
 
-def settled_loop(config: Config, parameters: PlantParameters, left_out: tuple[str, ...] = ()) -> ClosedLoop:
-    """A loop without these terms that is homed, enabled, and at rest at START_MM."""
+def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
+    """A loop that is homed, enabled, and at rest at START_MM."""
     # a handle in motion would feel forces over the scene's at the closed end, which is a fault
     device = VirtualDevice(parameters, RecordedHand((0.0,), (0.0,)), seed=1)
-    scene = msgspec.structs.replace(load_scene("coronary"), terms=EVERY_TERM.without(*left_out))
-    loop = ClosedLoop(config, Stepper(config, scene), None, device)
+    loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
     loop.arm(gap_plan(95.0))
     drive(loop, START_MM, 3.0)
     return loop
@@ -200,11 +199,6 @@ def _at_rest(parameters: PlantParameters, gap_mm: float) -> PlantParameters:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark step`."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
-
-
-def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The object for these options."""
-    return run(options.plant)
 
 
 def drive(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import zmq
 from machines.own import own_machine
-from machines.processes import begun, end, first_line
+from machines.processes import begun, end, first_line, received
 from machines.wire import carried
 
 from tormagd.config import load_config
 from tormagd.lab.arrays import Array
-from tormagd.recording.ticks import decode_ticks
+from tormagd.recording.ticks import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.keys import SECRET, SERVER, generate
 
@@ -126,15 +126,12 @@ class Stand:
     @contextlib.contextmanager
     def ticks(self) -> Iterator[Callable[[], list[dict[str, Any]]]]:
         """Gives a function that gives the control ticks since it was last called, by their columns."""
-        with zmq.Context() as context, context.socket(zmq.SUB) as recorder:
-            recorder.subscribe(b"")
-            recorder.connect(self.endpoints.recording)
+        with zmq.Context() as context, listening(context, self.endpoints.recording, None) as recorder:
 
             def read() -> list[dict[str, Any]]:
                 rows: list[dict[str, Any]] = []
                 while recorder.poll(0):
-                    batch = decode_ticks(recorder.recv())
-                    rows += [dict(zip(batch.columns, row, strict=True)) for row in batch.rows]
+                    rows += received(recorder)
                 return rows
 
             yield read

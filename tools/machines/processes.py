@@ -1,4 +1,4 @@
-"""Processes of ours: begun with a log, waited for, and ended."""
+"""Processes of ours: begun with a log, waited for, heard, and ended."""
 
 import contextlib
 import signal
@@ -8,6 +8,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import zmq
+
+from tormagd.recording.ticks import decode_ticks
 from tormagd_client import Client, ClientError
 
 PATIENCE_S, LOOK_S = 20.0, 0.05
@@ -44,6 +47,12 @@ def is_linked(client: Client, daemon: "subprocess.Popen[str]", patience_s: float
                 return True
         time.sleep(LOOK_S)
     return False
+
+
+def received(socket: "zmq.Socket[bytes]") -> list[dict[str, Any]]:
+    """Waits for the next control ticks that a daemon tells, some 20 ms of them; each by its columns."""
+    batch = decode_ticks(socket.recv())
+    return [dict(zip(batch.columns, row, strict=True)) for row in batch.rows]
 
 
 def end(child: "subprocess.Popen[Any]", number: signal.Signals = signal.SIGTERM) -> int:
