@@ -5,7 +5,7 @@ A configuration is refused at the border, or it plans and steps the simulated de
 
 import math
 import random
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from typing import Any, NamedTuple, get_type_hints
 
@@ -42,10 +42,8 @@ class End(NamedTuple):
 
 def ends() -> list[End]:
     """Both ends of every number that shapes control, and of the device's own."""
-    found = [
-        End(section, key, value) for section in SECTIONS for key, value in _ends_of(type(getattr(Config(), section)))
-    ]
-    found += [End("insert", key, value) for key, value in _ends_of(type(load_scene(SCENE).insert))]
+    parts = {section: getattr(Config(), section) for section in SECTIONS} | {"insert": load_scene(SCENE).insert}
+    found = [End(section, key, value) for section, part in parts.items() for key, value in _ends_of(type(part))]
     return found + [End("plant", key, value) for key, *both in OF_PLANT for value in both]
 
 
@@ -60,11 +58,10 @@ def _ends_of(struct: type) -> Iterator[tuple[str, float]]:
 
 class Became(NamedTuple):
     """What became of a configuration: `refused` at the border; `ran`; `stated` where it may not be enabled or a fault
-    ended it; or `wrong`. `why` has its ends and the text; the gain margin is of those that were not refused."""
+    ended it; or `wrong`. `why` has its ends and the text."""
 
     kind: str
     why: str
-    gain_margin_dB: float | None = None
 
 
 def drawn_ends(count: int, seed: int) -> list[tuple[End, ...]]:
@@ -87,22 +84,21 @@ def became(case: tuple[End, ...], seconds: float) -> Became:
         kind, why = _ran(core, plant, seconds)
     except UNNAMED as error:
         kind, why = "wrong", f"{type(error).__name__}: {error}"
-    return Became(kind, f"{name}: {why}", core.margins.gain_margin_dB)
+    return Became(kind, f"{name}: {why}")
 
 
 def _built(case: tuple[End, ...]) -> tuple[Core, PlantParameters]:
-    config, plant = Config(scene=SCENE), load_plant(PLANT)
-    scene = msgspec.structs.replace(load_scene(SCENE), signal=None)
+    ends: defaultdict[str, dict[str, float]] = defaultdict(dict)
     for section, key, value in case:
-        if section == "plant":
-            electronics = msgspec.structs.replace(plant.electronics, **{key: value})
-            plant = msgspec.structs.replace(plant, electronics=electronics)
-        elif section == "insert":
-            scene = msgspec.structs.replace(scene, insert=msgspec.structs.replace(scene.insert, **{key: value}))
-        else:
-            part = msgspec.structs.replace(getattr(config, section), **{key: value})
-            config = msgspec.structs.replace(config, **{section: part})
-    return build_core(config, scene), plant
+        ends[section][key] = value
+    config, scene, plant = Config(scene=SCENE), load_scene(SCENE), load_plant(PLANT)
+    parts = {name: msgspec.structs.replace(getattr(config, name), **ends[name]) for name in SECTIONS}
+    insert = msgspec.structs.replace(scene.insert, **ends["insert"])
+    electronics = msgspec.structs.replace(plant.electronics, **ends["plant"])
+    core = build_core(
+        msgspec.structs.replace(config, **parts), msgspec.structs.replace(scene, signal=None, insert=insert)
+    )
+    return core, msgspec.structs.replace(plant, electronics=electronics)
 
 
 def _ran(core: Core, plant: PlantParameters, seconds: float) -> tuple[str, str]:
@@ -123,15 +119,12 @@ def _ran(core: Core, plant: PlantParameters, seconds: float) -> tuple[str, str]:
 
 
 def summed(found: list[Became]) -> dict[str, Any]:
-    """Of all configurations: how many of each kind, the ends of their gain margins, and first what was wrong, then what
-    was stated."""
+    """Of all configurations: how many of each kind, and first what was wrong, then what was stated."""
     told = sorted((each for each in found if each.kind in ("wrong", "stated")), key=lambda each: each.kind != "wrong")
     counts = Counter(each.kind for each in found)
-    margins_dB = [each.gain_margin_dB for each in found if each.gain_margin_dB is not None]
     return {
         "cases": len(found),
         **{kind: counts[kind] for kind in ("refused", "ran", "stated", "wrong")},
-        "gain_margin_dB": [min(margins_dB, default=None), max(margins_dB, default=None)],
         "told": [f"{each.kind}: {each.why}" for each in told][:MAX_TOLD],
     }
 

@@ -41,14 +41,10 @@ MEANT = {("out.Plan.stamp_s", -math.inf)}
 
 
 class Draw:
-    """The inputs of one step: the usual ones, or some of `strange`."""
+    """The inputs of an episode, step by step: the usual ones, or some of `strange`."""
 
     def __init__(self, rng: random.Random, strange: tuple[float, ...]) -> None:
         self._rng, self._strange, self.has_nan = rng, strange, False
-        self.begin()
-
-    def begin(self) -> None:
-        """Time and steps of an episode begin."""
         self.now_s = self.last_s = 10.0
         self.steps, self.is_hostile = 0, False
 
@@ -64,24 +60,20 @@ class Draw:
 
     def __call__(self, usual: float) -> float:
         """A number."""
-        if self.is_hostile and self._rng.random() < SHARE:
-            usual = self._rng.choice(self._strange)
-            self.has_nan |= math.isnan(usual)
-        return usual
+        value = self._drawn(usual, self._strange)
+        self.has_nan |= math.isnan(value)
+        return value
 
     def bounded(self, usual: float) -> float:
         """A number that has passed the core's borders."""
-        if self.is_hostile and self._rng.random() < SHARE:
-            return self._rng.choice(BOUNDED)
-        return usual
+        return self._drawn(usual, BOUNDED)
 
     def positive(self, usual: float) -> float:
         """A number above 0, where the stage is promised one."""
         return abs(self.bounded(usual)) or usual
 
-    def bytes(self, count: int) -> bytes:
-        """So many at random."""
-        return self._rng.randbytes(count)
+    def _drawn(self, usual: float, strange: tuple[float, ...]) -> float:
+        return self._rng.choice(strange) if self.is_hostile and self._rng.random() < SHARE else usual
 
 
 class Stage(NamedTuple):
@@ -115,11 +107,10 @@ class Row(NamedTuple):
 def tried(stage: Stage, episodes: int, seed: int) -> Row:
     """One stage through so many episodes."""
     rng = random.Random(f"{seed} {stage.name}")
-    draw = Draw(rng, BOUNDED if stage.border else EVERYTHING)
     counts: Counter[str] = Counter()
     told: list[str] = []
     for _ in range(episodes):
-        draw.begin()
+        draw = Draw(rng, BOUNDED if stage.border else EVERYTHING)
         fed = stage.make()
         sentinels = {path for path, value in leaves(fed) if math.isinf(value)}
         for step in range(USUAL_STEPS + HOSTILE_STEPS + AFTER_STEPS):

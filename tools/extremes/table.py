@@ -5,21 +5,16 @@ import random
 from functools import cache, partial
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from extremes.stages import Draw, Stage
 from firmware_protocol.codec import (
     DeviceFault,
     DeviceMode,
-    Drive,
-    DriveMode,
     Sense,
     State,
     Status,
     Switches,
-    decode,
-    encode,
 )
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Motor, Position
@@ -60,14 +55,13 @@ from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.link_statistics import DeviceClock
 from tormagd.hardware.measurement import Measurement
-from tormagd.inverse.choice import RUNTIME_SOLVERS, Choice, build, named
+from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
 from tormagd.model.displacement import MOBILISED_MM, Turn
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, DeviceRequest, SafetyState, command
-from tormagd_client.messages import Setpoint, decode as decode_message
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
 "Of a tick, of a plan, and of what `Stepper` lets a tick take."
@@ -471,11 +465,6 @@ def curve(_: object, draw: Draw) -> object:
     return [made.force_N(field_mT), *made.force_and_slope(field_mT), made.confidence(field_mT, draw.bounded(0.1))]
 
 
-def coarse(solver: str) -> Choice:
-    """A search by its name, on few fields: a number travels through one as through a thousand, row by row."""
-    return named(solver)._replace(step_mT=10.0)
-
-
 def search(stage: Any, draw: Draw) -> object:
     found = stage.solve(core().element.nominal.only, draw(1.2), draw(200.0) if draw.steps % 2 else None)
     return [found.field_mT, found.predicted_force_N, found.confidence]
@@ -502,15 +491,6 @@ def linked(stage: DeviceLink, draw: Draw) -> object:
     return stage.measurement
 
 
-def wire(_: object, draw: Draw) -> object:
-    """Numbers to bytes and back, and any bytes."""
-    if draw.is_hostile and draw.steps % 2:
-        return decode(4, draw.bytes(8))
-    sense = Sense(draw(0.1), draw(0.1), draw(0.6), draw(1.0))
-    drive = Drive(draw(0.1), draw(-0.1), DriveMode.RUN, 1)
-    return [decode(4, encode(sense)), decode(2, encode(drive))]
-
-
 def clock(stage: DeviceClock, draw: Draw) -> object:
     stage.add(draw.now_s, draw(draw.now_s))
     return [stage.drift, stage.fit()]
@@ -529,15 +509,6 @@ def safety(stages: list[SafetyState], draw: Draw) -> object:
     return [some.round_trip_s, some.clock_drift, some.apart_mm]
 
 
-def inbox(_: object, draw: Draw) -> object:
-    """A setpoint's message."""
-    fields = {"v": 1, "source": "a", "seq": draw.steps, "stamp_ns": 1, "servo_cf": draw(1.2)}
-    fields |= {"valid_for_ms": draw(100.0), "displacement_mm": draw(2.0), "rate_mm_s": draw(42.0)}
-    fields |= {"preview_N": [draw(1.2), draw(1.2)], "preview_dt_ms": draw(10.0)}
-    found = decode_message(msgspec.msgpack.encode(fields), Setpoint)
-    return [getattr(found, name) for name in ("servo_cf", "valid_for_ms", "displacement_mm", "preview_N")]
-
-
 def stages() -> list[Stage]:
     """The table."""
     made, position = core(), CONFIG.position
@@ -545,8 +516,6 @@ def stages() -> list[Stage]:
     range_mT, scene = element.nominal.fields_mT, made.scene
     model = load_model(model_path(scene.insert.model, made.models), element=scene.element)
     return [
-        Stage("client: a setpoint's message", lambda: None, inbox),
-        Stage("firmware_protocol: codec", lambda: None, wire),
         Stage("hardware/link", link, linked, CODEC, PERIOD_S),
         Stage("hardware/link_statistics", DeviceClock, clock, CODEC, 0.6),
         Stage("safety/operating_state", lambda: [SafetyState()], safety),
@@ -584,9 +553,10 @@ def stages() -> list[Stage]:
         Stage("field_of_gap", lambda: element.field, field),
         Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT, PLAN_S),
         Stage("model/force_curve", lambda: None, curve),
+        # on few fields: a number travels through one as through a thousand, row by row
         *[
-            Stage(f"inverse: {name}", partial(build, coarse(name), range_mT, model, rises=True), search)
-            for name in RUNTIME_SOLVERS
+            Stage(f"inverse: {name}", partial(build, choice, range_mT, model, rises=True), search)
+            for name, choice in ((name, named(name)._replace(step_mT=10.0)) for name in RUNTIME_SOLVERS)
         ],
         Stage("inverse: portrait", lambda: PortraitSearch(made.portrait, element.field), search),
     ]
