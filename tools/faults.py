@@ -11,7 +11,7 @@ import argparse
 import json
 import sys
 
-from fault_matrix.cases import CAN, MATRIX, SERIAL, Injection
+from fault_matrix.cases import MATRIX, SERIAL, Injection
 from fault_matrix.recovery import recover
 from fault_matrix.rig import Rig
 from fault_matrix.watch import Cell, Watch
@@ -40,18 +40,11 @@ def main() -> int:
     """Prints the matrix; returns 1 where a cell is not named, not safe, too late, or not recovered from."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
-    parser.add_argument("--bus", choices=(SERIAL, CAN), help="only this one")
     parser.add_argument("--only", default="", metavar="TEXT", help="faults with this in their name")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="only every Nth cell")
     parser.add_argument("--firmware", choices=FIRMWARES, default="python", help="what the device runs")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    todo = [
-        (injection, bus)
-        for injection in MATRIX
-        for bus in injection.buses
-        if options.bus in (None, bus) and options.only in injection.name
-    ][:: options.every]
+    todo = [(injection, bus) for injection in MATRIX for bus in injection.buses if options.only in injection.name]
     boot = FIRMWARES[options.firmware]
     steps = tqdm(todo, desc="faults", unit="fault", disable=not sys.stderr.isatty())
     cells = [recover(injection, *inject(injection, options.plant, bus, boot=boot)) for injection, bus in steps]

@@ -18,10 +18,6 @@ STAYS = "stays"
 "Nothing can open the gap, or nothing has been driven: it closes by no more than MAX_CLOSED_MM."
 
 SERIAL, CAN = "serial", "can"
-DRIVEN = "1.8 ± 0.1 N at 1 Hz, handle at 42 mm/s"
-HOMING = "homing"
-ARMING = "homing for 14 s, then enable"
-CONNECTING = "the command home"
 
 
 class Injection(NamedTuple):
@@ -43,7 +39,6 @@ class Injection(NamedTuple):
     publisher: str | None = None
     within_ms: float | None = None
     "By when the reaction has to be on its way, where that is not what the table of codes says."
-    excitation: str = DRIVEN
     is_driven: bool = True
     buses: tuple[str, ...] = (SERIAL, CAN)
 
@@ -100,8 +95,7 @@ MATRIX = (
         ("LINK_DEGRADED", "LINK_LOST"),
         HELD_OR_OPENS,
         way=partial(damaging, 0.05),
-        within_ms=1_000.0,
-        excitation=f"{DRIVEN}; a Hello that is hit opens the device at once, States have to be counted",
+        within_ms=1_000.0,  # a Hello that is hit opens the device at once, States have to be counted
     ),
     Injection("every frame twice", (), HELD, way=doubling),
     Injection("20% of the frames overtaken", (), HELD, way=partial(reordering, 0.2)),
@@ -115,8 +109,7 @@ MATRIX = (
         "firmware hangs, its watchdog resets it",
         ("MEASUREMENT_STALE",),
         device="frozen",
-        within_ms=151.0,
-        excitation=f"{DRIVEN}; nothing can act before the watchdog has, after 100 ms",
+        within_ms=151.0,  # nothing can act before the watchdog has, after 100 ms
     ),
     # the force sensor and the handle
     Injection("force sensor stuck", ("SENSOR",), sensor="stuck"),
@@ -155,7 +148,6 @@ MATRIX = (
         ("WRONG_DIRECTION",),
         STAYS,
         "motor_reversed_left",
-        excitation=HOMING,
         is_driven=False,
     ),
     Injection(
@@ -163,7 +155,6 @@ MATRIX = (
         ("WRONG_DIRECTION",),
         STAYS,
         "encoder_reversed_left",
-        excitation=HOMING,
         is_driven=False,
     ),
     Injection(
@@ -171,8 +162,7 @@ MATRIX = (
         ("DEVICE_OVERCURRENT",),
         STAYS,
         "switch_dead_left",
-        within_ms=6_000.0,
-        excitation="homing, from the closed end",
+        within_ms=6_000.0,  # from the closed end
         is_driven=False,
     ),
     Injection(
@@ -181,7 +171,6 @@ MATRIX = (
         STAYS,
         "switch_stuck_left",
         within_ms=6_000.0,
-        excitation=HOMING,
         is_driven=False,
     ),
     Injection(
@@ -190,7 +179,6 @@ MATRIX = (
         OPENS,
         "duties_reversed",
         within_ms=15_000.0,
-        excitation=ARMING,
         is_driven=False,
     ),
     Injection(
@@ -198,7 +186,6 @@ MATRIX = (
         ("not_connected: no Sense yet",),
         STAYS,
         "no_sense",
-        excitation=CONNECTING,
         is_driven=False,
     ),
     Injection(
@@ -206,7 +193,6 @@ MATRIX = (
         ("not_connected: no Status yet",),
         STAYS,
         "no_status",
-        excitation=CONNECTING,
         is_driven=False,
     ),
     Injection(
@@ -214,7 +200,6 @@ MATRIX = (
         ("not_connected: State refused: CRC-8",),
         STAYS,
         "state_crc",
-        excitation=CONNECTING,
         is_driven=False,
     ),
     Injection(
@@ -223,7 +208,6 @@ MATRIX = (
         STAYS,
         way=partial(delaying, 0.007),
         within_ms=14_100.0,
-        excitation=ARMING,
         is_driven=False,
     ),
     Injection(
@@ -232,7 +216,6 @@ MATRIX = (
         STAYS,
         "clock=-30%",
         within_ms=14_100.0,
-        excitation=ARMING,
         is_driven=False,
     ),
     Injection(
@@ -240,7 +223,6 @@ MATRIX = (
         ("not_connected: the firmware's protocol schema",),
         STAYS,
         "other_schema",
-        excitation=CONNECTING,
         is_driven=False,
     ),
 )

@@ -25,17 +25,14 @@ def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
     if not injection.passes and not rig.is_dead:
         tried, is_held_back = _before(rig, injection)
     rig.mend()
-    mended_s = rig.loop.now_s
     rig.rest(MENDED_S)
     commands = next_commands(rig.safety, rig.is_homed)
     trouble = armed(rig, PATIENCE_S)
-    back_s = rig.loop.now_s - mended_s
     is_held, told = _follow(rig)
     is_back = not trouble and not rig.safety.faults and is_held and not _named(injection, told)
     return cell._replace(
         tried=tried,
         recovery=tuple(map(str, commands)),
-        back_s=round(back_s, 3) if is_back and commands else None,
         recovered=is_held_back and is_back,
     )
 

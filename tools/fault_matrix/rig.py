@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from functools import cache
 
-import msgpack
+import msgspec
 
 from fault_matrix.bad_lines import BadBus, BadSerialLine
 from fault_matrix.cases import NOTHING, SERIAL, Injection
@@ -227,5 +227,4 @@ class DaemonsBorder:
 
     def _message(self, source: str, force_N: float, stamp_ns: int) -> bytes:
         numbered = {"v": 1, "source": source, "seq": self._seq, "session": self._session}
-        packed: bytes = msgpack.packb(numbered | {"stamp_ns": stamp_ns, "servo_cf": force_N, "valid_for_ms": 100.0})
-        return packed
+        return msgspec.msgpack.encode(numbered | {"stamp_ns": stamp_ns, "servo_cf": force_N, "valid_for_ms": 100.0})

@@ -31,9 +31,9 @@ class Cell(NamedTuple):
     its way. The device began to open or let go, the limit was told, or the command was refused. `in_time`: that was by
     `stated_ms`, which is null where nothing is to be told.
 
-    The last four are of `fault_recovery`. `tried`: what the recovery came to before the cause had gone, empty where
-    there was nothing to try. `recovery`: the commands that led back once it had, `back_s` how long they took.
-    `recovered`: they did, not before, and the force was followed again.
+    The last three are of `fault_recovery`. `tried`: what the recovery came to before the cause had gone, empty where
+    there was nothing to try. `recovery`: the commands that led back once it had. `recovered`: they did, not before, and
+    the force was followed again.
     """
 
     bus: str
@@ -50,14 +50,12 @@ class Cell(NamedTuple):
     named: bool
     safe: bool
     seconds: float | None
-    excitation: str
     must_be_named: tuple[str, ...]
     stated_ms: float | None
     reacted_ms: float | None
     in_time: bool
     tried: str = ""
     recovery: tuple[str, ...] = ()
-    back_s: float | None = None
     recovered: bool = False
 
 
@@ -144,7 +142,6 @@ class Watch:
             self._is_named(injection.names),
             is_safe,
             None if safe_ms is None else round(safe_ms * 1e-3, 4),
-            injection.excitation,
             injection.names,
             stated_ms,
             reacted_ms,
