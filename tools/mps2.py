@@ -37,12 +37,11 @@ DRIVE = "Drive taken, State and Sense sent"
 
 @final
 class Counted(EmulatedFirmware):
-    """The program, and the instructions of its wakes by what they were for."""
+    """The program; it adds the instructions of its wakes to `counts`, by what they were for."""
 
-    def __init__(self, plant: PlantParameters) -> None:
+    def __init__(self, plant: PlantParameters, counts: defaultdict[str, list[int]]) -> None:
         super().__init__(plant)
-        self.counts: defaultdict[str, list[int]] = defaultdict(list)
-        self.unanswered = 0
+        self.counts, self.unanswered = counts, 0
 
     def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
         """As the program, counted."""
@@ -71,18 +70,15 @@ def main() -> int:
     except BuildError as error:
         parser.error(str(error))
     booted: list[Counted] = []
+    counts: defaultdict[str, list[int]] = defaultdict(list)
 
     def boot(plant: PlantParameters) -> EmulatedFirmware:
-        booted.append(Counted(plant))
+        booted.append(Counted(plant, counts))
         return booted[-1]
 
     is_right = is_passed(boot) if options.kit else is_followed(boot, options.pulses)
     listing = subprocess.run([size, program], capture_output=True, text=True, check=True).stdout
     text, data, bss = map(int, listing.splitlines()[1].split()[:3])
-    counts: defaultdict[str, list[int]] = defaultdict(list)
-    for firmware in booted:
-        for name, counted in firmware.counts.items():
-            counts[name] += counted
     dropped = sum(one.unanswered + one.statistics.lost + one.statistics.corrupt for one in booted)
     used = max(one.close() or 0 for one in booted)
     print(f"flash {text + data} bytes, RAM {data + bss} bytes, stack {used} bytes by paint")

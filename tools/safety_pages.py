@@ -8,6 +8,7 @@ red rows.
 import json
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from risk.page import page, red_rows
 from risk.rows import Row, judgement, rows
 
 from tormagd.lab.pages import table
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
-from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, Guard, OperatingState, Refusal, Transition
+from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
+from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, OperatingState, Refusal, Transition
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -132,12 +133,8 @@ def _lead(row: Transition | Refusal) -> str:
 
 
 def _guards() -> str:
-    known: dict[tuple[str, str], Guard] = {}
-    for row in ROWS:
-        if isinstance(row, Transition):
-            for guard in row.guards:
-                known.setdefault((guard.code, guard.wants), guard)
-    rows = [(f"`{guard.code}`", guard.wants, guard.remedy) for guard in known.values()]
+    guards = [guard for row in ROWS if isinstance(row, Transition) for guard in row.guards]
+    rows = [(f"`{guard.code}`", guard.wants, guard.remedy) for guard in dict.fromkeys(guards)]
     return (
         "## Guards\n\nA command is refused with the first that does not hold.\n\n"
         + table(("refused as", "wants that", "otherwise"), rows)
@@ -146,27 +143,24 @@ def _guards() -> str:
 
 
 def _faults() -> str:
-    rows = [
-        (f"`{fault}`", row.cause, row.reaction, f"{row.safe_ms:,.0f}", row.remedy)
-        for fault, row in ((fault, FAULTS[fault]) for fault in Fault)
-    ]
     stay = ", ".join(f"`{fault}`" for fault in Fault if "home" not in FAULTS[fault].clears)
     return (
         "## Faults\n\nLatched until `clear-fault`, and then `home`; no homing is wanted after "
         f"{stay}. Several at once are named in this order, causes first. *By* counts from when the fault shows: 50 ms "
         "are the device's own timeout, and control at 500 Hz adds up to 4 ms.\n\n"
-        + table(("fault", "means", "reaction", "by, ms", "remedy"), rows)
+        + _codes("fault", {fault: FAULTS[fault] for fault in Fault})
         + "\n"
     )
 
 
 def _limits() -> str:
-    rows = [
-        (f"`{limit}`", row.cause, row.reaction, f"{row.safe_ms:,.0f}", row.remedy)
-        for limit, row in ((limit, LIMITS[limit]) for limit in Limit)
-    ]
-    headings = ("limit", "means", "reaction", "by, ms", "remedy")
-    return "## Limits\n\nThey come and go by themselves.\n\n" + table(headings, rows)
+    limits = {limit: LIMITS[limit] for limit in Limit}
+    return "## Limits\n\nThey come and go by themselves.\n\n" + _codes("limit", limits)
+
+
+def _codes(kind: str, codes: Mapping[Any, Explanation]) -> str:
+    rows = [(f"`{code}`", row.cause, row.reaction, f"{row.safe_ms:,.0f}", row.remedy) for code, row in codes.items()]
+    return table((kind, "means", "reaction", "by, ms", "remedy"), rows)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import firmware_protocol
 from firmware_protocol.c.build import FIRMWARE, ROOM, BuildError, Target, build
@@ -31,32 +31,19 @@ MAX_INPUT_BYTES = 512
 SLOWEST_INPUT_S = 120
 LINE_BYTES = 4000
 "Bytes in one request to the C filter; its lines end at 8192 characters."
-BEYOND_REACH = {
-    "generated, and nothing calls it": r"_init\(struct|_phys_range\(|_crc_is_in_range\(",
-    "generated: the length was checked before": r"-EINVAL",
-    "the function code was checked before": r"^    default:$",
-    "of a sensor that is not finite, which a port rules out": r"^    if \(!isfinite\(",
-}
-"By what its function's head or the lines about it look like."
+BEYOND_REACH = (
+    r"_init\(struct|_phys_range\(|_crc_is_in_range\(",  # generated, and nothing calls it
+    r"-EINVAL",  # generated: the length was checked before
+    r"^    default:$",  # the function code was checked before
+    r"^    if \(!isfinite\(",  # of a sensor that is not finite, which a port rules out
+)
+"What its function's head or the lines about it look like."
 PROTECTED = {layout.function for layout in LAYOUTS if layout.protected}
 HELLO, HOME, CLEAR, RETRACT, RELEASE = (b"\x1e\0", b"\x06\0", b"\x0e\0", b"\x16\0", b"\x26\0")
 WAIT, CLOSE, OPEN, MEND = b"\xf8", b"\xff\x30", b"\xff\xd0", b"\x03"
 "Operations of firmware_protocol/c/fuzz/device.c: 125 ticks, and 32 Drives of RUN."
 ARMED = HELLO + HOME + 11 * WAIT + 4 * CLOSE
 RESTED = MEND + 8 * WAIT + CLEAR
-
-
-class Coverage(NamedTuple):
-    """Lines of the firmware: how many were run, which were not, and how many are beyond reach for what reason."""
-
-    run: int
-    missed: list[str]
-    beyond: Counter[str]
-
-    @property
-    def share(self) -> float:
-        """Of the lines that bytes can reach."""
-        return self.run / (self.run + len(self.missed))
 
 
 def run(seconds: int, seed: int) -> dict[str, Any]:
@@ -66,13 +53,12 @@ def run(seconds: int, seed: int) -> dict[str, Any]:
     except BuildError as error:
         return {"skipped": str(error), "failures": []}
     with TemporaryDirectory() as folder:
-        executions, failures = {}, []
+        executions, failures = Counter[str](), list[str]()
         for name, seeds in SEEDS.items():
             corpus = Path(folder) / name
             corpus.mkdir()
             for number, data in enumerate(seeds()):
                 (corpus / f"{number:04}").write_bytes(data)
-            executions[name] = 0
             share_s = max(1, round(seconds / len(SEEDS)))
             # what was begun with and found is run to its end too, however little the machine gave before
             for bound in (f"-max_total_time={share_s}", "-runs=0"):
@@ -80,18 +66,17 @@ def run(seconds: int, seed: int) -> dict[str, Any]:
                 executions[name] += executed
                 failures += failed
         found = {name: [path.read_bytes() for path in sorted((Path(folder) / name).iterdir())] for name in SEEDS}
-        coverage = covered(program, Path(folder))
+        share, missed = covered(program, Path(folder))
     differ = differences(found["codec"], found["framing"])
-    if coverage is not None and coverage.share < REACHED:
-        failures.append(f"{coverage.share:.1%} of the lines that bytes can reach: asked are {REACHED:.0%}")
+    if share is not None and share < REACHED:
+        failures.append(f"{share:.1%} of the lines that bytes can reach: asked are {REACHED:.0%}")
     if differ:
         failures.append(f"Python and C differ {differ} times")
     return {
         "executions": executions,
         "inputs": {name: len(inputs) for name, inputs in found.items()},
-        "lines": "no llvm-cov here" if coverage is None else f"{coverage.share:.1%}",
-        "lines_missed": [] if coverage is None else coverage.missed,
-        "lines_beyond_reach": {} if coverage is None else coverage.beyond,
+        "lines": "no llvm-cov here" if share is None else f"{share:.1%}",
+        "lines_missed": missed,
         "languages_differ": differ,
         "failures": failures,
     }
@@ -166,8 +151,9 @@ SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {"codec": payloads, "framing":
 # -- which lines were run ------------------------------------------------------------------------------------------
 
 
-def covered(program: Path, folder: Path) -> Coverage | None:
-    """The lines of the firmware that the targets ran, of the profiles in `folder`; None without LLVM's two tools."""
+def covered(program: Path, folder: Path) -> tuple[float | None, list[str]]:
+    """Which share of the firmware's lines that bytes can reach the targets ran, by the profiles in `folder`, and those
+    that they did not. None without LLVM's two tools."""
     merged = folder / "all.profdata"
     merge = ["llvm-profdata", "merge", "-o", str(merged), *map(str, folder.glob("*.profraw"))]
     sources = [str(ROOM / f"{name}.c") for name in FIRMWARE]
@@ -176,26 +162,23 @@ def covered(program: Path, folder: Path) -> Coverage | None:
         subprocess.run(merge, capture_output=True, check=True)
         table = subprocess.run(export, capture_output=True, text=True, check=True).stdout
     except FileNotFoundError:
-        return None
-    run, missed, beyond = 0, list[str](), Counter[str]()
+        return None, []
+    run, missed = 0, list[str]()
     for record in table.split("end_of_record\n")[:-1]:
         path = Path(re.findall(r"^SF:(.*)$", record, re.MULTILINE)[0])
         lines = path.read_text(encoding="utf-8").splitlines()
         for number, count in re.findall(r"^DA:(\d+),(\d+)$", record, re.MULTILINE):
-            reason = "" if int(count) else out_of_reach(lines, int(number))
             run += int(count) > 0
-            if reason:
-                beyond[f"{path.name}: {reason}"] += 1
-            elif not int(count):
+            if not int(count) and not is_out_of_reach(lines, int(number)):
                 missed.append(f"{path.name}:{number}")
-    return Coverage(run, missed, beyond)
+    return run / (run + len(missed)), missed
 
 
-def out_of_reach(lines: list[str], number: int) -> str:
-    """Why no bytes reach the line, by its function's head, itself and the two lines before it; empty where they can."""
+def is_out_of_reach(lines: list[str], number: int) -> bool:
+    """Whether no bytes reach the line, by its function's head, itself and the two lines before it."""
     heads = [line for line in lines[:number] if line and line[0].isalpha()]
     looks_like = "\n".join([*heads[-1:], *lines[number - 3 : number]])
-    return next((why for why, looks in BEYOND_REACH.items() if re.search(looks, looks_like, re.MULTILINE)), "")
+    return any(re.search(looks, looks_like, re.MULTILINE) for looks in BEYOND_REACH)
 
 
 # -- both languages ------------------------------------------------------------------------------------------------

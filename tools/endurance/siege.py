@@ -18,7 +18,7 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
-import msgpack
+import msgspec
 import zmq
 from tqdm import tqdm
 
@@ -76,15 +76,15 @@ Attack = Callable[[Endpoints, Path, Event, Any], None]
 
 def hostile(draw: random.Random, valid: dict[str, Any], not_allowed: dict[str, tuple[Any, ...]]) -> list[bytes]:
     """The parts of one message that must not be taken, made of a valid one."""
-    packed: bytes = msgpack.packb(valid)
+    packed = msgspec.msgpack.encode(valid)
     name, lacking = draw.choice(list(not_allowed)), draw.choice([field for field in valid if field != "args"])
     ways = (
         [b"\xc1" + draw.randbytes(draw.randrange(200))],
         [packed[: draw.randrange(len(packed))]],
         [packed + draw.randbytes(draw.randrange(1, 9))],
-        [msgpack.packb({field: value for field, value in valid.items() if field != lacking})],
-        [msgpack.packb(valid | {lacking: draw.choice(MISTYPED)})],
-        [msgpack.packb(valid | {name: draw.choice(not_allowed[name])})],
+        [msgspec.msgpack.encode({field: value for field, value in valid.items() if field != lacking})],
+        [msgspec.msgpack.encode(valid | {lacking: draw.choice(MISTYPED)})],
+        [msgspec.msgpack.encode(valid | {name: draw.choice(not_allowed[name])})],
         [draw.choice((b"\x91", b"\x81\xa1v")) * draw.choice((32, 1_000, 5_000))],
         [draw.choice(HEADS) + packed],
         [packed] * draw.randrange(2, 6),
@@ -120,7 +120,7 @@ def busy_clients(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> 
 def flood(name: str, endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
     """Messages to one endpoint, valid ones and garbage; subscriptions where it takes nothing else."""
     kind, data = {
-        "setpoint": (zmq.PUB, [msgpack.packb(SETPOINT), os.urandom(100)]),
+        "setpoint": (zmq.PUB, [msgspec.msgpack.encode(SETPOINT), os.urandom(100)]),
         "control": (zmq.DEALER, [encode(Request(v=VERSION, id=0, command="status"))]),
         "recording": (zmq.XSUB, [sign + os.urandom(16) for sign in (b"\x01", b"\x00")]),
     }[name]

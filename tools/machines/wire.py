@@ -7,9 +7,6 @@ workers get a real-time priority. New ones are made at any time, so they are loo
 
 import contextlib
 import os
-import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,15 +17,23 @@ LOOK_S = 0.25
 
 
 @contextlib.contextmanager
-def carried(priority: int) -> Iterator[bool]:
-    """The workers at this SCHED_FIFO priority meanwhile; tells whether the kernel granted it."""
-    keeper = subprocess.Popen([sys.executable, "-P", __file__, str(priority)], stdout=subprocess.PIPE, text=True)
+def carried(priority: int) -> Iterator[None]:
+    """The workers at this SCHED_FIFO priority meanwhile, where the kernel grants it; then at ordinary priority."""
+    ended = threading.Event()
+    keeper = threading.Thread(target=keep, args=(priority, ended))
+    keeper.start()
     try:
-        assert keeper.stdout is not None
-        yield keeper.stdout.readline().strip() == "granted"
+        yield
     finally:
-        keeper.terminate()
-        keeper.wait()
+        ended.set()
+        keeper.join()
+
+
+def keep(priority: int, ended: threading.Event) -> None:
+    """Looks for workers until the event, or until they are refused."""
+    while schedule(os.SCHED_FIFO, priority) and not ended.wait(LOOK_S):
+        pass
+    schedule(os.SCHED_OTHER, 0)
 
 
 def schedule(policy: int, priority: int) -> bool:
@@ -41,19 +46,3 @@ def schedule(policy: int, priority: int) -> bool:
                 except PermissionError:
                     return False
     return True
-
-
-def main() -> int:
-    """Until SIGTERM; then they are as they were."""
-    ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())
-    is_granted = schedule(os.SCHED_FIFO, int(sys.argv[1]))
-    print("granted" if is_granted else "refused", flush=True)
-    while is_granted and not ended.wait(LOOK_S):
-        schedule(os.SCHED_FIFO, int(sys.argv[1]))
-    schedule(os.SCHED_OTHER, 0)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
