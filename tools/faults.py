@@ -1,10 +1,13 @@
 """The fault matrix: each fault on a serial line and on a CAN bus, in virtual time. It shows its name, how it ends safe,
-and what leads out of it.
+and what leads out of it: the commands that the daemon's own table names, before its cause has gone and after.
 
 Driven faults are injected at 1.8 N, and times count from then. The others are there from the beginning, and times count
 from the command `home`. What is safe is stated for each, and by when the reaction has to be on its way. It is what the
 table of codes says of the code that is named, or what the injection says itself. How fast the force is lost on the way
 is measured too: a force that vanishes at once is a hazard of its own.
+
+To recover, an operator does no more than to say `arm`, beside a publisher that goes on. Before the cause has gone that
+must come to nothing, or the fault be named all the while. Afterwards the force has to be followed again.
 """
 
 import argparse
@@ -12,13 +15,13 @@ import json
 import sys
 
 from fault_matrix.cases import MATRIX, SERIAL, Injection
-from fault_matrix.recovery import recover
 from fault_matrix.rig import Rig
-from fault_matrix.watch import Cell, Watch
+from fault_matrix.watch import MAX_OFF_N, MAX_OVER_N, Cell, Watch
 from tqdm import tqdm
 
+from tormagd.daemon.arming import Arming
 from tormagd.lab.told import table
-from tormagd.safety.operating_state import RefusedError
+from tormagd.safety.operating_state import OperatingState, RefusedError, next_commands
 from tormagd.simulation.__main__ import FIRMWARES
 from tormagd.simulation.device import FirmwareKind
 from tormagd.simulation.firmware import Firmware
@@ -29,6 +32,13 @@ USUAL_S = 2.0
 WATCHED_S = 6.0
 CONNECTED_S = 0.5
 ARMING_S = 14.0
+MENDED_S = 1.5
+"A device that was silent is asked once a second who it is, and one that was reset is told so."
+PATIENCE_S = 12.0
+"It is said again for so long: a clock is judged over some seconds."
+FOLLOWED_S = 4.0
+JUDGED_S = 1.0
+"The end of it, in which the force is to be what is asked and nothing to be told any more."
 SHOWN = (
     *("fault", "bus", "host_faults", "device_faults", "limits", "reaction", "named", "safe", "in_time", "recovered"),
     *("noticed_ms", "reacted_ms", "stated_ms", "open_ms", "loss_N_s", "tried", "recovery"),
@@ -104,6 +114,78 @@ def _is_taken(rig: Rig, watch: Watch, command: str) -> bool:
         watch.refuse(error)
         return False
     return True
+
+
+def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
+    """The row with what came of the recovery, of a rig in which the fault may still last."""
+    tried, is_held_back = "", True
+    if not injection.passes and not rig.is_dead:
+        tried, is_held_back = _before(rig, injection)
+    rig.mend()
+    rig.rest(MENDED_S)
+    commands = next_commands(rig.safety, rig.is_homed)
+    trouble = armed(rig, PATIENCE_S)
+    is_held, told = _follow(rig)
+    is_back = not trouble and not rig.safety.faults and is_held and not _named(injection, told)
+    return cell._replace(
+        tried=tried,
+        recovery=tuple(map(str, commands)),
+        recovered=is_held_back and is_back,
+    )
+
+
+def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:
+    """What the recovery comes to while the cause lasts, and whether it is as it should be."""
+    commands = next_commands(rig.safety, rig.is_homed)
+    trouble = armed(rig, 0.0)
+    if trouble:
+        return trouble, True
+    _, told = _follow(rig)
+    if rig.safety.faults:
+        return ", ".join((*commands, f"{rig.safety.faults[0]} again")), True
+    if not injection.names:
+        return "", True
+    named = _named(injection, told)
+    return (f"{named} still told", True) if named else ("goes on, unnamed", False)
+
+
+def _follow(rig: Rig) -> tuple[bool, set[str]]:
+    """Whether the force is as asked at the end of the next seconds, and which limits are told then. It is not where a
+    fault shows, or nothing is enabled."""
+    off_N: list[float] = []
+    told: set[str] = set()
+    for _ in rig.run(FOLLOWED_S - JUDGED_S):
+        if rig.safety.faults:
+            return False, told
+    for sample in rig.run(JUDGED_S):
+        off_N.append(rig.off_N)
+        if sample is not None:
+            told.update(map(str, (*sample.plan.limits, *sample.output.limits)))
+    is_held = abs(sum(off_N) / len(off_N)) < MAX_OFF_N and max(off_N) < MAX_OVER_N
+    return rig.safety.operating_state is OperatingState.ENABLED and is_held, told
+
+
+def armed(rig: Rig, patience_s: float) -> str:
+    """Says `arm`, again and again for so long. Returns the commands that were taken and what came in the way of the
+    last one, empty where nothing did."""
+    until_s = rig.loop.now_s + patience_s
+    while True:
+        commands, arming = next_commands(rig.safety, rig.is_homed), Arming(rig.loop.now_s, rig.safety.faults)
+        while not arming.is_over:
+            arming.advance(rig.loop.now_s, rig.safety, rig.loop.conditions(), rig.loop.command)
+            rig.tick()
+        why = arming.refusal
+        if why is None:
+            return ""
+        if why.code == "fault":
+            return ", ".join((*arming.given, f"{rig.safety.faults[0]} again"))
+        if rig.loop.now_s >= until_s:
+            return ", ".join((*arming.given, f"{commands[len(arming.given)]} refused: {why.code}"))
+
+
+def _named(injection: Injection, told: set[str]) -> str:
+    """The code of the injection that is told."""
+    return next((name for name in injection.names if name in told), "")
 
 
 if __name__ == "__main__":

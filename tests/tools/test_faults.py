@@ -4,7 +4,6 @@ import faults
 import msgspec
 import pytest
 from fault_matrix.cases import CAN, MATRIX, OPENS, SERIAL, Injection
-from fault_matrix.recovery import recover
 
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.parameters import PlantParameters, load_plant
@@ -148,7 +147,7 @@ RECOVERED = (
 def test_what_leads_out_of_a_fault_does_so_when_its_cause_has_gone(
     name: str, tried: str, recovery: tuple[str, ...]
 ) -> None:
-    cell = recover(NAMED[name], *faults.inject(NAMED[name], "sample_1", watched_s=SAMPLED_S))
+    cell = faults.recover(NAMED[name], *faults.inject(NAMED[name], "sample_1", watched_s=SAMPLED_S))
     assert (cell.tried, cell.recovery, cell.recovered) == (tried, recovery, True)
 
 
@@ -157,7 +156,7 @@ def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.Mo
     hot = NAMED["device too hot"]
     rig, cell = faults.inject(hot, "sample_1", watched_s=JUDGED_S)
     monkeypatch.setattr(rig, "mend", lambda: None)
-    assert not recover(hot, rig, cell).recovered
+    assert not faults.recover(hot, rig, cell).recovered
 
 
 def test_names_are_codes_and_faults_stand_once() -> None:

@@ -31,7 +31,7 @@ class Cell(NamedTuple):
     its way. The device began to open or let go, the limit was told, or the command was refused. `in_time`: that was by
     `stated_ms`, which is null where nothing is to be told.
 
-    The last three are of `fault_recovery`. `tried`: what the recovery came to before the cause had gone, empty where
+    The last three are of `recover`. `tried`: what the recovery came to before the cause had gone, empty where
     there was nothing to try. `recovery`: the commands that led back once it had. `recovered`: they did, not before, and
     the force was followed again.
     """
