@@ -112,25 +112,22 @@ def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
     The host is to blame only where the kernel and bare timers say so, never because the daemon was late.
     """
     if isinstance(shown, Aborted):
-        what = str(shown.error)
-        if is_slow(scene, shown.spacing_s):
-            return Verdict.MISSED, f"{what}; {slow(shown.spacing_s)}"
-        if shown.error.is_of_time and shown.host.took_much:
-            cause = shown.error.cause
-            return Verdict.HOST, f"the host stood in the way, and the show ended early ({cause}): {shown.host}"
-        return Verdict.MISSED, what
-    missed = [text for text, is_met in checks(scene, shown).items() if not is_met]
-    if not missed:
-        return Verdict.MET, ""
-    what = ", ".join(missed)
+        what, is_of_time = str(shown.error), shown.error.is_of_time
+        by_host, otherwise = f", and the show ended early ({shown.error.cause})", what
+    else:
+        missed = ", ".join(text for text, is_met in checks(scene, shown).items() if not is_met)
+        if not missed:
+            return Verdict.MET, ""
+        what, is_of_time, by_host = f"missed: {missed}", True, f" (missed: {missed})"
+        otherwise = (
+            f"{what}; the host did not take what is missing ({shown.host}), so it is the software: keep {RUN_DIR} "
+            "and report it"
+        )
     if is_slow(scene, shown.spacing_s):
-        return Verdict.MISSED, f"missed: {what}; {slow(shown.spacing_s)}"
-    if shown.host.took_much:
-        return Verdict.HOST, f"the host stood in the way (missed: {what}): {shown.host}"
-    return Verdict.MISSED, (
-        f"missed: {what}; the host did not take what is missing ({shown.host}), so it is the software: keep {RUN_DIR} "
-        "and report it"
-    )
+        return Verdict.MISSED, f"{what}; {slow(shown.spacing_s)}"
+    if is_of_time and shown.host.took_much:
+        return Verdict.HOST, f"the host stood in the way{by_host}: {shown.host}"
+    return Verdict.MISSED, otherwise
 
 
 def is_slow(scene: Scene, spacing_s: float) -> bool:
