@@ -266,10 +266,8 @@ def missed(result: Json) -> list[str]:
 
 def row(case: Case, figures: Figures) -> Json:
     """One run for JSON."""
-    errors = [error for _, _, error in figures.settled]
-    measured = {name: getattr(figures, name) for name in ("over_N", "under_N", "peak_N")}
-    range_N = [min(errors), max(errors)] if errors else None
-    return case._asdict() | measured | {"settled_N": range_N, "limits": figures.limits}
+    measured = {name: getattr(figures, name) for name in ("over_N", "under_N", "peak_N", "limits")}
+    return case._asdict() | measured
 
 
 def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None:

@@ -9,6 +9,7 @@ import argparse
 import subprocess
 import sys
 from collections import defaultdict
+from statistics import mean
 from typing import final
 
 import numpy as np
@@ -82,7 +83,9 @@ def main() -> int:
     dropped = sum(one.unanswered + one.statistics.lost + one.statistics.corrupt for one in booted)
     used = max(one.close() or 0 for one in booted)
     print(f"flash {text + data} bytes, RAM {data + bss} bytes, stack {used} bytes by paint")
-    print(*table(instructions(name, counts[name]) for name in sorted(counts)), sep="\n")
+    wakes = sorted(counts.items())
+    means = [{"wake": name, "times": len(each), "mean": round(mean(each)), "most": max(each)} for name, each in wakes]
+    print(*table(means), sep="\n")
     print(f"{len(counts[DRIVE])} Drives answered, {dropped} frames dropped, those that the kit damages among them")
     return int(not is_right or (dropped > 0 and not options.kit))
 
@@ -109,11 +112,6 @@ def is_followed(boot: FirmwareKind, pulses: int) -> bool:
     worst_N = float(np.abs(there_N - here_N).max())
     print(f"pulse of {times_s[-1]:.0f} s: {worst_N * 1e3:.2g} mN at most from the host library's")
     return worst_N <= MAX_N
-
-
-def instructions(name: str, counted: list[int]) -> dict[str, object]:
-    """Of one kind of wake."""
-    return {"wake": name, "times": len(counted), "mean": round(float(np.mean(counted))), "most": max(counted)}
 
 
 class VirtualPort:

@@ -168,14 +168,12 @@ class Run:
         self._course = Course(*(column[::every] for column in bench.course))
         self._roots = bench.roots[case.hidden][::every]
         self._solves = max(effort.slow_solves if is_slow else effort.solves, len(self._course.field_mT))
-        self._fields_mT: list[Array] = []
         self._times_us: list[Array] = []
 
     def advance(self) -> None:
-        """One round more."""
-        fields_mT, times_us = follow(self._solver, self._model, self._course, self._solves)
+        """One round more, with the same answers as every round."""
+        self._fields_mT, times_us = follow(self._solver, self._model, self._course, self._solves)
         self._times_us.append(times_us)
-        self._fields_mT.append(fields_mT)
 
     def row(self) -> dict[str, Any]:
         """The row of the table."""
@@ -192,7 +190,7 @@ class Run:
     def _errors(self) -> dict[str, float]:
         """The solver's error (against the network's own nearest root) and the plant's, apart."""
         along = self._course
-        fields = self._fields_mT[0][: len(along.field_mT)]
+        fields = self._fields_mT[: len(along.field_mT)]
         rooted = np.array([found.size > 0 for found in self._roots])
         to_root = [abs(found - field).min() for found, field in zip(self._roots, fields, strict=True) if found.size]
         features = np.column_stack((along.displacement_mm, along.rate_mm_s, fields, np.full(len(fields), CIP_PERCENT)))

@@ -106,8 +106,6 @@ class Stand(NamedTuple):
 T = TypeVar("T")
 Running = tuple[Config, int]
 """The configuration and the id of a process that keeps time."""
-Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
-"""Begins what is measured, with its files in the folder."""
 
 
 def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
@@ -175,8 +173,8 @@ def _middle(found: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def block(started: Started, seconds: float) -> Block:
-    """One block of one kind, under the load of the clients."""
+def block(started: Callable[[Path], contextlib.AbstractContextManager[Running]], seconds: float) -> Block:
+    """One block under the load of the clients; `started` begins what is measured, with its files in a folder."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, started(Path(folder)) as (config, pid):
         time.sleep(WARM_UP_S)
         _, *alone = spent(pid, lambda: time.sleep(seconds))

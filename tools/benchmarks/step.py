@@ -120,12 +120,11 @@ def stroke(loop: ClosedLoop) -> float:
 def overshoot_over_stroke(loop: ClosedLoop) -> float:
     """The largest overshoot of steps from STROKE_GAPS_MM, both ways, share of the step."""
     worst = 0.0
-    for gap_mm in STROKE_GAPS_MM:
-        for direction in (1.0, -1.0):
-            if gap_mm + direction * STEP_MM < STROKE_GAPS_MM[0]:
-                continue  # past the end of the stroke
+    # the first step that closes would go past the end of the stroke
+    for gap_mm, target_mm in [(gap_mm, gap_mm + way) for gap_mm in STROKE_GAPS_MM for way in (STEP_MM, -STEP_MM)]:
+        if target_mm >= STROKE_GAPS_MM[0]:
             drive(loop, gap_mm, 0.8)
-            worst = max(worst, step(loop, gap_mm + direction * STEP_MM).overshoot)
+            worst = max(worst, step(loop, target_mm).overshoot)
     return worst
 
 

@@ -27,8 +27,6 @@ from firmware_protocol.layouts import LAYOUTS
 
 VECTORS = Path(firmware_protocol.__file__).parent / "vectors"
 REACHED = 0.95
-MAX_INPUT_BYTES = 512
-SLOWEST_INPUT_S = 120
 LINE_BYTES = 4000
 "Bytes in one request to the C filter; its lines end at 8192 characters."
 BEYOND_REACH = (
@@ -87,7 +85,7 @@ def fuzzed(program: Path, corpus: Path, seed: int, bound: str) -> tuple[int, lis
     name, crashes = corpus.name, corpus.with_name(f"{corpus.name}-crash-")
     command = [
         *(str(program), str(corpus), bound, f"-seed={seed}", "-print_final_stats=1", f"-artifact_prefix={crashes}"),
-        *(f"-max_len={MAX_INPUT_BYTES}", f"-timeout={SLOWEST_INPUT_S}"),
+        *("-max_len=512", "-timeout=120"),
     ]
     environment = os.environ | {"TORMAG_FUZZ": name, "LLVM_PROFILE_FILE": str(corpus.with_suffix(".profraw"))}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)

@@ -31,8 +31,7 @@ def run(stand: Stand, count: int, seed: int) -> Figures:
     processes = {"daemon": stand.daemon, "recorder": stand.begin(*ctl, "record", str(path))}
     stand.until(lambda _status: path.exists(), "recorded")
     stand.arm()
-    memory_kB: dict[str, list[int]] = {name: [] for name in processes}
-    descriptors: dict[str, list[int]] = {name: [] for name in processes}
+    samples: dict[str, list[tuple[int, int]]] = {name: [] for name in processes}
     for _ in tqdm(range(count), desc="soak", unit="sample", disable=None):
         since_s = time.monotonic()
         stand.ask(MEAN_N + SWING_N * math.sin(math.tau * SWING_HZ * since_s))
@@ -42,17 +41,15 @@ def run(stand: Stand, count: int, seed: int) -> Figures:
         if stand.see_faults(since_s):
             stand.arm()
         for name, process in processes.items():
-            now = used(process)
-            descriptors[name].append(now[0])
-            memory_kB[name].append(now[1])
+            samples[name].append(used(process))
     end(processes["recorder"])
-    grown_kB = {name: growth(values) for name, values in memory_kB.items()}
-    stayed = {name: staying(values) for name, values in descriptors.items()}
+    grown_kB = {name: growth([kB for _, kB in values]) for name, values in samples.items()}
+    stayed = {name: staying([descriptors for descriptors, _ in values]) for name, values in samples.items()}
     ticks = recorded(path)
     return {
         "minutes": round(count * SAMPLE_S / 60.0, 2),
         "growth_kB": grown_kB,
-        "memory_kB": {name: values[-1] for name, values in memory_kB.items()},
+        "memory_kB": {name: values[-1][1] for name, values in samples.items()},
         "descriptor_growth": stayed,
         "ticks": len(ticks),
         "failures": failures(grown_kB, stayed, ticks),

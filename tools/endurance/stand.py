@@ -85,13 +85,6 @@ class Stand:
         """The daemon's status. Raises ClientError."""
         return self.client.request("status")
 
-    def is_done(self, command: str) -> bool:
-        """Gives a command; whether it was carried out."""
-        with contextlib.suppress(ClientError):
-            self.client.request(command)
-            return True
-        return False
-
     def until(self, reached: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
         """The status in which that is so. Raises TimeoutError saying what was waited for, and the last words."""
         until_s = time.monotonic() + PATIENCE_S
@@ -111,7 +104,8 @@ class Stand:
 
         def is_armed(status: dict[str, Any]) -> bool:
             if status["operating_state"] != "ENABLED":
-                self.is_done("arm")
+                with contextlib.suppress(ClientError):
+                    self.client.request("arm")
             return bool(status["operating_state"] == "ENABLED")
 
         self.ask(NEUTRAL_N)

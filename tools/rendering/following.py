@@ -89,9 +89,9 @@ class Followed(NamedTuple):
         inside = self.time_s >= start_s
         return tracking(self.asked_N[inside], self.rendered_N[inside])
 
-    def mean_N(self, begins_s: float, lasts_s: float = MEAN_S) -> float:
-        """The mean error over a while."""
-        return float(self.error_N[(self.time_s >= begins_s) & (self.time_s < begins_s + lasts_s)].mean())
+    def mean_N(self, begins_s: float) -> float:
+        """The mean error over MEAN_S."""
+        return float(self.error_N[(self.time_s >= begins_s) & (self.time_s < begins_s + MEAN_S)].mean())
 
     def worst_N(self, begins_s: float, ends_s: float) -> float:
         """The greatest of the means over MEAN_S in between."""

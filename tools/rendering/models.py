@@ -70,13 +70,11 @@ def _cells(row: Json) -> list[str]:
     ]
 
 
-def errors(
-    model: ForceModel, fitted: Insert, plant: PlantParameters, rates_mm_s: Array = RATES_MM_S, gaps_mm: Array = GAPS_MM
-) -> Json:
+def errors(model: ForceModel, fitted: Insert, plant: PlantParameters, rates_mm_s: Array = RATES_MM_S) -> Json:
     """The model less the device, fresh and cool, at the same gaps and speeds; `full_N` is the most that it gives."""
-    true_N = brake_N(with_insert(plant, fitted.name), rates_mm_s, gaps_mm)
+    true_N = brake_N(with_insert(plant, fitted.name), rates_mm_s, GAPS_MM)
     field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, TORMAG.inner_radius_m)
-    rates, fields = np.meshgrid(rates_mm_s, [field.field_mT(gap) for gap in gaps_mm.tolist()], indexing="ij")
+    rates, fields = np.meshgrid(rates_mm_s, [field.field_mT(gap) for gap in GAPS_MM.tolist()], indexing="ij")
     ones = np.ones(rates.size)
     rows = np.column_stack((MOBILISED_MM * ones, rates.ravel(), fields.ravel(), 100.0 * fitted.cip_fraction * ones))
     error_N = model.predict(rows) - true_N.ravel()

@@ -7,7 +7,7 @@ LEARN_S on the error counts. A frozen run learns until then, and no more. Runs a
 """
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from rendering.device_draws import device
 from rendering.following import FILE_PREVIEW_S, armed, publisher, taught
 from rendering.hands import swinging
 from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.executors import finished
@@ -64,9 +63,13 @@ def run(case: Case) -> float:
     """RMS of the true force less the force asked, N; a run that ends in a fault counts as no force at all."""
     if case.situation == "contact":
         return _touched(case)
-    played = Play(case)
-    rows = []
-    for time_s, loop in played.ticks():
+    played, rows = Play(case), []
+    loop, ends_s = played.loop, played.begins_s + float(played.time_s[-1])
+    while loop.now_s < ends_s:
+        time_s = loop.now_s - played.begins_s
+        if time_s >= LEARN_S:
+            taught(loop).learns = case.is_learning
+        loop.tick(played.publish(loop.now_s))
         truth = loop.device.truth
         if loop.stepper.safety.faults:
             return rms(played.force_N)
@@ -109,17 +112,16 @@ class Play:
 
     def __init__(self, case: Case) -> None:
         self.core = core_of(case)
-        self._learns = case.is_learning
         scene = self.core.scene
-        self._loop = armed(self.core, plant_of(case.device, scene), hand_of(case.situation, scene))
+        self.loop = armed(self.core, plant_of(case.device, scene), hand_of(case.situation, scene))
         self.time_s, self.force_N = self._asked(case)
         approach_s = APPROACH_S
         finger = scene.finger
         if finger is not msgspec.UNSET:
-            approach_s += PRESSES_AT_S + finger.depth_mm / PRESSING_MM_S - self._loop.now_s
+            approach_s += PRESSES_AT_S + finger.depth_mm / PRESSING_MM_S - self.loop.now_s
         before_s = np.arange(round(approach_s * case.inference_hz)) / case.inference_hz
-        self.begins_s = self._loop.now_s + approach_s
-        times = np.concatenate([self._loop.now_s + before_s, self.begins_s + self.time_s])
+        self.begins_s = self.loop.now_s + approach_s
+        times = np.concatenate([self.loop.now_s + before_s, self.begins_s + self.time_s])
         forces = np.concatenate([np.full(len(before_s), self.force_N[0]), self.force_N])
         sent_hz = sends_hz(case, scene)
         if sent_hz < case.inference_hz:
@@ -139,17 +141,6 @@ class Play:
         if case.situation == "steps":
             return time_s, np.where(time_s // STEP_S % 2.0 == 0.0, low_N, low_N + HELD * (high_N - low_N))
         return signal_of(scene, case.scene, (low_N, high_N), lasts_s, rate_hz)
-
-    def ticks(self) -> Iterator[tuple[float, ClosedLoop]]:
-        """The loop after each tick, with the time since what is asked began, from the approach to its end."""
-        loop = self._loop
-        ends_s = self.begins_s + float(self.time_s[-1])
-        while loop.now_s < ends_s:
-            time_s = loop.now_s - self.begins_s
-            if time_s >= LEARN_S:
-                taught(loop).learns = self._learns
-            loop.tick(self.publish(loop.now_s))
-            yield time_s, loop
 
 
 def plant_of(name: str, scene: Scene) -> PlantParameters:
