@@ -5,7 +5,7 @@ A configuration is refused at the border, or it plans and steps the simulated de
 
 import math
 import random
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any, NamedTuple, get_type_hints
 
@@ -88,17 +88,18 @@ def became(case: tuple[End, ...], seconds: float) -> Became:
 
 
 def _built(case: tuple[End, ...]) -> tuple[Core, PlantParameters]:
-    ends: defaultdict[str, dict[str, float]] = defaultdict(dict)
+    config, plant = Config(scene=SCENE), load_plant(PLANT)
+    scene = msgspec.structs.replace(load_scene(SCENE), signal=None)
     for section, key, value in case:
-        ends[section][key] = value
-    config, scene, plant = Config(scene=SCENE), load_scene(SCENE), load_plant(PLANT)
-    parts = {name: msgspec.structs.replace(getattr(config, name), **ends[name]) for name in SECTIONS}
-    insert = msgspec.structs.replace(scene.insert, **ends["insert"])
-    electronics = msgspec.structs.replace(plant.electronics, **ends["plant"])
-    core = build_core(
-        msgspec.structs.replace(config, **parts), msgspec.structs.replace(scene, signal=None, insert=insert)
-    )
-    return core, msgspec.structs.replace(plant, electronics=electronics)
+        if section == "plant":
+            electronics = msgspec.structs.replace(plant.electronics, **{key: value})
+            plant = msgspec.structs.replace(plant, electronics=electronics)
+        elif section == "insert":
+            scene = msgspec.structs.replace(scene, insert=msgspec.structs.replace(scene.insert, **{key: value}))
+        else:
+            part = msgspec.structs.replace(getattr(config, section), **{key: value})
+            config = msgspec.structs.replace(config, **{section: part})
+    return build_core(config, scene), plant
 
 
 def _ran(core: Core, plant: PlantParameters, seconds: float) -> tuple[str, str]:
