@@ -85,7 +85,7 @@ def commands_page() -> str:
         parts.append(f"## {parser.prog}\n\n{parser.description}\n")
         shared = _options(parser)
         parts.append(table(("option", "what"), shared))
-        for name, command in _subparsers(parser):
+        for name, command in subparsers(parser):
             own = [row for row in _options(command) if row not in shared]
             parts.append(f"### {parser.prog} {name}\n\n{command.description}\n")
             if own:
@@ -93,7 +93,8 @@ def commands_page() -> str:
     return "\n".join(parts)
 
 
-def _subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """The commands of a program by their names; of a command none."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             yield from action.choices.items()

@@ -65,7 +65,7 @@ class Wall(threading.Thread):
 def pairs(count: int, seed: int) -> list[tuple[float, bool]]:
     """So many ratios, each as often as the others, and whether the stiffer wall comes first: in a drawn order."""
     drawn = random.Random(seed)
-    all_pairs = [pair for pair, _ in zip(itertools.cycle(itertools.product(RATIOS, (True, False))), range(count))]
+    all_pairs = list(itertools.islice(itertools.cycle(itertools.product(RATIOS, (True, False))), count))
     drawn.shuffle(all_pairs)
     return all_pairs
 

@@ -1,6 +1,5 @@
 """The documentation says what is there: pages written from types are up to date, what is shown can be typed."""
 
-import argparse
 import ast
 import importlib
 import importlib.util
@@ -10,8 +9,8 @@ import shlex
 from pathlib import Path
 
 import pytest
-import reference_pages
 from PIL import Image
+from reference_pages import commands_page, configuration_page, keys, subparsers, tables
 
 from firmware_protocol.conformance import __main__ as conformance
 from tormagd.command_line import UsageError
@@ -82,13 +81,7 @@ def parser_of(words):
 
 def known_options(parser):
     """Every option of a command and of its subcommands."""
-    options = set()
-    for action in parser._actions:
-        options.update(action.option_strings)
-        if isinstance(action, argparse._SubParsersAction):
-            for each in action.choices.values():
-                options |= known_options(each)
-    return options
+    return {*parser._option_string_actions}.union(*(known_options(each) for _, each in subparsers(parser)))
 
 
 def require_there(words):
@@ -134,8 +127,7 @@ def test_every_command_in_a_line_has_the_options_that_are_named(page):
     for words, parser, arguments in parsed(spans(page.read_text(encoding="utf-8"))):
         assert {word for word in arguments if word.startswith("--")} <= known_options(parser), words
         if words[0] == "tormagctl" and arguments and not arguments[0].startswith("--"):
-            (subparsers,) = (each for each in parser._actions if isinstance(each, argparse._SubParsersAction))
-            assert arguments[0] in subparsers.choices, words
+            assert arguments[0] in dict(subparsers(parser)), words
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs/guides").glob("*.md"))], ids=name_of)
@@ -147,19 +139,12 @@ def test_every_table_of_a_configuration_that_is_shown_is_taken(page):
 
 def test_the_pages_of_reference_are_those_of_the_types():
     """`python tools/reference_pages.py` writes them."""
-    assert (ROOT / "docs/reference/configuration.md").read_text(
-        encoding="utf-8"
-    ) == reference_pages.configuration_page()
-    assert (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8") == reference_pages.commands_page()
+    assert (ROOT / "docs/reference/configuration.md").read_text(encoding="utf-8") == configuration_page()
+    assert (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8") == commands_page()
 
 
 def test_every_key_of_the_configuration_says_what_it_is_for():
-    silent = [
-        f"{table} {name}"
-        for table, kind in reference_pages.tables(Config, "")
-        for name, _, _, why in reference_pages.keys(kind)
-        if not why
-    ]
+    silent = [f"{table} {name}" for table, kind in tables(Config, "") for name, _, _, why in keys(kind) if not why]
     assert silent == []
 
 
@@ -245,8 +230,5 @@ def test_a_picture_is_no_older_than_its_figures(picture, figures):
 
 def test_other_figures_have_another_stamp_and_other_words_the_same():
     page = "# A\n\n| mN |\n| --- |\n| 3 |\n"
-    assert (
-        stamp(figures_of(page))
-        == stamp(figures_of(page + "\nMore words.\n"))
-        != stamp(figures_of(page.replace("3", "4")))
-    )
+    first, longer, other = (stamp(figures_of(each)) for each in (page, page + "\nWords.\n", page.replace("3", "4")))
+    assert first == longer != other

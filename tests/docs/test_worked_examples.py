@@ -74,13 +74,9 @@ def test_cycles_become_a_model_of_the_inserts_law_that_a_scene_takes(here: Path)
 
 def test_a_motor_log_becomes_a_motor(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     time_s = np.arange(0.0, 20.0, 1e-3)
-    phases = [2.0 * np.pi * hertz * time_s for hertz in (0.23, 0.61, 1.7)]
-    sizes = [(0.06, 0.23), (0.02, 0.61), (0.004, 1.7)]
-    angular = [(size, 2.0 * np.pi * hertz) for size, hertz in sizes]
-    waves = list(zip(angular, phases, strict=True))
-    position_m = sum(size * np.sin(phase) for (size, _), phase in waves)
-    speed = sum(size * turns * np.cos(phase) for (size, turns), phase in waves)
-    acceleration = -sum(size * turns**2 * np.sin(phase) for (size, turns), phase in waves)
+    sizes, turns = np.array([0.06, 0.02, 0.004]), 2.0 * np.pi * np.array([0.23, 0.61, 1.7])
+    sines, cosines = np.sin(np.outer(turns, time_s)), np.cos(np.outer(turns, time_s))
+    position_m, speed, acceleration = sizes @ sines, (sizes * turns) @ cosines, -(sizes * turns**2) @ sines
     volts = (95.0 * acceleration + 200.0 * speed + 20.0 * np.sign(speed)) / 35.0
     noise = np.random.default_rng(0).normal(0.0, 0.02, len(time_s))
     savemat("DATA_EMPS.mat", {"t": time_s, "qm": position_m, "vir": volts + noise, "gtau": 35.0})

@@ -72,8 +72,8 @@ def test_no_cell_loses_a_force_faster_than_the_scene_allows() -> None:
 
 def test_what_is_seen_at_once_is_stated_so() -> None:
     """50 ms and one tick for wire and host, 100 ms for what is visible at once; the others say what they take."""
-    for fault in (Fault.LINK_LOST, Fault.HOST_STALL, Fault.DEVICE_COMMAND_TIMEOUT):
-        assert FAULTS[fault].safe_ms == 51.0
+    at_once = (Fault.LINK_LOST, Fault.HOST_STALL, Fault.DEVICE_COMMAND_TIMEOUT)
+    assert {FAULTS[fault].safe_ms for fault in at_once} == {51.0}
     late = [code for code, row in FAULTS.items() if row.safe_ms > 100.0 and row.shows.startswith("at once")]
     assert late == [Fault.SENSE_STALE, Fault.STATUS_STALE], "streams that are missed after 100 ms of nothing"
 
