@@ -1,5 +1,5 @@
 """The fault matrix: each fault on a serial line and on a CAN bus, in virtual time. It shows its name, how it ends safe,
-and what leads out of it: the commands that the daemon's own table names, before its cause has gone and after.
+and what leads out of it. Those are the commands that the daemon's own table names, before its cause has gone and after.
 
 Driven faults are injected at 1.8 N, and times count from then. The others are there from the beginning, and times count
 from the command `home`. What is safe is stated for each, and by when the reaction has to be on its way. It is what the
