@@ -16,6 +16,7 @@ import random
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 from tormagd_client import Client, ClientError
 
@@ -27,39 +28,20 @@ WALL_MM = 20.0
 PERIOD_S = 0.01
 
 
-class Wall(threading.Thread):
-    """Offers one wall from its own client until it is told to end."""
-
-    def __init__(self, folder: str, stiffness_N_mm: float) -> None:
-        super().__init__(daemon=True)
-        self._folder, self._stiffness_N_mm = folder, stiffness_N_mm
-        self._ended = threading.Event()
-        self.error: Exception | None = None
-        self.is_felt = False
-        "The brake was enabled, and followed this wall, at some time."
-
-    def run(self) -> None:
-        """See Thread.run."""
-        try:
-            with Client.local(self._folder, wait_s=2.0, source="trials") as client:
-                start_mm = None
-                while not self._ended.wait(PERIOD_S):
-                    for state in client.telemetry():
-                        start_mm = state.handle_mm if start_mm is None else start_mm
-                        said = state.verdict
-                        self.is_felt |= state.operating_state == "ENABLED" and said is not None and said.source == "trials"
-                    if start_mm is not None:
-                        contact = {"handle_mm": start_mm + WALL_MM, "stiffness_N_mm": self._stiffness_N_mm}
-                        client.publish(0.0, 200.0, contact=contact, withdraw_cf=0.0)
-        except (ClientError, ValueError) as error:
-            self.error = error
-
-    def end(self) -> None:
-        """Waits until nothing is published any more. Raises ClientError or ValueError where it could not be."""
-        self._ended.set()
-        self.join()
-        if self.error is not None:
-            raise self.error
+def offer(folder: str, stiffness_N_mm: float, ended: threading.Event) -> bool:
+    """Publishes one wall from a client of its own until `ended`. Returns whether the brake was enabled, and followed this
+    wall, at some time. Raises ClientError or ValueError where it could not be published."""
+    is_felt, start_mm = False, None
+    with Client.local(folder, wait_s=2.0, source="trials") as client:
+        while not ended.wait(PERIOD_S):
+            for state in client.telemetry():
+                start_mm = state.handle_mm if start_mm is None else start_mm
+                said = state.verdict
+                is_felt |= state.operating_state == "ENABLED" and said is not None and said.source == "trials"
+            if start_mm is not None:
+                contact = {"handle_mm": start_mm + WALL_MM, "stiffness_N_mm": stiffness_N_mm}
+                client.publish(0.0, 200.0, contact=contact, withdraw_cf=0.0)
+    return is_felt
 
 
 def pairs(count: int, seed: int) -> list[tuple[float, bool]]:
@@ -78,12 +60,15 @@ def interval(right: int, count: int) -> tuple[float, float]:
 
 
 def offered(folder: str, stiffness_N_mm: float, number: int, say: Callable[[str], str]) -> bool:
-    """One wall, until the operator is done with it; whether there was one to feel."""
-    wall = Wall(folder, stiffness_N_mm)
-    wall.start()
-    say(f"  wall {number}: push, draw back to where you began, then press Enter ")
-    wall.end()
-    return wall.is_felt
+    """One wall, until the operator is done with it; whether there was one to feel. Raises as `offer`."""
+    ended = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        wall = pool.submit(offer, folder, stiffness_N_mm, ended)
+        try:
+            say(f"  wall {number}: push, draw back to where you began, then press Enter ")
+        finally:
+            ended.set()
+    return wall.result()
 
 
 def run(
