@@ -33,12 +33,13 @@ async def stalls_until_ended(realtime: RealTime) -> list[Stall]:
         if now_ns - first_due_ns > PERIOD_NS:
             found.append(Stall(first_due_ns / NS, now_ns / NS))
 
+    print("stands", flush=True)
     await beat(PERIOD_NS, on_beat, ended)
     return found
 
 
 def main() -> int:
-    """Beats on one processor; prints the stalls as JSON pairs of seconds at its end."""
+    """Beats on one processor; prints a line when it begins, and the stalls as JSON pairs of seconds at its end."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cpu", type=int, required=True, help="the processor it stays on")
     parser.add_argument("--fifo", type=int, default=0, help="SCHED_FIFO priority; 0, or refused: ordinary scheduling")

@@ -116,6 +116,9 @@ class HostWatch:
         self._looking = threading.Thread(target=self._look, daemon=True)
 
     def __enter__(self) -> "HostWatch":
+        for timer in self._timers:
+            assert timer.stdout is not None
+            timer.stdout.readline()  # it stands: before, it would see nothing, and the host would be taken for quiet
         self._looking.start()
         return self
 
