@@ -319,7 +319,11 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
         "device": {"port": port},
         "endpoints": {name: f"ipc://{folder}/{name}" for name in ENDPOINTS},
         "rates": {"control_hz": control_hz, "inference_hz": inference_hz},
-        "realtime": {name: getattr(realtime, name) for name in ("fifo_priority", "keep_awake", "lock_memory")},
+        "realtime": {
+            "fifo_priority": realtime.fifo_priority,
+            "keep_awake": realtime.keep_awake,
+            "lock_memory": realtime.lock_memory,
+        },
     }
     path.write_text(as_toml(tables), encoding="utf-8")
     return path
