@@ -1,12 +1,13 @@
 """What a hand feels that pushes into a wall and draws back: run and bound, in virtual time.
 
-    contact.py [--json] [--picture FILE.png]
+    contact.py [--quick] [--draws N] [--json] [--picture FILE.png]
 
 Onset: from when the wall's force at the handle's place reaches the waiting level W and 0.2 N to when the kinetic force
 does. W is what carriages without inertia leave of the open gap, the scene's least force and its standby. RMS: kinetic
 force less the wall's, at least W, from the wall's place until the hand turns; less W after that. Held: how long the
 handle is held back by more than W and 0.1 N while the hand draws it back. Devices are simulated: sample 1 was tuned on,
-the others judge. The band of the picture is the just noticeable difference of force, 10 % (Jones 1989); that of
+the others judge. `--draws` are random walls, pushes and hands behind a network with jitter of 30 ms and 5 % loss in
+bursts. The band of the picture is the just noticeable difference of force, 10 % (Jones 1989); that of
 stiffness is 22 % (Jones and Hunter 1990).
 """
 
@@ -40,11 +41,13 @@ from tormagd.lab.pages import subplots
 from tormagd.lab.told import lines
 
 DEVICES = (*SAMPLES, "draw 100", "draw 103", SECOND)
-HANDS_N_MM = (0.1, 0.3, 1.0)
+QUICK_DEVICES = ("sample_2", SECOND)
+HANDS_N_MM, QUICK_HANDS_N_MM = (0.1, 0.3, 1.0), (0.3,)
 TOUCHES = ((0.05, 60.0), (0.25, 10.0), (0.25, 30.0), (1.0, 30.0))
 "Walls, N/mm, and pushes, mm/s."
 ROUND_TRIPS_MS = (0.0, 100.0, 400.0)
 MODES = ("force", "force_standby", "way", "way_standby", "law", "law_standby")
+JITTER_MS, LOSS = 30.0, 0.05
 EARLY_TICKS = 20
 "Before the wall, what is exceeded for no longer does not count."
 LATER_MS, WORSE, WORSE_N = 40.0, 1.1, 0.015
@@ -59,11 +62,30 @@ DRAWN = {
 FORCE_JND = 0.10
 
 
-def cases() -> list[Case]:
+def cases(is_quick: bool) -> list[Case]:
     """The matrix."""
+    devices, hands = (QUICK_DEVICES, QUICK_HANDS_N_MM) if is_quick else (DEVICES, HANDS_N_MM)
     return [
         Case(device, hand, *touched, round_trip_ms, mode)
-        for device, hand, touched, round_trip_ms, mode in product(DEVICES, HANDS_N_MM, TOUCHES, ROUND_TRIPS_MS, MODES)
+        for device, hand, touched, round_trip_ms, mode in product(devices, hands, TOUCHES, ROUND_TRIPS_MS, MODES)
+    ]
+
+
+def drawn(count: int) -> list[Case]:
+    """Random touches behind a bad network."""
+    random = np.random.default_rng(2037)
+    return [
+        Case(
+            str(random.choice(DEVICES)),
+            float(np.exp(random.uniform(math.log(0.1), 0.0))),
+            float(np.exp(random.uniform(math.log(0.05), 0.0))),
+            float(random.uniform(10.0, 60.0)),
+            float(random.uniform(0.0, 400.0)),
+            str(random.choice(MODES)),
+            JITTER_MS,
+            LOSS,
+        )
+        for _ in range(count)
     ]
 
 
@@ -217,10 +239,12 @@ def draw(picture: Path) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Exit code 0: all that has to hold does; else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="two devices, one hand")
+    parser.add_argument("--draws", type=int, default=0, metavar="N", help="random touches instead of the matrix")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--picture", type=Path, metavar="FILE.png")
     options = parser.parse_args(arguments)
-    played = cases()
+    played = drawn(options.draws) if options.draws else cases(options.quick)
     with ProcessPoolExecutor() as pool:
         rows = list(tqdm(pool.map(judged, played), total=len(played), disable=options.json))
     result = {"cases": rows, "kept": kept(rows), "energy_error": max(row["energy_error"] for row in rows)}
