@@ -4,7 +4,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import zmq
@@ -142,14 +142,18 @@ class Run(Device):
 
         `enable` is tried for SILENT_S while measurements are not fresh.
         """
-        if name == "enable":
-            _enable(self._client)
-        elif name == "disable":
-            # in FAULT the gap opens already, and a daemon that has gone has opened it
-            with suppress(ClientError):
+        until_s = time.monotonic() + SILENT_S
+        while True:
+            try:
                 self._client.request(name)
-        else:
-            self._client.request(name)
+            except ClientError as error:
+                # on a busy machine the newest measurement may be a little old once
+                if name == "enable" and error.code == "not_fresh" and time.monotonic() <= until_s:
+                    continue
+                # in FAULT the gap opens already, and a daemon that has gone has opened it
+                if name != "disable":
+                    raise
+            return
 
     def exchange(self, asked: Asked) -> Heard:
         """Publish the force, valid for VALID_FOR_MS, and return the ticks until the next is due, 1/RATE_HZ later.
@@ -263,20 +267,3 @@ def armed(endpoints: Endpoints, client: Client, force_N: float) -> Iterator[Run]
             home(client, HOMING_S, is_waiting=True)
         run.follow(enabled(force_N))
         yield run
-
-
-def _enable(client: Client) -> None:
-    """Enable the device, and try again for SILENT_S where its measurements are not fresh.
-
-    Raises ClientError for any other refusal, and for this one after SILENT_S.
-    """
-    # on a busy machine the newest measurement may be a little old once
-    until_s = time.monotonic() + SILENT_S
-    while True:
-        try:
-            client.request("enable")
-        except ClientError as error:
-            if error.code != "not_fresh" or time.monotonic() > until_s:
-                raise
-        else:
-            return

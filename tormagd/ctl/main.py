@@ -117,12 +117,11 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
     (USAGE) for an address or keys that cannot be used.
     """
     changed: dict[str, object] = {}
-    keys = {
+    given = {
         "client_secret": options.key or os.environ.get(KEY),
         "server_public": options.server_key or os.environ.get(SERVER_KEY),
     }
-    if any(keys.values()):
-        named = {name: file for name, file in keys.items() if file}
+    if named := {name: file for name, file in given.items() if file}:
         changed["curve"] = msgspec.structs.replace(configured.curve or Curve(), **named)
     address = options.endpoint
     if address is not None:
