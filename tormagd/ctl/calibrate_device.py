@@ -23,11 +23,12 @@ DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
 
 
 def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
-    """Let the daemon learn the device, judge it by steps, and wait until its profile is kept. The gap opens in the end.
+    """Let the daemon learn the device, judge it by steps, and wait until its profile is kept. The gap opens before
+    that.
 
-    It is the short form of `tormagctl commission`: two of its steps. `scene_most_N` is the greatest force to ask for.
-    The outcome holds `serial_number`, the fields of the status' `device`, and the number of `steps`. It also holds
-    their `mean_error_N`, with its sign, their `worst_error_N`, and `profile`, the folder. Raises as `known_of`, `armed`
+    A person has to turn the handle, as stderr says. `scene_most_N` is the greatest force to ask for. The result holds
+    `serial_number`, the fields of a DeviceReport, and the number of `steps`. It also holds their `mean_error_N`, with
+    its sign, their `worst_error_N`, both 0 where not known, and `profile`, the folder. Raises as `known_of`, `armed`
     and `Run.follow`. Raises CommandError (REFUSED) where no profile is kept, the handle hardly moves, or the daemon
     doubts the force sensor.
     """
@@ -55,8 +56,11 @@ def _in_N(value_mN: float | None) -> float:
 
 
 def require_believed(status: Status) -> None:
-    """Raise CommandError (REFUSED) where the daemon doubts the force sensor, by a limit of DOUBTS: then nothing was
-    learned."""
+    """Raise CommandError (REFUSED) where `status` has a limit of DOUBTS: the daemon doubts the force sensor, and
+    learned nothing.
+
+    The message has that limit's cause, the hint its remedy. Otherwise return.
+    """
     doubt = next((limit for limit in status.limit_details if limit.code in DOUBTS), None)
     if doubt is not None:
         raise CommandError(
@@ -65,10 +69,10 @@ def require_believed(status: Status) -> None:
 
 
 def _kept(client: Client) -> ProfileReport:
-    """Wait until the daemon has written the profile anew, and return its report; one written up to a second before
-    counts.
+    """Wait until the daemon has written the profile, and return its report.
 
-    Raises CommandError (REFUSED) where the daemon says that it cannot write it, or has not within KEPT_WITHIN_S.
+    One that was written up to a second before the call counts, an older one does not. Raises CommandError (REFUSED)
+    where the daemon says that it cannot write it, or has not within KEPT_WITHIN_S. Raises as `Client.status`.
     """
     began_s = time.monotonic()
     while True:
@@ -81,7 +85,10 @@ def _kept(client: Client) -> ProfileReport:
 
 
 def _not_kept(profile: ProfileReport) -> CommandError:
-    """Return the error (REFUSED) for a daemon that keeps no profile, with the reason that `profile` gives."""
+    """Return the error (REFUSED) for a daemon that keeps no profile, to be raised by the caller.
+
+    Its message has the reason that `profile` gives, or that none was written where it gives none.
+    """
     return CommandError(
         Exit.REFUSED,
         "not_kept",
@@ -93,7 +100,7 @@ def _not_kept(profile: ProfileReport) -> CommandError:
 def _text(result: dict[str, Any]) -> str:
     """Say what the device showed of itself, how well the steps were followed, and where the profile is.
 
-    `result` is that of `calibrate_device`. Forces are told in mN.
+    `result` is that of `calibrate_device`; a key that is missing raises KeyError. Forces are told in mN.
     """
     return (
         f"device {result['serial_number']}: {result['scale']:.3f} +- {result['scale_sd']:.3f} times the model's force, "

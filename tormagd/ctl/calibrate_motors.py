@@ -52,8 +52,9 @@ LONGEST_HOLE_S = 0.02
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
     """Return the waveform to ask for: ramps, then jumps, `rounds` times, between two forces.
 
-    They are CLEAR_N above the least force, and the most. A ramp of RAMPS_S goes up and then down. A jump takes 1 ms,
-    and its force is held for JUMP_S. A range narrower than CLEAR_N is not refused: the waveform is then upside down.
+    These are CLEAR_N above the least of `forces`, and their most. Each ramp takes one of RAMPS_S up, and as long down.
+    A jump takes 1 ms, to one of JUMP_SHARES of the range, and is held for JUMP_S. A range narrower than CLEAR_N is not
+    refused: the waveform is then upside down.
     """
     low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]
@@ -63,11 +64,12 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
 
 
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
-    """Drive both carriages through `excitation`, and write the log of one to the new file `path`.
+    """Drive both carriages through `excitation`, and write the log of one to the new CSV file `path`.
 
-    The outcome has `file`, `side`, and the log's `rows` and `seconds`. The gap opens in the end. Raises as `reach`,
-    `armed` and `Run.follow`. Raises CommandError (REFUSED) for a control rate under MIN_HZ, or gaps in the ticks.
-    Raises OSError where the file exists or cannot be made: this shows only after the drive.
+    Its columns are LOG_COLUMNS, as of `motor_log`, with six digits. The result has `file`, `side`, and the log's `rows`
+    and `seconds`. The gap opens before the file is written. Raises as `reach`, `armed` and `Run.follow`. Raises
+    CommandError (REFUSED) for a control rate under MIN_HZ, before anything moves, and as `motor_log`. Raises OSError
+    where the file exists or cannot be made: this shows only after the drive.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
@@ -98,13 +100,14 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
 
 def motor_log(ticks: Columns, side: Side) -> Columns:
-    """Return the motor log's LOG_COLUMNS from control ticks, evenly spaced on the device's clock, with time from 0.
+    """Return the motor log of one side: an array for each of LOG_COLUMNS, evenly spaced on the device's clock, from 0
+    s.
 
-    A row's voltage is the one sent in answer to the row's position: duty times supply. Positions are from the centre
-    plane, positive as the gap opens; `reference_mm` is half the gap's reference. `force_N` is at the roller. Ticks with
-    an unknown value, or without news from the device, are left out. The step is the median one: voltages are held,
-    other values interpolated. Raises CommandError (REFUSED) where the device was silent for more than LONGEST_HOLE_S,
-    or throughout.
+    `ticks` have an array of one length for each of COLUMNS. A row's voltage, V, is the one sent in answer to the row's
+    position: duty times supply. Positions are from the centre plane, positive as the gap opens; `reference_mm` is half
+    the gap's reference. `force_N` is at the roller. Ticks with an unknown value, or without news from the device, are
+    left out. The step is the median one: voltages are held, other values interpolated. Raises CommandError (REFUSED)
+    where the device was silent for more than LONGEST_HOLE_S, or throughout.
     """
     known = np.isfinite(np.column_stack([ticks[name] for name in COLUMNS])).all(axis=1)
     time_s = ticks["device_time_s"][known]

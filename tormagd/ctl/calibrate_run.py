@@ -49,9 +49,9 @@ HOMING_S = 30.0
 
 
 def interrupted_run() -> CommandError:
-    """Return the error (REFUSED) for a run that the person ended: what was under way is not saved.
+    """Return the error (REFUSED, code `interrupted`) for a run that the person ended; the caller raises it.
 
-    The daemon may keep what it learned of the device.
+    It says that a device that was armed opens its gap, and that nothing is saved. The daemon may keep what it learned.
     """
     return CommandError(
         Exit.REFUSED,
@@ -117,10 +117,11 @@ class Run(Device):
         self.progress = Progress()
 
     def follow(self, course: Course[Found]) -> Found:
-        """Run `course` in real time, and return what it found.
+        """Run `course` in real time, and return what it found; the line of progress ends with it.
 
-        Raises CommandError: FAULT or REFUSED where the course stops, REFUSED where the person interrupts. UNREACHABLE
-        is a daemon without ticks for SILENT_S, or with those of another version. Raises as `Client.request`.
+        Where it raises, the device is told to disable. Raises CommandError: FAULT or REFUSED where the course stops, by
+        its code; REFUSED where the person interrupts. UNREACHABLE is a daemon without ticks for SILENT_S, or with those
+        of another version. Raises as `Client.request` for a command, and as `Client.publish`.
         """
         try:
             return drive(course, self)
@@ -138,9 +139,10 @@ class Run(Device):
         return self.follow(watch(waveform.duration_s, lambda t_s: waveform.at(t_s).force_N))
 
     def command(self, name: str) -> None:
-        """Give a command. `disable` is tried whatever happens; raises ClientError where another one is refused.
+        """Give the daemon a command by its name, and wait for the answer, which is not returned.
 
-        `enable` is tried for SILENT_S while measurements are not fresh.
+        Raises as `Client.request` where it is refused; `disable` alone raises nothing, whatever happens. `enable` is
+        tried again for SILENT_S while measurements are not fresh. `name` is not checked here.
         """
         until_s = time.monotonic() + SILENT_S
         while True:
@@ -156,10 +158,12 @@ class Run(Device):
             return
 
     def exchange(self, asked: Asked) -> Heard:
-        """Publish the force, valid for VALID_FOR_MS, and return the ticks until the next is due, 1/RATE_HZ later.
+        """Publish the force, N, valid for VALID_FOR_MS, and return the time and the ticks until the next is due,
+        1/RATE_HZ later.
 
-        A tick is a row by COLUMNS. None publishes nothing. There may be no tick: they come every 20 ms. Raises as
-        `follow`.
+        A tick is a row by the course's COLUMNS. A force of None publishes nothing. There may be no tick: they come
+        every 20 ms. The command in `asked` is not given. Draws the progress anew. Raises as `follow`, also for an
+        interrupt.
         """
         if self._is_interrupted():
             raise interrupted_run()
@@ -178,9 +182,10 @@ class Run(Device):
         return Heard(time.monotonic(), rows)
 
     def _rows(self, data: bytes) -> list[Row]:
-        """Return a batch's ticks by COLUMNS, and note that the daemon was heard.
+        """Return a batch's ticks, each a row by the course's COLUMNS, and note that the daemon was heard.
 
-        Raises CommandError where the batch is another version's.
+        `data` is one message of the recording endpoint. Raises CommandError (UNREACHABLE) where it is no batch, or
+        lacks a column.
         """
         try:
             batch = decode_ticks(data)
@@ -197,11 +202,11 @@ class Run(Device):
 
 
 def reach(status: Status, scene_most_N: float) -> Range:
-    """Return the forces that can be asked for: from the daemon's least to its most, or to the scene's.
+    """Return the forces that can be asked for, N: from the daemon's least to its most, or to `scene_most_N` where that
+    is less.
 
-    The lesser of its most and `scene_most_N` counts, N. A least force above the most is not refused here; `known_of`
-    does that. Raises CommandError (REFUSED) where another source holds the brake, or published within
-    RECENT_SETPOINT_MS.
+    A least force above the most is not refused here; `known_of` does that. Raises CommandError (REFUSED) where another
+    source holds the brake, or anybody published within RECENT_SETPOINT_MS.
     """
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
@@ -217,10 +222,11 @@ def reach(status: Status, scene_most_N: float) -> Range:
 
 
 def known_of(config: Config, status: Status, scene_most_N: float, weight_N: float | None = None) -> Known:
-    """Return what courses know: the configuration, the daemon's control period, the forces of `reach`, and the weight.
+    """Return what a course may use: configuration, the daemon's control period, s, the forces of `reach`, and the
+    weight.
 
-    `weight_N` is what is to be hung up, N; None: there is none. The daemon must have run for a moment: a rate of 0 Hz
-    raises ZeroDivisionError. Raises as `reach`, and CommandError (REFUSED) where the forces leave no range.
+    `weight_N` is what a person will hang up, N; None: nothing. The daemon must have run for a moment: a control rate of
+    0 Hz raises ZeroDivisionError. Raises as `reach`, and CommandError (REFUSED) where the forces leave no range.
     """
     forces = reach(status, scene_most_N)
     known = Known(config, 1.0 / status.rates["control"].hz, forces.least_N, forces.most_N, weight_N)
@@ -236,10 +242,11 @@ def known_of(config: Config, status: Status, scene_most_N: float, weight_N: floa
 
 @contextmanager
 def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
-    """Give a `Run`; at the end of the context disable, so that the gap opens. Disables after an error, too.
+    """Give a `Run`, as a context; however it ends, the device is told to disable, so that the gap opens.
 
-    Within the context SIGINT and SIGTERM are only noted: the `Run` raises for them. Raises UnreachableError where
-    nobody takes setpoints.
+    A `disable` that fails is passed over. Within the context SIGINT and SIGTERM are only noted: the `Run` raises for
+    them. `client` stays open. Raises UnreachableError where nobody takes setpoints, and SettingError for keys or
+    addresses that cannot be used.
     """
     context = zmq.Context()
     try:
@@ -257,10 +264,10 @@ def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
 
 @contextmanager
 def armed(endpoints: Endpoints, client: Client, force_N: float) -> Iterator[Run]:
-    """Home where needed, enable with the setpoint `force_N`, and give a `Run`, as a context.
+    """Home where needed, enable with the setpoint `force_N`, N, and give a `Run`, as a context.
 
-    At its end and after an error the gap opens, and signals are only noted, as in `connected`. Raises as `connected`,
-    `home` and `Run.follow`.
+    At its end and after an error the gap opens, and signals are only noted, as in `connected`. Homing takes HOMING_S at
+    most. Raises as `connected`, `home` and `Run.follow`.
     """
     with connected(endpoints, client) as run:
         if not client.status().is_homed:

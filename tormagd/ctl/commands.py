@@ -37,7 +37,7 @@ def option(*names: str, **settings: Any) -> Option:
 
 
 def number(text: str) -> float:
-    """Parse a finite number. Raises ArgumentTypeError, which says what is allowed."""
+    """Parse a finite number, also in a form such as `1e3`. Raises ArgumentTypeError, which says what is allowed."""
     try:
         value = float(text)
     except ValueError:
@@ -70,8 +70,10 @@ def port(text: str) -> int:
 
 
 def rates(text: str) -> tuple[float, ...]:
-    """Return 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas, as given. Raises ArgumentTypeError for
-    anything else."""
+    """Return 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas, in their order; equal ones are allowed.
+
+    Raises ArgumentTypeError for anything else.
+    """
     found = tuple(Within(0.02, 10.0, " N/s")(part) for part in text.split(","))
     if not 3 <= len(found) <= 60:
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 3..60 rates")
@@ -104,8 +106,11 @@ def _operate(help_text: str) -> Command:
 
 
 def _waiting(usual_s: float) -> tuple[Option, ...]:
-    """Return the options of a command that waits until the carriages have arrived: `--timeout`, usually `usual_s`, and
-    `--no-wait`."""
+    """Return two options of a command that can wait until the carriages have arrived.
+
+    They are `--timeout`, s, as `timeout_s`, with `usual_s` for its default, and `--no-wait`, which makes `is_waiting`
+    False.
+    """
     return (
         option(
             "--timeout",

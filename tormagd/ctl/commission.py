@@ -60,14 +60,15 @@ def commission(
 ) -> Outcome:
     """Run all steps on the device, and keep findings and page in `folder`, named by its serial number.
 
-    The configuration that the daemon has in force judges, an earlier calibration included.
+    The configuration that the daemon has in force judges, an earlier calibration included. Findings (.json) and page
+    (.html) are written after each step; after the last one also the calibration (.toml). `is_resumed` goes on with
+    those that are there; else a new report replaces them. `weight_N` is the weight to hang up, N; None: there is none.
+    `conformance` is the kit's report, None without one. A person agrees first, unless `is_agreed`.
 
-    Findings (.json) and page (.html) are written after each step; after the last one also the calibration (.toml).
-    `is_resumed` goes on with those that are there. `weight_N` is the weight to hang up, N; None: there is none.
-    `conformance` is the kit's report, None without one. The outcome has the `page` and the report's fields. It is
-    REFUSED where a row or a check of the kit failed, or the device stopped. Raises CommandError (USAGE) for files that
-    cannot be read or written, and where nothing is there to resume. Raises it (REFUSED) without a device. Raises as
-    `known_of`, `Run.follow` and `calibrate.agree`; the gap opens then, too.
+    The result has the `page` and the fields of a Report. The outcome is REFUSED where a row or a check of the kit
+    failed, or a step stopped. Raises CommandError (USAGE) for files that cannot be read or written. It also does where
+    nothing is there to resume, or `[motor]` has changed since. Raises it (REFUSED) without a device. Raises as
+    `Client.request`, `known_of`, `Run.follow` and `calibrate.agree`; the gap opens then, too.
     """
     checks = None if conformance is None else _failed_checks(conformance)
     with Client(endpoints, wait_s, SOURCE) as client:
@@ -114,7 +115,11 @@ class Kept:
         self._write()
 
     def follow(self, run: Run, known: Known) -> None:
-        """Run the steps that are not done. Why it stopped is written, too, also where it raises as `Run.follow`."""
+        """Run the steps that are not done, in order, and write the report after each; say each on stderr.
+
+        That a step stopped, and why, is written; a stop that the steps themselves find is not raised. Raises as
+        `Run.follow`, after writing why. Raises CommandError (USAGE) where the report cannot be written.
+        """
 
         def begins(step: Step) -> None:
             self._step = step.name
@@ -154,19 +159,19 @@ def _read(path: Path) -> Report | None:
 
 
 def _failed_checks(path: Path) -> list[tuple[str, str, str]]:
-    """Return name, what was seen and what was expected, of each check of a conformance report that did not pass.
+    """Return name, what was seen and what was expected, of each check of the kit's report that did not pass.
 
-    Empty where all passed. Raises CommandError (USAGE) for another file.
+    Empty where all passed. Raises CommandError (USAGE) where `path` cannot be read, or is no such report.
     """
     report = _decoded(path, _Conformance, "give what the kit prints with --json")
     return [(each.name, each.seen, each.expected) for each in report.checks if not each.passed]
 
 
 def _decoded(path: Path, kind: type[Read], hint: str) -> Read:
-    """Read the JSON file `path`, of at most MAX_BYTES, as a `kind`.
+    """Read the JSON file `path`, of at most MAX_BYTES, as a `kind`; the caller says what helps, as `hint`.
 
-    Raises CommandError (USAGE) with `hint`: an OSError or ValueError, of a file that cannot be read or is no such JSON,
-    becomes one.
+    Raises CommandError (USAGE) with that hint. The OSError or ValueError of a file that is missing, too large, or no
+    JSON of this kind becomes one.
     """
     with as_usage_error(OSError, ValueError, hint=hint):
         try:

@@ -20,8 +20,9 @@ from tormagd_client.endpoints import Endpoints
 def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
     """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording.
 
-    Port 0 takes one that is free; the address is said on stderr. The outcome has the `seconds` that it was served.
-    Raises CommandError (USAGE) where the port is taken or the recording cannot be read, and as `AsyncClient.status`.
+    It is served at 127.0.0.1 alone; port 0 takes one that is free, and stderr says the address. The result has the
+    `seconds` that it was served. Raises CommandError (USAGE) where the port is taken, or the recording cannot be read
+    or is empty. Raises as `AsyncClient.status` where no daemon answers at the start; one that goes later is waited for.
     """
     start_s = time.monotonic()
     try:
@@ -35,8 +36,11 @@ def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int
 
 
 async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
-    """Serve the page of the daemon, listening to it meanwhile. Raises as `AsyncClient.status` where it does not
-    answer."""
+    """Serve the page of the daemon until a signal, listening to it meanwhile.
+
+    Raises as `AsyncClient.status` where it does not answer within `wait_s` at the start. Raises OSError where the port
+    is taken.
+    """
     async with AsyncClient(endpoints, wait_s) as client:
         shown = Live(client, await client.status(), await client.describe())
         listening = asyncio.create_task(shown.run())

@@ -83,9 +83,10 @@ class Running(NamedTuple):
 def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_s: float, measure: bool) -> Outcome:
     """Check this machine, and with `measure` also which rates it holds; return the report as text and result.
 
-    The outcome is REFUSED where a check failed.
-    Judges the configuration of the daemon that answers, else `config`, read from `config_file`; None means the
-    defaults. A daemon that cannot be asked is a warning. Raises CommandError where the measurement fails.
+    Judges the configuration of the daemon that answers within `wait_s`, else `config`, read from `config_file`; None
+    means the defaults. A daemon that cannot be asked is a warning. The result is as of `judged`. The outcome is REFUSED
+    where a check failed. Measuring takes six seconds of both processors' time. Raises CommandError (REFUSED) where it
+    fails.
     """
     machine = Machine(Path("/"))
     known: Running | ClientError = running(endpoints, wait_s)
@@ -95,9 +96,10 @@ def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_
 
 
 def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
-    """Ask the daemon at the control endpoint for its status and configuration; return the error where that fails.
+    """Ask the daemon at the control endpoint for its status and configuration, and return both with the file's path.
 
-    An endpoint on another machine is not asked: that is an error, too.
+    Returns the error, and raises nothing, where that fails: nobody answers within `wait_s`, or it is not understood. An
+    endpoint on another machine is not asked: that is an error, too.
     """
     if not re.match(HERE, endpoints.control):
         return ClientError("elsewhere", f"{endpoints.control} is another machine's", "run tormagctl doctor there")
@@ -117,9 +119,10 @@ def judged(
 ) -> Outcome:
     """Return the report on a machine, on the daemon `known` there, and on the headroom `found`.
 
-    `known` is an error where no daemon could be asked: then the caller's rights are judged by `config`. None for either
-    leaves it out. The result holds `checks`, the count of each verdict, and `measured` with `found`. The outcome is
-    REFUSED where a check failed.
+    A daemon says itself what it was granted; where `known` is an error or None, the caller's rights are judged by
+    `config`. None for `known` or `found` leaves that part out. The result holds `checks`, each a Finding's fields, and
+    the counts `ok`, `warn` and `fail`. With `found` it holds `measured`: that, and `rates`, each a Rate's fields. The
+    outcome is REFUSED where a check failed.
     """
     if isinstance(known, Running):
         findings = (*of_daemon(known), *(check(_in_force(known), machine) for check in OF_MACHINE))
@@ -159,12 +162,11 @@ def nobody(why: ClientError | None) -> tuple[Finding, ...]:
 
 
 def of_daemon(known: Running) -> tuple[Finding, ...]:
-    """Return findings on what a daemon says of itself: that it runs, build, what it asked of the kernel, its device,
-    and the device's calibration.
+    """Return findings on what a daemon says of itself: that it runs, its build, its link, and its device's calibration.
 
-    FAIL for a setting that the kernel refused, or a link that is not RUNNING. WARN for an interpreted build, and for
-    `fifo_priority` or `lock_memory` that is not set; other settings that are not set have no finding. WARN for a
-    calibration that is refused, too.
+    What it asked of the kernel is among them: FAIL for a setting that was refused, WARN for `fifo_priority` or
+    `lock_memory` that is not set. Other settings that are not set have no finding. FAIL is also a link that is not
+    RUNNING. WARN is an interpreted build, and a calibration that is refused.
     """
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
@@ -200,7 +202,11 @@ def _in_force(known: Running) -> Config:
 
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
-    """Return findings on a measurement: the timer, what others took, the core's cost, and the two configured rates."""
+    """Return five findings on a measurement: bare timer, what others took, the core's cost, control rate, inference
+    rate.
+
+    The rates are those of `config`.
+    """
     held = {row.loop: row for row in rates(config, found) if row.configured}
     return (
         bare_timer(found),
@@ -211,9 +217,9 @@ def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
 
 
 def bare_timer(found: Headroom) -> Finding:
-    """Judge how late a thread wakes that does nothing else, at the control rate.
+    """Judge how late a thread wakes that does nothing else, at the control rate, us.
 
-    WARN where its p99 is over LATE_SHARE of a period, or it missed more than MISSED_SHARE of its beats.
+    WARN where its p99 is over LATE_SHARE of a period, or it missed more than MISSED_SHARE of its beats; else OK.
     """
     late_us, rate_hz = found.bare.lateness_us, found.bare.rate_hz
     return _finding(
@@ -226,9 +232,9 @@ def bare_timer(found: Headroom) -> Finding:
 
 
 def others(found: Headroom) -> Finding:
-    """Judge what a hypervisor and other programs took during the measurement, by the kernel's counters.
+    """Judge what a hypervisor and other programs took during the measurement, as shares of its time.
 
-    WARN above MAX_STOLEN or MAX_WAITED; a wait that is not known passes.
+    WARN where `steal` is over MAX_STOLEN, or `waited` over MAX_WAITED; a wait that is not known passes.
     """
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
     is_stolen = found.steal > MAX_STOLEN
@@ -241,7 +247,10 @@ def others(found: Headroom) -> Finding:
 
 
 def core(found: Headroom) -> Finding:
-    """Report the core's build, what its step and plan take of a processor, and the reference loop beside; always OK."""
+    """Report the core's build, what its step and plan take, us, and how long the reference loop took here.
+
+    Always OK: the findings on the rates judge it. The reference loop tells how fast machines are beside each other.
+    """
     step, plan = found.step_us, found.plan_us
     return Finding(
         "core",
@@ -258,7 +267,10 @@ def configured_rate(row: Rate) -> Finding:
 
 
 def preemption(config: Config, machine: Machine) -> Finding:
-    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT, else WARN with the model in force."""
+    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT, else WARN, naming the model in force.
+
+    The model that was asked for at boot is named where the one in force cannot be read, as that takes root.
+    """
     version = machine.text("/proc/version") or ""
     is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
     # the model in force stands in brackets or parentheses; reading it takes root
@@ -281,7 +293,10 @@ def preemption(config: Config, machine: Machine) -> Finding:
 
 
 def governor(config: Config, machine: Machine) -> Finding:
-    """Judge whether processors slow down between ticks: WARN unless every scaling governor, if any, is performance."""
+    """Judge whether processors slow down between ticks: WARN unless every scaling governor is `performance`.
+
+    OK also where the kernel tells of no governor.
+    """
     files = machine.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governors = {text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))}
     return _finding(
@@ -293,8 +308,11 @@ def governor(config: Config, machine: Machine) -> Finding:
 
 
 def scheduling(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller may use SCHED_FIFO at the configured priority: FAIL where not, WARN for priority 0,
-    which is none."""
+    """Judge whether the caller may use SCHED_FIFO at the configured priority: FAIL where not; WARN for priority 0,
+    which asks for none.
+
+    The capability CAP_SYS_NICE allows all priorities; without it the process's own limit counts.
+    """
     wanted = config.realtime.fifo_priority
     allowed = 99 if machine.has_capability(CAP_SYS_NICE) else int(machine.limit("Max realtime priority"))
     return _finding(
@@ -309,7 +327,11 @@ def scheduling(config: Config, machine: Machine) -> Finding:
 
 
 def memory_lock(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller may lock MEMORY_TO_LOCK_BYTES; where not, FAIL if that is configured, else WARN."""
+    """Judge whether the caller may lock MEMORY_TO_LOCK_BYTES; where not, FAIL if `lock_memory` is configured, else
+    WARN.
+
+    The capability CAP_IPC_LOCK allows it; without it the process's own limit counts.
+    """
     limit = float("inf") if machine.has_capability(CAP_IPC_LOCK) else machine.limit("Max locked memory")
     return _finding(
         "memlock",
@@ -321,8 +343,10 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
-    """Judge whether control can have a processor to itself: FAIL where a configured one is not online, WARN for under
-    two."""
+    """Judge the processors online: FAIL where `realtime.cpus` names one that is not, WARN for under two, else OK.
+
+    Processors are taken to be numbered from 0 without a gap.
+    """
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:
@@ -336,7 +360,7 @@ def cores(config: Config, machine: Machine) -> Finding:
 
 
 def load(config: Config, machine: Machine) -> Finding:
-    """Judge whether other programs want the processors: WARN for a one-minute load over 0.8 a processor, or an unknown
+    """Judge whether other programs want the processors: WARN for a one-minute load over 0.8 for each, or an unknown
     one."""
     fields = (machine.text("/proc/loadavg") or "").split()
     if not fields:
@@ -346,7 +370,8 @@ def load(config: Config, machine: Machine) -> Finding:
 
 
 def clock_source(config: Config, machine: Machine) -> Finding:
-    """Judge whether reading the time is fast and even: WARN unless the clock source is of GOOD_CLOCKS, or not known."""
+    """Judge whether reading the time is fast and even: OK where the clock source is of GOOD_CLOCKS, or not told, else
+    WARN."""
     name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     return _finding(
         "clock source",
@@ -357,10 +382,10 @@ def clock_source(config: Config, machine: Machine) -> Finding:
 
 
 def swap(config: Config, machine: Machine) -> Finding:
-    """Judge whether the daemon's memory can be paged out: WARN where swap is on and the configuration does not lock
-    memory.
+    """Judge whether the daemon's memory can be paged out: WARN where swap is on, and `realtime.lock_memory` is not
+    configured.
 
-    OK otherwise, also where /proc/swaps cannot be read.
+    OK otherwise, also where /proc/swaps cannot be read. Only the first swap area is named.
     """
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
@@ -371,7 +396,10 @@ def swap(config: Config, machine: Machine) -> Finding:
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
-    """Judge whether the kernel stops processes to make huge pages: WARN where transparent huge pages are "always"."""
+    """Judge whether the kernel stops processes to make huge pages: WARN where transparent huge pages are `always`.
+
+    OK for another setting, and for a kernel without them.
+    """
     active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
     found = active[1] if active else "not in this kernel"
     return _finding(
@@ -383,8 +411,11 @@ def huge_pages(config: Config, machine: Machine) -> Finding:
 
 
 def run_directory(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller can write where the configured control socket lies: FAIL where not; OK for no ipc://
-    path."""
+    """Judge whether the caller can write where the configured control socket lies: FAIL where not, or where there is no
+    folder.
+
+    OK for an address that is no absolute ipc:// path. The other endpoints are not looked at.
+    """
     address = config.endpoints.control
     if not address.startswith("ipc:///"):
         return Finding("run directory", Severity.OK, f"none needed for {address}")
@@ -408,9 +439,9 @@ def run_directory(config: Config, machine: Machine) -> Finding:
 
 
 def port(config: Config, machine: Machine) -> Finding:
-    """Judge whether the device's port is there and open to the caller: FAIL where not.
+    """Judge whether the configured device's port is there, and readable and writable for the caller: FAIL where not.
 
-    A name that is no path is a CAN interface: WARN where it is not there.
+    A name that is no path is a CAN interface: WARN where it is not there. It is not opened.
     """
     name = config.device.port
     if not name.startswith("/"):
@@ -438,8 +469,10 @@ def port(config: Config, machine: Machine) -> Finding:
 
 
 def port_holder(config: Config, machine: Machine) -> Finding:
-    """Judge whether a process other than tormagd has the port open; FAIL names each. Of a pseudo-terminal only lock
-    holders count."""
+    """Judge whether a process other than tormagd has the port open: FAIL, naming each, else OK.
+
+    Only processes that the caller may look into are seen. Of a pseudo-terminal only those count that have locked it.
+    """
     name = config.device.port
     target = machine.resolved(name)
     others = machine.holders([target])[0][target] if name.startswith("/") else []
@@ -454,8 +487,10 @@ def port_holder(config: Config, machine: Machine) -> Finding:
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:
-    """Judge how long a USB serial chip keeps received bytes back: WARN over FAST_LATENCY_MS; OK where the port has no
-    such timer."""
+    """Judge how long a USB serial chip keeps received bytes back: WARN over FAST_LATENCY_MS.
+
+    OK for less, and where the port has no such timer.
+    """
     adapter = os.path.basename(machine.resolved(config.device.port))  # noqa: PTH119
     file = f"/sys/bus/usb-serial/devices/{adapter}/latency_timer"
     latency_ms = machine.number(file) if adapter else None
@@ -492,7 +527,11 @@ CHECKS = (*OF_CALLER, *OF_MACHINE)
 
 
 def _table(table: tuple[Rate, ...]) -> str:
-    """Return the table of all rates, a row each: its use, whether it is held with margin, and what would hold it."""
+    """Return the table of all rates, a row each: loop, Hz, share used, whether held with margin, and what would hold
+    it.
+
+    An asterisk marks the configured rates. The first line is empty.
+    """
     lines = [
         f"\nrates (at most {MAX_USED:.0%} used is held with margin; * is configured):",
         "  loop          Hz    used  held  to hold it",
@@ -506,7 +545,10 @@ def _table(table: tuple[Rate, ...]) -> str:
 
 
 def _text(findings: tuple[Finding, ...]) -> str:
-    """Return a line for each finding, with the remedy on the next line."""
+    """Return a line for each finding, in their order: verdict, name and what was found; a remedy has the line below.
+
+    Verdicts are coloured where stdout is a terminal.
+    """
     colour = Colour(sys.stdout)
     paint = {Severity.OK: colour.green, Severity.WARN: colour.yellow, Severity.FAIL: colour.red}
     return "\n".join(

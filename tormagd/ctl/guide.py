@@ -10,9 +10,9 @@ FOLDERS = ("guides", "reference", ".")
 
 
 def guide(name: str | None) -> Outcome:
-    """Return the text of one page, with its `name`, as `text`; for None, the titles of all pages by name, as `guides`.
+    """Return a page of the documentation, as text and as `name` and `text`; with None, the list of all pages.
 
-    Raises CommandError (USAGE) for an unknown name.
+    That result is `guides`: titles by name, in the order of FOLDERS. Raises CommandError (USAGE) for an unknown name.
     """
     folders = [files("tormagd") / "docs" / folder for folder in FOLDERS]
     pages = {

@@ -80,8 +80,8 @@ class Rate(msgspec.Struct, frozen=True):
 def measured(path: Path | None, machine: Machine) -> Headroom:
     """Measure this machine in a process of its own, for the configuration in `path`; None takes the defaults.
 
-    `machine` is this one, whose kernel tells before and after what others took: `steal` and `waited`. Raises
-    CommandError (REFUSED) where the process fails or takes over LONGEST_S.
+    `machine` is this one, whose kernel tells before and after what others took, as `steal` and `waited`. Waits for the
+    process. Raises CommandError (REFUSED) where it fails, as for a faulty configuration, or takes over LONGEST_S.
     """
     before, started_s = machine.taken(), time.monotonic()
     try:
@@ -98,7 +98,8 @@ def measured(path: Path | None, machine: Machine) -> Headroom:
 def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | None]:
     """Return the share of time stolen between two readings, and the share in which something waited for a processor.
 
-    `took_s` lies between them. The second share is None where the kernel does not say.
+    Both are 0..1. `took_s` lies between the readings, s, and must be above 0. The second is None where the kernel does
+    not say.
     """
     steal = (after.stolen - before.stolen) / max(after.ticks - before.ticks, 1)
     if before.waited_us is None or after.waited_us is None:
@@ -107,10 +108,10 @@ def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | N
 
 
 def rates(config: Config, found: Headroom) -> Iterator[Rate]:
-    """Yield a verdict on every rate of RATES_HZ and the configured one, for control, then for inference, each rising.
+    """Yield a verdict on each of RATES_HZ and the configured rate, for control, then for inference, each rising.
 
-    Inference rates above the configured control rate are left out. A control rate is judged with inference no faster
-    than itself.
+    A control rate is judged beside the configured inference rate, or its own where that is less. An inference rate is
+    judged beside the configured control rate; one above that is left out, unless it is configured.
     """
     control_hz, inference_hz = config.rates.control_hz, config.rates.inference_hz
     for hz in sorted({*RATES_HZ, control_hz}):
@@ -120,11 +121,11 @@ def rates(config: Config, found: Headroom) -> Iterator[Rate]:
 
 
 def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: int, inference_hz: int) -> Rate:
-    """Judge one rate `hz` of `loop`, beside the other loop's: `used` is the larger share of time and of processor.
+    """Judge the rate `hz` of `loop`, "control" or "inference", where the loops run at `control_hz` and `inference_hz`.
 
-    A control tick has to fit its period even when it wakes late (p99); a plan, with the tick before it, in the median.
-    All runs in one thread, so ticks and plans together must fit one processor. It holds up to MAX_USED; else `change`
-    says what helps.
+    `used` is the larger of two shares: of a period, by which the work has to be done, and of one processor, which all
+    share. A control tick counts with the p99 of its lateness and its step, a plan with medians. It holds up to
+    MAX_USED; above that `change` says what helps first.
     """
     late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us
     period = 1e-6 * control_hz

@@ -63,8 +63,8 @@ class Machine:
         """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi).
 
         `stolen` and `ticks` are of all processors since boot, in the kernel's clock ticks. Both are 0 without
-        /proc/stat; the time waited is None without /proc/pressure/cpu. Raises ValueError for a first line of /proc/stat
-        that is not the kernel's.
+        /proc/stat; the time waited, us, is None without /proc/pressure/cpu. Raises ValueError for a first line of
+        /proc/stat that is not the kernel's.
         """
         first = (self.text("/proc/stat") or "").split("\n", 1)[0]
         fields = [int(field) for field in first.split()[1:9]]  # beyond: guests, who are counted as users already
@@ -77,10 +77,11 @@ class Machine:
         return f"/{os.path.relpath(there, root)}"
 
     def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
-        """Return, by path, id and name of each process that has it open, this one excepted; and how many cannot be
-        looked into.
+        """Return, for each of `paths`, id and name of each process that has it open; and how many processes could not
+        be looked into.
 
-        A path is one without symbolic links, and has a list also where nobody has it open.
+        This process is left out. `paths` are to be absolute and without symbolic links; links are not followed. Each
+        has a list, which is empty where nobody has it open.
         """
         holding: dict[str, list[tuple[int, str]]] = {path: [] for path in paths}
         hidden = 0
@@ -104,8 +105,10 @@ class Machine:
         return printable(self.text(f"/proc/{process_id}/comm") or "?")
 
     def lock_owners(self, absolute: str) -> list[int]:
-        """List the ids of the processes, of any user, that hold a flock on a file, sorted; empty where there is no such
-        file."""
+        """Return the ids of the processes, of any user, that hold a flock on a file, in rising order.
+
+        Empty where there is none, no such file, or no /proc/locks.
+        """
         try:
             status = self.path(absolute).stat()
         except OSError:

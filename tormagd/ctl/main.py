@@ -83,8 +83,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> Outcome:
     """Import the command's function, call it with its options and what it needs, and return its outcome.
 
-    Loads the configuration and opens a client where needed. `doctor` without --config reads SERVICE_CONFIG where that
-    exists. Raises CommandError (USAGE) for a faulty configuration or endpoint, and as the function.
+    `options` are those of `parser`. Loads the configuration, and opens a client, which is closed at the end, where they
+    are needed. `doctor` without --config reads SERVICE_CONFIG where that exists. Raises CommandError (USAGE) for a
+    faulty configuration or endpoint, ModuleNotFoundError for a missing extra, and as the function.
     """
     command = COMMANDS[options.command]
     file = options.config
@@ -113,8 +114,9 @@ def _run(options: argparse.Namespace) -> Outcome:
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
     """Return the configured endpoints and keys with the changes that options, or else the environment, make.
 
-    An endpoint `ipc://DIR/control` stands for all endpoints in DIR, under the daemon's own names. Raises CommandError
-    (USAGE) for an address or keys that cannot be used.
+    An `--endpoint` of `ipc://DIR/control` stands for all endpoints in DIR, under the daemon's own names; any other
+    replaces the control endpoint alone. Key files are not read here. Raises CommandError (USAGE) for an address or keys
+    that cannot be used.
     """
     changed: dict[str, object] = {}
     given = {

@@ -35,12 +35,12 @@ UP = "Whether the daemon answers"
 
 
 def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
-    """Return the metrics as text where `port` is None; else serve them at that port of 127.0.0.1 until a signal.
+    """Return the metrics as text where `port` is None; else serve them at that port of 127.0.0.1 until Ctrl-C or
+    SIGTERM.
 
-    The signal is Ctrl-C or SIGTERM. The outcome holds the text as `metrics`, or the `address` that was served. Port 0
-    takes one that is free; the address is said on stderr. Each scrape asks the daemon anew, and waits `wait_s` at most.
-    Without an answer it gives `tormag_up` 0 alone. Raises CommandError (USAGE) where the port is taken, and as
-    `Client.status` where no daemon answers at the start.
+    The result holds the text as `metrics`, or the `address` that was served. Port 0 takes one that is free; the address
+    is said on stderr. Each scrape asks the daemon anew, as `Scrape.collect`, and waits `wait_s` at most. Raises
+    CommandError (USAGE) where the port is taken, and as `Client.status` where no daemon answers at the start.
     """
     with Client(endpoints, wait_s) as client:
         client.status()
@@ -76,7 +76,8 @@ class Scrape(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Yield `tormag_up`: 1 with all other metrics while the daemon answers, else 0 alone."""
+        """Ask the daemon, waiting for it, and yield `tormag_up`: 1 with all other metrics where it answers, else 0
+        alone."""
         try:
             with Client(self._endpoints, self._wait_s) as client:
                 status = client.status()
@@ -99,8 +100,11 @@ def _family(
     values: Mapping[tuple[str, ...], float | None],
     unit: float = 1.0,
 ) -> Iterator[Metric]:
-    """Yield one metric with a sample for each known value, times `unit`, by its labels; none at all without labels and
-    value."""
+    """Yield one metric, `tormag_` and `name`, with a sample for each value, times `unit`; `text` is its help.
+
+    `values` are by the values of `labels`, in that order; `()` without labels. None has no sample. A metric without
+    labels whose value is None is not yielded at all; with labels its head is, even without a sample.
+    """
     family = kind(f"tormag_{name}", text, labels=labels)
     for key, value in values.items():
         if value is not None:

@@ -39,11 +39,11 @@ COMES_BACK_S = 0.6
 
 
 def arm(client: Client, timeout_s: float) -> Outcome:
-    """Have the daemon clear faults, home and enable, as far as needed, within `timeout_s`, and say each step on stderr.
+    """Have the daemon clear faults, home and enable, as far as needed, and say each step on stderr.
 
-    The outcome has the steps `given` (none: it was armed already), `operating_state` and `seconds`. Raises CommandError
-    (REFUSED) where the device is not ENABLED afterwards, and as `Client.arm`. Ctrl-C disables, and so does the end of
-    `timeout_s`: the gap opens.
+    The result has the steps `given`, empty where it was armed already, `operating_state`, and the `seconds` that it
+    took. Raises CommandError (REFUSED) where the device is not ENABLED afterwards, and as `Client.arm`, such as after
+    `timeout_s`. Ctrl-C and that end disable the device: the gap opens.
     """
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
@@ -60,10 +60,10 @@ def arm(client: Client, timeout_s: float) -> Outcome:
 def operate(client: Client, command: str) -> Outcome:
     """Give one command of DONE, which the daemon carries out or refuses at once, and return its answer.
 
-    The outcome has `operating_state` and `is_connected`; the gap may still move. `stop` without a device gives an
-    outcome of REFUSED: the gap does not open. After a fault was cleared, watches for COMES_BACK_S; without a fault
-    there is nothing to clear, and that is said. Raises CommandError: REFUSED where the answer does not show the state,
-    FAULT where the fault comes back; and as `Client.request`.
+    Another command raises KeyError, after it was given. The result has `operating_state` and `is_connected`; the gap
+    may still move. `stop` without a device gives an outcome of REFUSED: the gap does not open. After a fault was
+    cleared, watches for COMES_BACK_S; where none was latched, the text says so. Raises CommandError: REFUSED where the
+    answer does not show the state, FAULT where the fault comes back. Raises as `Client.request`.
     """
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
@@ -84,9 +84,10 @@ def operate(client: Client, command: str) -> Outcome:
 def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
     """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open.
 
-    The outcome is that of `operate`, after waiting with the `seconds`. `stop` without a device gives an outcome of
-    REFUSED at once. Raises as `operate`. Raises CommandError: FAULT where the gap cannot open, or `disable` meets any
-    fault; REFUSED where the gap is not known to be open within `timeout_s`.
+    The result is that of `operate`, after waiting with the `seconds`. `stop` without a device gives an outcome of
+    REFUSED at once. Shows progress on a terminal. Raises as `operate`. Raises CommandError: FAULT where the gap cannot
+    open, or `disable` meets any fault; REFUSED where the gap is not known to be open within `timeout_s`. The daemon
+    goes on opening it.
     """
     begun = operate(client, command)
     if begun.exit_code is not Exit.DONE or not is_waiting:
@@ -108,9 +109,10 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
 
 
 def take(client: Client, source: str) -> Outcome:
-    """Give the brake to `source`, whoever holds it. The outcome has `source`, and the holder before as `instead_of`.
+    """Give the brake to `source`, whoever holds it, so that its setpoints are rendered.
 
-    Raises as `Client.request`, and CommandError (REFUSED) where the answer names another holder.
+    The result has `source`, and as `instead_of` the holder before, which may be `source` itself. Raises as
+    `Client.request`, and CommandError (REFUSED) where the answer names another holder.
     """
     result = client.request("take", source=source)
     if result.get("source") != source:
@@ -121,11 +123,11 @@ def take(client: Client, source: str) -> Outcome:
 
 
 def confirm(client: Client, what: str) -> Outcome:
-    """Settle a dispute between force sensor and believed device: which of them, `what`, is to be doubted.
+    """Settle a dispute between force sensor and believed device, by saying what is to be doubted.
 
-    "device": it has changed, and is learned anew. "sensor": it is wrong. The outcome has `what` as `confirmed`. Raises
-    as `Client.request`: RefusedError where nothing is disputed. Raises CommandError (REFUSED) where the daemon confirms
-    something else.
+    `what` is "device": it has changed, and is learned anew; or "sensor": it is not believed. The result has it as
+    `confirmed`. Raises as `Client.request`: RefusedError where nothing is disputed. Raises CommandError (REFUSED) where
+    the daemon confirms something else.
     """
     result = client.request("confirm", what=what)
     if result.get("confirmed") != what:
@@ -139,11 +141,11 @@ def _not_done(what: str) -> CommandError:
 
 
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
-    """Home both carriages, and with `is_waiting` wait until they are homed.
+    """Home both carriages, and with `is_waiting` wait until they are homed, showing progress on a terminal.
 
-    The outcome has `operating_state` and `is_connected`, and after waiting the `seconds`. Raises CommandError (FAULT)
-    where the device latches a fault meanwhile. REFUSED is a homing that does not begin within BEGIN_S, leaves the
-    device not homed, or takes over `timeout_s`. Raises as `Client.request`.
+    The result has `operating_state` and `is_connected`, and after waiting the `seconds`. Raises CommandError (FAULT)
+    where the device is in FAULT meanwhile. REFUSED is a homing that does not begin within BEGIN_S, leaves the device
+    not homed, or takes over `timeout_s`; then it goes on. Raises as `Client.request`.
     """
     was_homed = client.status().is_homed
     result = client.request("home")
@@ -173,10 +175,10 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
 
 
 def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tuple[float, Status]]:
-    """Yield seconds since the start and status, every POLL_S for `timeout_s`; that it is over raises nothing.
+    """Yield seconds since the start and status, every POLL_S; end after `timeout_s` without raising anything.
 
-    On a terminal draws a line of progress that says what the device is `doing`; none where that is empty. Raises as
-    `Client.status`.
+    With a `timeout_s` above 0 there is at least one. On a terminal a line of progress on stderr says what the device is
+    `doing`, and is removed at the end. An empty `doing` draws none. Raises as `Client.status`.
     """
     started_s = time.monotonic()
     shows_progress = bool(doing) and is_terminal(sys.stderr)
@@ -194,9 +196,9 @@ def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tupl
 
 
 def require_no_fault(state: Status, what: str) -> None:
-    """Raise CommandError (FAULT) where the device is in FAULT: which fault, why, and what to do.
+    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to do; else return.
 
-    The message begins with `what`. The cause told is of a fault other than STOPPED, where there is one.
+    The message begins with `what`. Cause and remedy are of the first fault other than STOPPED, where there is one.
     """
     if state.operating_state != "FAULT":
         return

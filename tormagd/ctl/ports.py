@@ -69,7 +69,8 @@ class Ports(msgspec.Struct, frozen=True):
 def ports(config: Config, root: Path = Path("/")) -> Outcome:
     """Look for serial ports and CAN channels now, for at most about DETECTION_S, and report them.
 
-    Silences python-can's log below CRITICAL. `root` is where the machine's file system begins.
+    The result has the fields of a `Ports`. No port is opened. Silences python-can's log below CRITICAL, which lasts.
+    `root` is where the machine's file system begins.
     """
     # it says at every start which makers' libraries are not installed
     logging.getLogger("can").setLevel(logging.CRITICAL)
@@ -83,10 +84,10 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
 
 
 def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:
-    """Describe serial ports, CAN channels, and the processes that hold ports.
+    """Describe serial ports, CAN channels, and the processes that hold ports; serial ports are sorted by path.
 
-    `listed` are pyserial's ListPortInfo, `detected` python-can's configurations. A configured serial port is added
-    where it exists, a configured CAN channel always.
+    `listed` are pyserial's ListPortInfo, `detected` python-can's configurations, with `interface` and `channel`. A
+    configured serial port is added where it exists, a configured CAN channel always, as the last.
     """
     known = {machine.resolved(info.device): info for info in listed}
     configured = machine.resolved(config.device.port) if _is_line(config) else ""
@@ -107,8 +108,10 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
 def _serial_port(
     machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
 ) -> ListedPort:
-    """Describe one serial port; `info` is None for one that pyserial does not list. A locking process counts as a
-    holder."""
+    """Describe the serial port at `path`, which has no symbolic links; `info` is pyserial's, None where it lists none.
+
+    `opened` are id and name of the processes that have it open; those that have locked it are added as holders.
+    """
     locking = machine.lock_owners(path)
     names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
     has_usb_id = info is not None and info.vid is not None
@@ -139,10 +142,10 @@ def _is_up(machine: Machine, channel: str) -> bool | None:
 
 
 def _text(found: Ports, config: Config, colour: Colour) -> str:
-    """Return a line for each serial port, its holders below it, and each CAN channel; a configured port that is not
-    there, too.
+    """Return a line for each serial port, its holders below it, then one for each CAN channel.
 
-    A last line counts the processes that cannot be looked into.
+    A configured serial port that is not there has a line, too. A last one counts the processes that cannot be looked
+    into. Without any line the text says that there is no port.
     """
     lines = []
     for entry in found.serial:

@@ -6,9 +6,11 @@ from collections.abc import Iterable
 
 
 def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
-    """Run `python -m MODULE` and return what it prints to stdout. What it says on stderr is not shown.
+    """Run `python -m MODULE` with `arguments` and return what it prints to stdout, as text. What it says on stderr is
+    not shown.
 
-    Raises TimeoutError after `longest_s`, which ends it; ChildProcessError, with stderr's last line, for a failure.
+    Raises TimeoutError after `longest_s`, which ends it. Raises ChildProcessError, with stderr's last line, where its
+    exit code is not 0.
     """
     command = [sys.executable, "-P", "-m", module, *arguments]
     try:

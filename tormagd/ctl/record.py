@@ -33,7 +33,8 @@ SILENT_S = 1.0
 
 
 def budget_of(settings: Recordings) -> Budget:
-    """Return what the configuration allows a folder of recordings, in bytes and s; 1 MB is 1e6 bytes."""
+    """Return what the configuration allows a folder of recordings, in bytes and s; 1 MB is 1e6 bytes, and a day 86400
+    s."""
     return Budget(
         segment_bytes=round(settings.segment_MB * 1e6),
         segment_s=settings.segment_minutes * 60.0,
@@ -54,8 +55,8 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
     """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder.
 
     What the daemon runs is asked and written first, and again at the end: its device may have been connected meanwhile.
-    A message that cannot be read is counted, and the first one's reason told on stderr. The outcome is as of `_record`:
-    REFUSED where ticks were lost, UNREACHABLE where the daemon was gone at the end.
+    The result is as of `_record`. The outcome is REFUSED where ticks were lost, UNREACHABLE where the daemon was gone
+    at the end.
 
     Raises CommandError (USAGE) where the folder is missing, where the file exists or cannot be made, and as `key_of`.
     UNREACHABLE is a daemon that publishes nothing within `wait_s`, or does not answer: then there is no file. REFUSED
@@ -98,8 +99,9 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
-    """Ask the daemon what it runs, and return it as metadata: JSON unless a string; unknown values are left out.
+    """Ask the daemon what it runs, within `wait_s`, and return it as a recording's metadata.
 
+    Keys are the fields of a Description. Values are texts as they are, and others as JSON; unknown ones are left out.
     Raises as `Client.describe`.
     """
     with Client(endpoints, wait_s) as client:
@@ -112,7 +114,10 @@ def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
 
 
 def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
-    """Wait until a socket has a message; False after `wait_s`, or once interrupted."""
+    """Wait until a socket has a message, and return True; False after `wait_s`, or once interrupted, within POLL_MS.
+
+    Nothing is received here. Looks once even for a `wait_s` of 0.
+    """
     poller = zmq.Poller()
     for socket in sockets:
         poller.register(socket, zmq.POLLIN)
@@ -129,12 +134,12 @@ def _record(
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
-    """Write what arrives until the time or an interrupt ends it, then what still waits, and return the outcome.
+    """Write what arrives until the time or an interrupt ends it, then what still waits, for LONGEST_END_S at most.
 
-    It has the last `file`, `seconds`, and how many came and were lost: `telemetry`, `telemetry_lost`, `ticks`,
-    `ticks_lost`. `silent_ms` is the time since the last ticks, and `unreadable` counts what was left out; stderr is
-    told of the first. Silence does not end it, and `writer` stays open. It is UNREACHABLE for a silence of over
-    SILENT_S at the end, else REFUSED where ticks were lost. Raises OSError where the disk takes no more.
+    The result has the last `file`, `seconds`, and how many came and were lost: `telemetry`, `telemetry_lost`, `ticks`,
+    `ticks_lost`. `silent_ms` is the time since the last ticks. `unreadable` counts messages that were left out; stderr
+    tells why of the first. Silence does not end it, and `writer` stays open. The outcome is UNREACHABLE for a silence
+    of over SILENT_S at the end, else REFUSED where ticks were lost. Raises OSError where the disk takes no more.
     """
     unreadable = 0
     start_s = heard_s = time.monotonic()

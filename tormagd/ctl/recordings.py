@@ -17,7 +17,7 @@ from tormagd_client.blocking import Client
 def mark(client: Client, text: str) -> Outcome:
     """Put an event into telemetry, and so into every recording; a folder's present segment is then kept from pruning.
 
-    The outcome has `t_ns`, since 1970, and `text`. Raises as `Client.request`.
+    The result has `t_ns`, since 1970, and `text`. The daemon checks the text. Raises as `Client.request`.
     """
     result = client.request("mark", text=text)
     return Outcome(result, f"marked: {text}")
@@ -26,11 +26,12 @@ def mark(client: Client, text: str) -> Outcome:
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
     """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy to `target`.
 
-    `action` is "list", "prune", "mark" or "export". To list or prune, `path` is a folder; None takes the configured
-    one. To mark or export it is a recording, which marking renames. `target`, for export alone, is a new file, or a
-    folder for a copy of the same name.
+    `action` is "list", "prune" or "mark"; any other exports. To list or prune, `path` is a folder; None takes the
+    configured one. To mark or export it is a recording, which marking renames; the result has the new `file`. `target`,
+    for export alone, is a new file, or a folder for a copy of the same name. Other results are as of `_list`, `_prune`
+    and `_export`.
 
-    The outcome is REFUSED where pruning was not enough. An exported file is REFUSED where it was altered, or could not
+    The outcome is REFUSED where pruning was not enough. An export is REFUSED where the file was altered, or could not
     be checked with the configured key. Raises CommandError (USAGE) where a path that is needed is None or cannot be
     used, and where the copy exists.
     """
@@ -49,10 +50,11 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
 
 
 def _list(folder: RecordingFolder, key: str) -> Outcome:
-    """Describe each segment of the folder, and say their total size; damaged ones are listed with the reason.
+    """Describe each segment of the folder, the oldest first, and say their total size.
 
-    The outcome has `folder`, `recordings`, each as `_row`, and their size, `MB`. Seals are not checked: that takes
-    reading all. Where no `key` is configured, those that have one say so.
+    The result has `folder`, `recordings`, each as `_row`, and their size, `MB`, of 1e6 bytes. Damaged ones are listed
+    with the reason. Seals are not checked: that takes reading all. Where no `key` is configured, those that have one
+    say so. Raises OSError.
     """
     rows = [_row(segment, bool(key)) for segment in folder.segments()]
     size_MB = sum(row["MB"] for row in rows)
@@ -68,8 +70,9 @@ def _list(folder: RecordingFolder, key: str) -> Outcome:
 def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
     """Describe one segment by its overview; without one, `said` tells why.
 
-    Returns `name`, `began_s` since 1970 (None where the name does not say), `MB`, `is_marked`, `seconds` (None without
-    an overview), `faults`, `marks` and `said`. Without an overview the lists are empty.
+    Returns `name`, `began_s` since 1970 (None where the name does not say), `MB`, `is_marked`, and `seconds` (None
+    without an overview). `faults` and `marks` are codes and texts, empty without an overview. `said` has all that is to
+    be noted, in words.
     """
     seconds, faults, marks = None, [], []
     try:
@@ -97,9 +100,10 @@ def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
 
 
 def _prune(folder: RecordingFolder) -> Outcome:
-    """Delete what is over the budget; the outcome has the names `removed`, and `over`, why that is not enough.
+    """Delete what is over the budget, and say what was deleted and whether that is enough.
 
-    It is REFUSED where `over` is not empty. Raises OSError.
+    The result has the names `removed`, the oldest first, and `over`, why it is not enough, empty where it is. The
+    outcome is REFUSED where it is not. Raises OSError.
     """
     gone = folder.prune()
     over = folder.make_room(0)
@@ -111,7 +115,7 @@ def _prune(folder: RecordingFolder) -> Outcome:
 def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
     """Copy a recording to a new file, check the copy's seals under `key`, and say their verdict; REFUSED where unsound.
 
-    `target` is the file, or a folder in which the copy has the same name. The outcome has `file`, the state as `seal`,
+    `target` is the file, or a folder in which the copy has the same name. The result has `file`, the state as `seal`,
     and `why`. Sound is also a recording without seals where `key` is empty. Half a copy is deleted; an unsound one
     stays. Raises OSError where the copy exists or cannot be made, or the recording cannot be read. Raises CommandError
     (USAGE) for a `target` of None.

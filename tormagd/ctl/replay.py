@@ -26,11 +26,11 @@ def replay(
 ) -> Outcome:
     """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulated `plant`.
 
-    `from_s` counts from the file's first tick. Settings are KEY=VALUE, as in limits.skew_fault_mm=2, and faults
-    NAME@SECONDS. With either, `from_s` plays no part. `config_file` None means the defaults. The result is that
-    process's report. The outcome is REFUSED where the replay is not bit-exact, or the file was altered, or sealed
-    without the configured key. Raises CommandError (USAGE) where file or options cannot be used, or it takes over
-    LONGEST_S.
+    `from_s` counts from the file's first tick, s. Settings are KEY=VALUE, as in limits.skew_fault_mm=2, and faults
+    NAME@SECONDS. With either, `from_s` plays no part; without both, `plant` plays none. `config_file` None means the
+    defaults. The result is that process's report. The outcome is REFUSED where the replay is not bit-exact, or the file
+    was altered, or sealed without the configured key. Raises CommandError (USAGE) where file or options cannot be used,
+    or it takes over LONGEST_S.
     """
     arguments = [
         f"--from={from_s!r}",
@@ -62,7 +62,8 @@ def replay(
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
     """Return the text on `done`, the report's `rerun`, and whether it was bit-exact: no first difference.
 
-    The text also tells how many ticks agree, the gaps and, of a difference, its tick, frame, field and both values.
+    The text also tells how many ticks agree and how many gaps there are. Of a difference it tells tick, time, frame,
+    field and both values.
     """
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     difference = done["difference"]
@@ -80,8 +81,8 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
 def _instead(result: dict[str, Any]) -> str:
     """Compare in words what was recorded with what the simulator met, as configured then and with the settings.
 
-    `result` is the report of `python -m tormagd.replay`. A recorded fault that did not come as configured then is
-    named.
+    `result` is the report of `python -m tormagd.replay`; without settings the third is left out. A recorded fault that
+    did not come as configured then is named.
     """
     told = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
     if result["instead"] is not None:
@@ -104,8 +105,11 @@ def _instead(result: dict[str, Any]) -> str:
 
 
 def _happened(what: dict[str, Any]) -> str:
-    """Say in words what was met: `faults` with their times, s, `limits` with how long they held, s, and `refused`
-    commands."""
+    """Say in words what was met in a run, of `what`, a part of the replay's report.
+
+    It has `faults` with their times and `limits` with how long they held, s, and `refused` commands. What is empty is
+    told as none, or left out.
+    """
     faults = ", ".join(f"{name} at {at_s:.3f} s" for name, at_s in what["faults"].items()) or "no fault"
     limits = ", ".join(f"{name} {held_s:.3f} s" for name, held_s in what["limits"].items()) or "none"
     refused = f"; refused: {', '.join(what['refused'])}" if what["refused"] else ""

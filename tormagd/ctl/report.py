@@ -22,9 +22,10 @@ def opened(config: Config, sources: list[Path]) -> list[RecordingFile]:
 
 
 def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> Outcome:
-    """Say what was written, and before that what the seals say: REFUSED where one is not sound.
+    """Say what was written, and before that what the seals say: REFUSED where one is not sound. Nothing is written
+    here.
 
-    The outcome has `file`, the `seals`' states by path, and what `result` has.
+    The result has `file`, the `seals`' states by path, and what `result` has.
     """
     seals = {str(each.path): each.seal.state for each in of}
     said = (f"{each.path}: {'. '.join(dict.fromkeys([each.seal.text(), *each.notes]))}" for each in of)
@@ -36,8 +37,9 @@ def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> O
 def report(config: Config, sources: list[Path], target: Path) -> Outcome:
     """Write an HTML page on one or two recordings to `target`; a page there is replaced, whole or not at all.
 
-    The outcome is REFUSED where one was altered, or could not be checked with the configured key. Raises CommandError
-    (USAGE): more than two, one that cannot be read or is empty, or a page that cannot be written.
+    The result has `file`, and the `seals`' states by path. The outcome is REFUSED where one was altered, or could not
+    be checked with the configured key; the page is written all the same. Raises CommandError (USAGE) for more than two,
+    one that cannot be read or is empty, or a page that cannot be written.
     """
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"
@@ -53,11 +55,11 @@ def report(config: Config, sources: list[Path], target: Path) -> Outcome:
 def plot(config: Config, source: Path, target: Path) -> Outcome:
     """Draw the recording `source` into the picture file `target`; a picture there is replaced, whole or not at all.
 
-    The suffix of `target` says its format: .png, .svg or .pdf. The outcome has the counts `ticks` and `telemetry`,
-    `is_complete`, and the codes of `limits` and `faults`. `tracking_rms_N` and `aligned_rms_N` are None where the force
-    was not followed for long enough. It is REFUSED where the recording was altered, or could not be checked with the
-    configured key. Raises CommandError (USAGE) for another suffix. It also does where the recording cannot be read or
-    is empty, or the picture cannot be written.
+    The suffix of `target` says its format: .png, .svg or .pdf. The result has `file`, `seals`, the counts `ticks` and
+    `telemetry`, `is_complete`, and the codes of `limits` and `faults`. `tracking_rms_N` and `aligned_rms_N` are None
+    where the force was not followed for long enough. The outcome is REFUSED where the recording was altered, or could
+    not be checked with the configured key. Raises CommandError (USAGE) for another suffix, a recording that cannot be
+    read or is empty, or a picture that cannot be written.
     """
     (recording,) = of = opened(config, [source])
     overview, following = recording.overview, recording.overview.following

@@ -34,10 +34,10 @@ def scene(
 ) -> Outcome:
     """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new.
 
-    `plant`, for check and new, also has to give the scene. `share`, `tolerance_N` or `out` choose how the scene is
-    served, for check only. `new` writes the file `name`, from `recorded`, which with `tolerance_N` is a `Recorded`,
-    or from answers. Raises CommandError (USAGE) for `new` without a name, and for what is recorded without it. Raises
-    as the six do.
+    Any other `action` is taken for use. `plant`, for check and new, also has to give the scene. `share`, `tolerance_N`
+    or `out` choose how the scene is served, for check only. `new` writes the file `name`, from `recorded`, which with
+    `tolerance_N` is a `Recorded`, or from answers. Raises CommandError (USAGE) for `new` without a name, and for an
+    option that the action does not take. Returns and raises as the function of the action.
     """
     named = name or config.scene
     if action == "new":
@@ -74,10 +74,10 @@ def scene(
 def use_scene(client: "Client", name: str) -> Outcome:
     """Have a disabled daemon change its scene, and wait until it has.
 
-    A shipped scene goes before a file of the same name. The daemon reads the file, on its machine. The outcome has the
-    `scene` that runs, its `fingerprint`, and `is_homed`. Raises as `Client.request`, such as RefusedError where the
-    device is in use. Raises CommandError (REFUSED) where the change was begun and failed, or is not over within
-    LONGEST_S.
+    A shipped scene goes before a file of the same name. The daemon reads the file, on its machine. The result has the
+    `scene` that runs, its `fingerprint`, and `is_homed`. The change is undone when the daemon starts anew. Raises as
+    `Client.request`, such as RefusedError where the device is in use. Raises CommandError (REFUSED) where the change
+    was begun and failed, or is not over within LONGEST_S.
     """
     from tormagd.ctl.operate import statuses
 
@@ -94,7 +94,7 @@ def use_scene(client: "Client", name: str) -> Outcome:
 
 
 def list_scenes() -> Outcome:
-    """List the shipped scenes; the outcome's `scenes` have `name` and `description` each."""
+    """List the shipped scenes, by name; the result's `scenes` have `name` and `description` each."""
     scenes = [load_scene(name) for name in shipped_scenes()]
     width = max(len(scene.name) for scene in scenes)
     return Outcome(
@@ -114,8 +114,8 @@ def show_scene(name: str) -> Outcome:
 def as_toml(tables: dict[str, Any]) -> str:
     """Return the text of a scene file with these keys and tables, without a line's end after the last.
 
-    Values are numbers, texts, booleans and lists of them. None, and a table within a table, are not refused, and give
-    no TOML.
+    Keys come first, then tables, each in the order given. Values are numbers, texts, booleans and lists of them. None,
+    and a table within a table, are not refused, and give no TOML.
     """
     lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
     for title, table in tables.items():
@@ -125,8 +125,10 @@ def as_toml(tables: dict[str, Any]) -> str:
 
 
 def torque_range(scene: Scene) -> str:
-    """Return the scene's forces as torques at the handle's shaft, mNm, in words; empty for a pad, which has no
-    shaft."""
+    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft, mNm, in words.
+
+    Begins with a comma, to end a line. Empty for a pad, which has no shaft.
+    """
     radius_mm, force = scene.roller_radius_mm, scene.force
     if radius_mm is None:
         return ""
@@ -143,11 +145,11 @@ def _line(key: str, value: object) -> str:
 def check_scene(name: str, config: Path | None, plant: str | None = None) -> Outcome:
     """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost.
 
-    `config` None means the defaults. With `plant`, a simulated device also has to give it. The outcome has `scene`,
-    `core_share_allowed`, what `_derived` gives, and the cost as `core_share`. That is known, and held against
-    `budget.core_share`, only where that way of serving was measured; else it is None. Raises CommandError: REFUSED
-    where the daemon refuses the scene, the plant does not give it, or it costs more than its budget. USAGE is for a
-    faulty scene or plant.
+    `config` None means the defaults. With `plant`, a simulated device also has to give it. The result has `scene`,
+    `core_share_allowed`, `on_plant` (None without a plant), what `_derived` gives, and the cost as `core_share`. The
+    cost is None unless that way of serving was measured; only then it is held against `budget.core_share`. Raises
+    CommandError: REFUSED where the daemon refuses the scene, the plant does not give it, or it costs more than its
+    budget. USAGE is for a faulty scene or plant.
     """
     scene = loaded(name)
     derived = _derived(name, config)
@@ -210,11 +212,10 @@ def check_scene(name: str, config: Path | None, plant: str | None = None) -> Out
 
 
 def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
-    """Return a line on how soon a force comes from where the brake waits, and from higher standby forces; none without
-    any.
+    """Return a line on how soon a force comes from where the brake waits, and from higher standby forces.
 
-    The force is halfway from the wait to the most. `approaches_s` are standby forces, N, with times, s, the present one
-    first.
+    `approaches_s` are standby forces, N, with times, s, the present one first; none of them gives no line. The force is
+    halfway from that to the most.
     """
     if not approaches_s:
         return []
@@ -229,7 +230,7 @@ def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]
 def explain_scene(name: str, config: Path | None) -> Outcome:
     """Show every way to serve a scene that was measured, the chosen one, and how well that served other signals.
 
-    `config` is the configuration's file, None the defaults: the way that runs with it is marked. The outcome has the
+    `config` is the configuration's file, None the defaults: the way that runs with it is marked. The result has the
     fields of a `MeasuredScene`, the `shares` of all ways, and `derived`, as `_derived`. Raises CommandError: REFUSED
     where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
     """
@@ -272,8 +273,10 @@ def way_of(derived: dict[str, Any]) -> OperatingPoint:
 
 
 def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
-    """Return what was measured of a scene that asks for exactly what `scene` does. Raises CommandError (REFUSED) for
-    none."""
+    """Return what was measured of the scene that asks for exactly what `scene` does, under whatever name.
+
+    Raises CommandError (REFUSED, `not_measured`) where `file` has none.
+    """
     found = file.scene(scene.fingerprint)
     if found is None:
         raise CommandError(
@@ -294,8 +297,9 @@ def loaded(name: str) -> Scene:
 def _derived(name: str, config: Path | None) -> dict[str, Any]:
     """Run the daemon's own check of the scene in a process of its own, and return what it derives.
 
-    The keys are those of `derived` in what `tormagd --check` prints. `config` None means the defaults. Raises
-    CommandError (REFUSED) where the check refuses the scene, or takes over LONGEST_S.
+    The keys are those of `derived` in what `tormagd --check` prints, such as `least_N`, `most_N`, `control_hz`. `name`
+    is a shipped scene or a file; `config` None means the defaults. Raises CommandError (REFUSED) where the check
+    refuses the scene or the configuration, or takes over LONGEST_S.
     """
     arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
     try:

@@ -54,11 +54,14 @@ def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | N
     """Write the new scene file `out` from a recorded force, or without one from a person's answers.
 
     `config` is the configuration to check it by; None means the defaults. `plant` also has to give it; None: no plant
-    is asked. Where column, scale or offset are stated, the forces are written beside `out`, as CSV. What only a weak
-    device does not give stands in the file's first lines, and as `unmet_if_weak` in the result. A scene that no insert
-    renders is written all the same. Its first lines say what is not met, and so does `unmet`; the exit code is REFUSED.
-    Raises CommandError (USAGE) for files and answers that cannot be used, or nobody to ask. Raises it for an unknown
-    insert or plant, and where the check does not come to an end. Then there is no file.
+    is asked. Where column, scale or offset are stated, the forces are written beside `out`, as CSV. The result is that
+    of `check_scene` with `file`, `insert`, `unmet` and `unmet_if_weak`. What only a weak device does not give stands in
+    the file's first lines, and as `unmet_if_weak`.
+
+    A scene that no insert renders is written all the same. Its first lines say what is not met, and so does `unmet`;
+    the outcome is REFUSED, and has no check. Raises CommandError (USAGE) for files and answers that cannot be used, or
+    nobody to ask. Raises it for an unknown insert or plant, and where the check does not come to an end. Then there is
+    no file.
     """
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
@@ -74,7 +77,11 @@ def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | N
 def _proposed(
     out: Path, force_file: Path | None, recorded: Recorded, config: Path | None, plant: str | None
 ) -> Outcome:
-    """Write the scene file `out` for the forces in `force_file`. Raises CommandError, as `new_scene`."""
+    """Write the scene file `out` for the forces in `force_file`, and for None from a person's answers.
+
+    Returns and raises as `new_scene`, but the forces' file stays. `recorded` tells insert and tolerance where they are
+    stated.
+    """
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
     if recorded.tolerance_N is not None:
         tables["force"] |= {"tolerance_rms_N": recorded.tolerance_N, "resolution_N": 2.0 * recorded.tolerance_N}
@@ -97,7 +104,10 @@ def _proposed(
 
 
 def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
-    """Return what of a scene that is taken a weak device does not give, with what it does give."""
+    """Return what a weak device does not give of a scene that is taken, a text for each, with what it does give.
+
+    Looked at are the greatest force and the tolerance. Empty where it gives both.
+    """
     force, missed_N = tables["force"], checked.result["missed_rms_N"] or 0.0
     weak = []
     if not _has_reserve(tables, checked):
@@ -108,9 +118,10 @@ def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
 
 
 def _forces_of(out: Path, recorded: Recorded) -> Path | None:
-    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new one beside `out`.
+    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new CSV beside `out`.
 
-    None where nothing was recorded. Raises CommandError (USAGE) for a file or options that cannot be used.
+    That has the columns `t_s` and `force_N`, and the name of `out`. None where nothing was recorded. Raises
+    CommandError (USAGE) for a file or options that cannot be used, and where the new file exists.
     """
     is_converted = (recorded.column, recorded.scale, recorded.offset_N) != (None, None, None)
     if recorded.force is None:
@@ -138,9 +149,10 @@ def _softest(
 ) -> tuple[str, Outcome | None, list[str]]:
     """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all.
 
-    Return the insert, what the check says, and an empty list. Where no insert gives the scene, the nearest to it is
-    written, and what it lacks as comments. Then there is no check, and the list has these lines. Raises
-    CommandError, and deletes the file, for an unknown insert and where a check does not come to an end.
+    `inserts` are from the softest on. Returns the insert, what the check says, and an empty list. Where no insert gives
+    the scene, the nearest to it is written, and what it lacks as comments. Then the check is None, and the list has
+    these reasons. Raises CommandError, and deletes the file, for an unknown insert and where a check does not come to
+    an end.
     """
     taken: dict[str, Outcome] = {}
     lacks: dict[str, list[str]] = {}
@@ -187,8 +199,8 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
     """Propose a scene's tables for a recorded force: its range, rounded outwards, a tolerance, a steady handle of 42
     mm/s.
 
-    The resolution is twice the tolerance; the file is named relative to `out`. Raises CommandError (USAGE) for a bad
-    file, or a force that does not change.
+    The resolution is twice the tolerance; the file is named relative to `out`. There is no insert yet. Raises
+    CommandError (USAGE) for a bad file, or a force that does not change.
     """
     hint = "a CSV with the columns t_s,force_N, no force below 0; else --column, --scale, --offset"
     with as_usage_error(ConfigError, hint=hint):
@@ -206,9 +218,9 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
 
 
 def _from_answers(name: str) -> Tables:
-    """Ask a person for each value of a scene, each with a proposal, and return its tables.
+    """Ask a person on stderr for each value of a scene, each with a proposal, and return its tables, without an insert.
 
-    Raises CommandError (USAGE) where stdin is no terminal, or ends.
+    Values are not checked here. Raises CommandError (USAGE) where stdin is no terminal, or ends.
     """
     if not is_terminal(sys.stdin):
         raise usage_error(
@@ -231,7 +243,10 @@ def _from_answers(name: str) -> Tables:
 
 
 def _answer(question: str, usual: str) -> str:
-    """Ask one question on stderr; an empty line takes `usual`. Raises CommandError (USAGE) where stdin ends."""
+    """Ask one question on stderr, and return the line from stdin without spaces around it; an empty one takes `usual`.
+
+    Raises CommandError (USAGE) where stdin ends.
+    """
     print(f"{question} [{usual}]: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:
@@ -240,7 +255,10 @@ def _answer(question: str, usual: str) -> str:
 
 
 def _number(question: str, usual: float) -> float:
-    """Ask until the answer is a number, `nan` and `inf` included; an empty line takes `usual`. Raises as `_answer`."""
+    """Ask until the answer is a number, `nan` and `inf` included, and return it; an empty line takes `usual`.
+
+    That is shown, and taken, with six digits. Raises as `_answer`.
+    """
     while True:
         answer = _answer(question, f"{usual:g}")
         try:
@@ -259,7 +277,12 @@ def _tables(
     signal: Tables,
     handle_mm_s: tuple[float, float],
 ) -> Tables:
-    """Return a scene's tables without an insert, at the least rates; forces are rounded to three digits."""
+    """Return a scene's tables as they are written to its file, but for the insert, at the least control and inference
+    rates.
+
+    Forces are rounded to three digits. `signal` is its table. `handle_mm_s` is the slowest and the fastest. Nothing is
+    checked.
+    """
     force = {"least_N": least_N, "most_N": most_N, "resolution_N": resolution_N, "tolerance_rms_N": tolerance_N}
     return {
         "name": name,

@@ -17,11 +17,12 @@ LONGEST_S, SIGNAL_S, SIGNAL_HZ = 120.0, 5.0, 200
 
 
 def on_plant(scene: Scene, name: str, plant: str) -> dict[str, Any]:
-    """Return what the plant's ideal carriages give of the scene `name`: its `plant`, range and RMS errors, N.
+    """Return what the plant's ideal carriages give of a scene: `plant`, range (`least_N`, `most_N`) and RMS errors, N.
 
-    A scene without a signal is asked for its range, up and down. Raises CommandError (REFUSED) where the plant does not
-    reach the greatest force or follow within the tolerance. Raises it (USAGE) for a plant that is refused, and without
-    the laboratory.
+    `foresight_rms_N` is the error that is judged. `name` is where `scene` is from. A scene without a signal is asked
+    for its range, up and down. Waits for the laboratory, a process of its own. Raises CommandError (REFUSED) where the
+    plant does not reach the greatest force or follow within the tolerance. Raises it (USAGE) for a plant that is
+    refused, and without the laboratory.
     """
     force = scene.force
     times_s, forces_N = (

@@ -23,7 +23,7 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
     """Choose the most exact measured way that takes at most `share` of a processor, or the cheapest within an error.
 
     The error is `tolerance_N`, RMS; one of both is None. With `out` writes the scene, served that way, to this new
-    file. The outcome has `scene`, `way`, its worst `rms_N`, its `daemon_share`, and `file`, None without one. Raises
+    file. The result has `scene`, `way`, its worst `rms_N`, its `daemon_share`, and `file`, None without one. Raises
     CommandError: USAGE for another action than check, for both or neither limit, and for files that cannot be used.
     REFUSED where nothing was measured, or no way is good enough.
     """
@@ -51,9 +51,11 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
 
 
 def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
-    """Return the most exact of `ways` that takes at most `share`, or for None the cheapest within `tolerance_N`.
+    """Return the most exact of `ways` whose share is at most `share`, or for None the cheapest whose error is at most
+    `tolerance_N`.
 
-    Raises CommandError (REFUSED) where no way does, ValueError where there is none at all.
+    Raises CommandError (REFUSED), with the least that is allowed, where no way does; ValueError where there is none at
+    all.
     """
     bounds = ("--tolerance", 1, tolerance_N, "N") if share is None else ("--share", 0, share, "of a processor")
     asked, bounded, most, unit = bounds
@@ -70,11 +72,10 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
 
 
 def _write(name: str, way: OperatingPoint, out: Path) -> None:
-    """Write the scene with these rates and this search to the new file `out`; relative paths in it are adapted.
+    """Write the scene `name` with this way's rates and search to the new file `out`; relative paths in it are adapted.
 
-    `[bandwidth]` and `[solver]` are replaced whole: a search's own settings are dropped.
-
-    Raises CommandError (USAGE) where `out` exists or cannot be made.
+    `[bandwidth]` and `[solver]` are replaced whole: a search's own settings are dropped. Raises CommandError (USAGE)
+    where `out` exists or cannot be made, ConfigError for a scene that cannot be loaded.
     """
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))

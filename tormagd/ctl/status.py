@@ -36,8 +36,12 @@ LINK_COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronis
 
 
 def status(client: Client) -> Outcome:
-    """Report what the daemon is doing; the outcome is FAULT while the device is in FAULT. Raises as
-    `Client.request`."""
+    """Ask for the daemon's status, and return it as result and as text; the outcome is FAULT while the device is in
+    FAULT.
+
+    The result has the daemon's own keys, those of a Status and others that it may know. Raises as `Client.request`, and
+    UnreachableError for an answer that is no status.
+    """
     result = client.request("status")
     known = understood(result, Status)
     code = Exit.FAULT if known.operating_state == "FAULT" else Exit.DONE
@@ -45,7 +49,10 @@ def status(client: Client) -> Outcome:
 
 
 def status_text(known: Status, colour: Colour) -> str:
-    """Return a status as lines of text, the most important first; an unknown value shows as `-`."""
+    """Return a status as labelled lines of text, the most important first; an unknown value shows as `-`.
+
+    Lines on what is not there, as faults or sources, are left out. Lines are not wrapped.
+    """
     state = known.operating_state
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
     is_running = known.link.state == "RUNNING"
@@ -90,8 +97,10 @@ def status_text(known: Status, colour: Colour) -> str:
 
 
 def _peers(peers: PeersReport, colour: Colour) -> list[str]:
-    """Return lines on peers that were refused or sent too much: counts, newest refusal, worst sender; empty for
-    none."""
+    """Return lines on peers that were refused or sent too much: both counts, the newest refusal, the worst sender.
+
+    Empty where nobody was.
+    """
     return [
         *_said("peers     ", peers.refused and f"{peers.refused} refused", colour.yellow),
         *_said("peers     ", peers.dropped and f"{peers.dropped} messages not read", colour.yellow),
@@ -103,9 +112,10 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 
 
 def _device(known: Status, colour: Colour) -> list[str]:
-    """Return lines on what the device has shown of itself, and why a kept profile is not used.
+    """Return lines on what the device has shown of itself: scale, offset, sensor's zero, each with its deviation.
 
-    They also tell how long ago that was kept, the other beliefs that act, and the calibration in force.
+    They also tell the age of the kept profile and why it is not used, other beliefs that act, and the calibration or
+    its refusal. What there is not, is left out.
     """
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
@@ -128,7 +138,7 @@ def _long_ago(known: Status) -> str:
 
 
 def played(report: PlayoutReport | None) -> str:
-    """Say what the playout adds and takes out, and how many setpoints came too late for it; empty for None."""
+    """Say what the playout adds and takes out, ms, and how many setpoints came too late for it; empty for None."""
     if report is None:
         return ""
     return (
@@ -150,7 +160,10 @@ def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
 
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
-    """Return the beliefs that act, except those named in `but`, in one line: value, deviation and unit of each."""
+    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and unit of each.
+
+    Empty where none acts. A deviation that is not known is left out.
+    """
     return ", ".join(
         f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
         for name, it in belief.items()
@@ -176,9 +189,11 @@ def _counts(report: LinkReport | SetpointReport, names: tuple[str, ...]) -> str:
 
 
 def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
-    """Return lines on one source: state, delay, jitter, losses, clock, restarts, and cause and remedy of what is wrong.
+    """Return lines on the source `name`: state, delay, jitter, losses, clock, restarts, then cause and remedy of what
+    is wrong.
 
-    The clock's drift is shown after SURE_WINDOWS.
+    The clock's drift is shown once it is fitted over SURE_WINDOWS, restarts where there are any. A state without words
+    of its own is shown as it is.
     """
     paint = {"holds": colour.green, "refused": colour.yellow}.get(source.state, str)
     delay, behind = source.delay_us, source.clock_behind_ms
@@ -200,9 +215,9 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
 
 
 def _way(way: WayReport | None, colour: Colour) -> list[str]:
-    """Return lines on the delay from a setpoint's stamp to its force, part by part; empty before the first setpoint.
+    """Return lines on the delay from a setpoint's stamp to its force, part by part, against its budget.
 
-    Over its budget, a line names the part that takes most.
+    Empty for None, and before the first setpoint. Over the budget, a second line names the part that takes most.
     """
     if way is None or way.to_duty_us.max == 0.0:
         return []
@@ -226,7 +241,10 @@ def _way(way: WayReport | None, colour: Colour) -> list[str]:
 
 
 def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:
-    """Return a line for each code, followed by lines on its cause and remedy where they are known."""
+    """Return a line for each of `codes`, with `label` before it, followed by its cause and its remedy from `details`.
+
+    A code without details has its line alone. `paint` colours the codes.
+    """
     known = {explained.code: explained for explained in details}
     unknown = Explained("", "", "")
     told = ((code, known.get(code, unknown)) for code in codes)
@@ -245,7 +263,10 @@ def _said(label: str, text: str | int | None, paint: Callable[[str], str]) -> li
 
 
 def _rate(name: str, group: RateReport, colour: Colour) -> str:
-    """Return a line on how a loop keeps its rate: its grade, lateness and counts of late runs."""
+    """Return a line on how the loop `name` keeps its rate: its grade, Hz, lateness, us, and counts of late runs.
+
+    A grade of warning or error is coloured.
+    """
     paint = {"warning": colour.yellow, "error": colour.red}.get(group.grade, str)
     lateness = group.lateness_us
     return (
@@ -268,7 +289,10 @@ def firmware(client: Client) -> Outcome:
 
 
 def firmware_text(link: LinkReport, colour: Colour) -> str:
-    """Return the link's report as a dozen lines; an unknown value shows as `-`."""
+    """Return the link's report as some ten labelled lines; an unknown value shows as `-`, or "not known yet".
+
+    They tell of the link, firmware and device, schema, losses, counts of what was received and refused, and timing.
+    """
     paint = colour.green if link.state == "RUNNING" else colour.yellow
     last = f", the last: {link.last_loss}" if link.last_loss else ""
     ours, theirs = link.daemon_schema, link.firmware_schema
@@ -302,10 +326,10 @@ def _round_trip(known: RoundTripReport | None) -> str:
 
 
 def _quality(link: LinkReport) -> str:
-    """Say what share of Drives was unanswered and of frames damaged in the last second; "not known yet" where either is
-    None.
+    """Say what share of Drives was unanswered and of frames damaged in the last second, and how many messages found the
+    wire full.
 
-    Also tells how many messages found the wire full.
+    "not known yet" where either share is None.
     """
     if link.unanswered_share is None or link.damaged_share is None:
         return "not known yet"
@@ -316,7 +340,10 @@ def _quality(link: LinkReport) -> str:
 
 
 def _clock(known: ClockReport | None) -> str:
-    """Say how the device's clock fits the host's; for None, that a fit takes some seconds."""
+    """Say how the device's clock fits the host's: drift, ppm, offset, s, and how far the fit is off, us.
+
+    For None says that a fit takes some seconds.
+    """
     if known is None:
         return "not known yet: a fit takes some seconds"
     return (

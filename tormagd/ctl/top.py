@@ -30,8 +30,8 @@ KEPT = 1_000
 def top(client: Client) -> Outcome:
     """Draw the daemon's state until `q`, Ctrl-C or SIGTERM; the terminal is restored then.
 
-    The outcome has the `seconds`. The end of input counts as `q`. Raises CommandError (USAGE) without a terminal to
-    draw on, and as `Client.status` and `Watcher.look`.
+    The result has the `seconds` that it took. The end of input counts as `q`; other keys do nothing. Raises
+    CommandError (USAGE) without a terminal to draw on, and as `Client.status` and `Watcher.look`.
     """
     console = Console(highlight=False)
     if not (is_terminal(sys.stdin) and console.is_terminal) or console.is_dumb_terminal:
@@ -68,9 +68,10 @@ class Watcher:
         self._ask_s = self._heard_s = time.monotonic()
 
     def look(self) -> Seen:
-        """Take what has arrived and return what is known by now; asks for the status now and then.
+        """Take what has arrived and return what is known by now, without waiting; asks for the status now and then.
 
-        Raises as `Client.answer`, and UnreachableError for a message that is no telemetry.
+        The telemetry returned goes on growing. A silent daemon raises nothing: `silent_s` grows. Raises as
+        `Client.answer`, and UnreachableError for a message that is no telemetry.
         """
         now_s = time.monotonic()
         try:
@@ -85,11 +86,12 @@ class Watcher:
         return Seen(self._telemetry, self._status, self._explained, now_s - self._heard_s)
 
     def _ask(self, now_s: float, codes: set[str]) -> None:
-        """Take the answer to the last request, and ask again after ASK_S, or for a code not explained yet.
+        """Take the answer to the last request, if it has come, and ask again after ASK_S, or for a code not explained
+        yet.
 
-        A request not answered by then is given up; for a code, none may be under way. Called only while the daemon is
-        heard: requests to a silent one would pile up. Raises as `Client.answer`, and UnreachableError for a result that
-        is no status.
+        `now_s` is by the monotonic clock, `codes` are those in the newest snapshot. A request not answered by then is
+        given up; for a code, none may be under way. Called only while the daemon is heard: requests to a silent one
+        would pile up. Raises as `Client.answer`, and UnreachableError for a result that is no status.
         """
         result = None if self._asked is None else self._client.answer(self._asked)
         if result is not None:

@@ -67,7 +67,8 @@ CURVES = (
 def screen(seen: Seen, width: int, height: int) -> RenderableType:
     """Return the whole screen: state, curves, loops and link, then faults and limits with remedies.
 
-    `width` and `height` are in characters. What stands last is cut where there is no room: then loops and link do.
+    `width` and `height` are in characters. What is too high is not cut here: then loops and link come last, and the
+    terminal cuts them. `seen` may be without telemetry.
     """
     more = max(height - STANDARD_ROWS, 0) // len(CURVES)
     wide = width - 2
@@ -85,7 +86,8 @@ def _below_each_other(*parts: RenderableType) -> RenderableType:
 def _head(seen: Seen, width: int) -> Text:
     """Return the first line: state, whether homed and busy, the force as torque in mNm, scene, uptime and version.
 
-    Over SILENT_S it says, too, how long nothing was heard.
+    State and force are of the newest telemetry, or the status without any. Over SILENT_S it says, too, how long nothing
+    was heard. Longer text than `width` is cut.
     """
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state, is_silent = printable(newest.operating_state), seen.silent_s > SILENT_S
@@ -112,9 +114,11 @@ def _head(seen: Seen, width: int) -> Text:
 
 
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
-    """Return a row for each curve: name, newest value, sparkline of `rows` lines, and the ends of its scale.
+    """Return a row for each of CURVES: name, newest value, sparkline of `rows` lines, and the ends of its scale.
 
-    Curves of one scale share its ends, which are left out below NARROW. `is_apart` puts an empty row between curves.
+    A character stands for COLUMN_NS, the newest at the right; `width` says how many there are. Curves of one scale
+    share its ends, which are left out below NARROW. A value that is not known is a dash, and a blank in the line.
+    `is_apart` puts an empty row between curves.
     """
     ends_wide = ENDS if width >= NARROW else 0
     count = max(width - LABEL - VALUE - ends_wide - 3, 8)
@@ -154,7 +158,10 @@ def _grid(*widths: int, is_cut: bool = True) -> Table:
 
 
 def _timing(status: Status, width: int) -> Table:
-    """Return rows on how loops keep time, the link, who publishes, what the kernel refused, following and belief."""
+    """Return rows on how loops keep time, the link, setpoints, playout, what the kernel refused, following and belief.
+
+    Loops that the status does not have, and what there is nothing to say of, have no row.
+    """
     table = _grid(LABEL, width - LABEL - 1)
     for name in ("control", "inference", "search"):
         group = status.rates.get(name)
@@ -191,7 +198,8 @@ def _codes(seen: Seen, width: int) -> Table:
     """Return rows of faults, then of limits that held in the telemetry kept, the longest first, each with cause and
     remedy.
 
-    A limit that does not hold now is dim. Without any, one row says so.
+    A limit has its share of that time; one that does not hold now is dim. A code that is not explained stands alone.
+    Without any, one row says so.
     """
     newest = seen.telemetry[-1] if seen.telemetry else seen.status
     times = Counter(code for each in seen.telemetry for code in each.limits)
@@ -221,10 +229,12 @@ def columns(
     period_ns: int,
     of_column: Callable[[list[float]], float],
 ) -> list[float | None]:
-    """Return the newest `count` periods, the oldest first: `of_column` of each period's values, None where it has none.
+    """Return a value for each of the newest `count` periods, the oldest first: `of_column` of what fell into it, else
+    None.
 
-    None and values not finite are left out. Periods are aligned to the clock, so that a column keeps its value while
-    the picture moves on.
+    `times_ns` rise, and have a value each; the last one is in the last period. None and values not finite are left out.
+    Periods are aligned to the clock, so that a column keeps its value while the picture moves on. All are None without
+    times.
     """
     if not times_ns:
         return [None] * count
@@ -238,9 +248,10 @@ def columns(
 
 
 def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
-    """Return the range of all known values, widened to `least` so that noise does not look like a signal.
+    """Return the least and the greatest known value, widened to `least` apart so that noise does not look like a
+    signal.
 
-    It is not widened below 0, and 0..least for none.
+    The middle stays, unless that would go below 0: then it is 0..`least`, as it is where no value is known.
     """
     known = [value for value in values if value is not None]
     if not known:
@@ -251,9 +262,10 @@ def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
 
 
 def sparkline(values: Sequence[float | None], low: float, high: float, rows: int) -> list[str]:
-    """Return `rows` lines of bars, the top line first: `low` is one eighth of a character, `high` all rows, None blank.
+    """Return `rows` lines of bars, the top line first, with a character for each value: `low` is one eighth of one,
+    `high` all rows.
 
-    Values outside are clipped; `high` must be above `low`.
+    None is blank. Values outside are clipped; `high` must be above `low`, which is not checked.
     """
     steps = len(EIGHTHS) - 1
     full = rows * steps

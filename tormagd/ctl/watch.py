@@ -37,8 +37,10 @@ class Fate(msgspec.Struct, frozen=True):
 
 
 def require_range(known: Description, least_N: float, most_N: float) -> None:
-    """Raise CommandError unless the daemon's scene allows these forces: REFUSED, or UNREACHABLE for another version's
-    scene."""
+    """Raise CommandError (REFUSED) unless the daemon's scene allows forces from `least_N` to `most_N`; else return.
+
+    The message names both ranges, N. UNREACHABLE is a scene without a range, as of another version.
+    """
     try:
         force = msgspec.convert(known.scene["force"], dict[str, Any])
         allowed = msgspec.convert((force["least_N"], force["most_N"]), tuple[float, float])
@@ -60,11 +62,12 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 
 
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
-    """Return why the setpoints of `source` are not rendered, as an error (REFUSED); None while they are.
+    """Return why the setpoints of `source` are not rendered, as an error (REFUSED) that the caller may raise; None
+    while they are.
 
     Reasons in this order: not ENABLED, nothing taken of the source, another holds the brake, its setpoints are stale, a
-    limit of SPOILING. With `is_over` only the first three count. Raises CommandError (FAULT) where the device is in
-    FAULT: then nothing more is to be sent.
+    limit of SPOILING. With `is_over`, after the last setpoint, only the first three count. Raises CommandError (FAULT)
+    where the device is in FAULT: then nothing more is to be sent.
     """
     require_no_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
@@ -120,9 +123,9 @@ class StatusWatch:
     def look(self) -> None:
         """Take a status that has arrived, or ask for one after LOOK_S, without waiting; call it between setpoints.
 
-        Says on stderr what newly keeps the force from being rendered. That spoils the sending once a force has been
-        rendered; before, it is waiting. Raises CommandError (FAULT) where the device is in FAULT, and as
-        `Client.answer`.
+        Says on stderr what newly keeps the force from being rendered. Once a force has been rendered, that spoils the
+        sending, as `finish` says; before, it is waiting. Raises CommandError (FAULT) where the device is in FAULT, and
+        as `Client.answer`. An answer that never comes raises nothing.
         """
         now_s = time.monotonic()
         if self._look_s is None:  # an answer may overtake the first setpoint
@@ -151,7 +154,7 @@ class StatusWatch:
 
         Call it once, after the last setpoint; those of the source before this watch do not count. Raises CommandError
         (REFUSED) where under MIN_TAKEN of them were taken, the force never came, or was held back later. Where no
-        `look` saw a status, only `held_back` is asked whether it came. Raises CommandError (FAULT) where the device is
+        `look` saw a status, the last one alone decides whether it came. Raises CommandError (FAULT) where the device is
         in FAULT, and as `Client.status`.
         """
         until_s = time.monotonic() + ARRIVAL_S

@@ -48,10 +48,10 @@ class Live:
         self._learn(status)
 
     async def run(self) -> None:
-        """Listen and publish without end; a daemon that is gone is waited for.
+        """Listen and publish to the browsers without end; a daemon that is gone is waited for.
 
         It ends by being cancelled. Any other error than those which a silent or odd daemon makes ends it, too, within
-        an ExceptionGroup.
+        an ExceptionGroup. The client stays open.
         """
         async with asyncio.TaskGroup() as tasks:
             for each in (self._listen(), self._tell(), self._ask()):
@@ -61,9 +61,9 @@ class Live:
     def browser(self) -> Iterator[asyncio.Queue[bytes]]:
         """Add a browser for this context, and give the queue of its events, each encoded as `event` does it.
 
-        The first events are the seconds kept so far, where there are any, the status, and what the device can render.
-        The queue takes WAITING events; of a browser that does not read the oldest are lost. At the end the browser is
-        removed.
+        Events are `frame`, `status`, `portrait` and `silence`. The first are the seconds kept so far, where there are
+        any, the status, and what the device can render. The queue takes WAITING events; of a browser that does not read
+        the oldest are lost. At the end the browser is removed. How many there may be is not checked.
         """
         events: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
         if self._kept:
@@ -79,7 +79,7 @@ class Live:
     async def _listen(self) -> None:
         """Keep each snapshot, and when it came, without end; after one that cannot be decoded listen anew.
 
-        That one is noted as the reason for silence.
+        That one is noted as the reason for silence, until the next good one.
         """
         while True:
             try:
@@ -91,8 +91,11 @@ class Live:
                 self._why_silent = f"what comes is not understood: {printable(str(error))}"
 
     async def _tell(self) -> None:
-        """Publish new snapshots every FRAME_S, without end; after SILENT_S without any, for how long nothing has been
-        heard, and why."""
+        """Publish new snapshots every FRAME_S as `frame`, without end.
+
+        After SILENT_S without any, publishes `silence`: for how many `seconds` nothing has been heard, and `why`, empty
+        where that is not known.
+        """
         while True:
             await asyncio.sleep(FRAME_S)
             silent_s = time.monotonic() - self._heard_s
@@ -103,9 +106,11 @@ class Live:
                 self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
 
     async def _ask(self) -> None:
-        """Ask for status every STATUS_S, and each PORTRAIT_EVERY-th time for the portrait, while the daemon is heard.
+        """Ask for the status every STATUS_S, and each PORTRAIT_EVERY-th time for the portrait, and publish them,
+        without end.
 
-        A client's error is passed over. Requests to a silent daemon would wait, and come at once.
+        A client's error is passed over. While nothing is heard, nothing is asked: requests would wait, and come at
+        once.
         """
         for number in itertools.count(1):
             await asyncio.sleep(STATUS_S)
@@ -119,7 +124,7 @@ class Live:
                         self._publish("portrait", self._portrait)
 
     def _publish(self, name: str, value: object) -> None:
-        """Queue an event for every browser; a full queue loses its oldest."""
+        """Queue an event for every browser, encoded once; a full queue loses its oldest. Raises as `event`."""
         data = event(name, value)
         for events in self.browsers:
             if events.full():
@@ -137,7 +142,8 @@ class Live:
     def _frame(self, snapshots: Sequence[Telemetry]) -> Frame:
         """Make a frame with curves of `snapshots`, and limits and latenesses of all that are kept.
 
-        State, faults and belief are those of the last of `snapshots`; the field is None outside DRIVEN.
+        `snapshots` must not be empty, the oldest first. State, faults and belief are those of the last; the field is
+        None outside DRIVEN. Shares of limits are of the snapshots kept.
         """
         newest, kept = snapshots[-1], self._kept
         times = Counter(code for each in kept for code in each.limits)

@@ -125,8 +125,8 @@ class Recorded:
         }
 
     def frame(self, at_s: float) -> Frame:
-        """Return the frame that ends at `at_s`, which is clamped to the recording; its curves have a point every
-        STEP_S.
+        """Return the frame of the SHOWN_S that end at `at_s`, which is clamped to the recording; its curves have a
+        point every STEP_S.
 
         The last point is at `at_s` itself. Curves come from the ticks, or the snapshots where ticks have no value; the
         field is None outside DRIVEN. The state is empty where no message is near. Keeps what was read for the next
@@ -165,8 +165,10 @@ class Recorded:
         )
 
     def _between(self, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-        """Return ticks and snapshots of at least this time; reads AHEAD_NS more on both sides and keeps them for the
-        next call."""
+        """Return ticks and snapshots of at least this time, ns since 1970, and often of more.
+
+        Reads AHEAD_NS more on both sides, and keeps them: a time within that is not read again. Raises as `moments`.
+        """
         if self._read is None or not self._read[0] <= from_ns < to_ns <= self._read[1]:
             span = from_ns - AHEAD_NS, to_ns + AHEAD_NS
             self._read = (*span, *moments(self._file, *span))
@@ -175,9 +177,9 @@ class Recorded:
     def _glance(self) -> dict[str, Any]:
         """Return the measured force over the whole length (else the asked one), and what came meanwhile; times in s.
 
-        Each stretch has its middle in `t_s` and its least and greatest force in `low_N` and `high_N`, None where not
-        known. All three are empty where no force is known. `limits` and `faults` are spans, from and to, without codes;
-        `marks` are times with their texts.
+        They count from the start. Each stretch has its middle in `t_s` and its least and greatest force in `low_N` and
+        `high_N`, None where not known. All three are empty where no force is known. `limits` and `faults` are spans,
+        from and to, without codes; `marks` are times with their texts.
         """
         overview = self._overview
         known = overview.series("measured_cf") or overview.series("setpoint_cf")
@@ -196,7 +198,7 @@ class Recorded:
 def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
     """Read the ticks and the snapshots from `from_ns` to `to_ns`, ns since 1970, both included; either may be empty.
 
-    Raises RecordingError where the file is damaged, or too many messages are in this time.
+    Raises RecordingError where the file cannot be read or is damaged, or too many messages are in this time.
     """
     seen, start_ns = file.between(from_ns, to_ns, Moment), file.overview.start_ns
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
@@ -218,9 +220,9 @@ def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
 
 
 def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
-    """Return the limits present from `from_s` to `at_s`, the largest share first; those in `now` are marked as present.
+    """Return the limits present from `from_s` up to `at_s`, s since the start, the largest share of that time first.
 
-    A message's limits hold until the next, for BREAK_S at most.
+    `now` has the codes that are present at the end. A message's limits hold until the next, for BREAK_S at most.
     """
     held_s: defaultdict[str, float] = defaultdict(float)
     steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)

@@ -25,7 +25,8 @@ MAX_TOLD = 20
 def report(of: Sequence[RecordingFile]) -> str:
     """Return one HTML page on these recordings, side by side, in their order; pictures are within it.
 
-    Raises ValueError for a recording without messages, also where its end cannot be read again.
+    How many there are is not checked. Raises ValueError for a recording without messages, and RecordingError, one too,
+    where its end cannot be read again.
     """
     names = [each.path.name for each in of]
     parts = [
@@ -63,7 +64,10 @@ def _succession(of: Sequence[RecordingFile]) -> list[str]:
 
 
 def _figures(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return the table's rows: for each recording its times, forces, counts, scene and device."""
+    """Return a table's rows: a name, and for each recording its times, forces, counts, scene and device, as text.
+
+    What a recording does not say is empty, or in words. Times are UTC.
+    """
 
     def known(each: RecordingFile) -> dict[str, str]:
         overview = each.overview
@@ -104,7 +108,12 @@ def _picture(of: RecordingFile) -> str:
 def _codes(
     of: Sequence[RecordingFile], kind: str, explained: Mapping[Any, Explanation], told: Callable[[Codes, float], str]
 ) -> str:
-    """Return a table of the codes of a kind: for each recording when or how long (`told`), then why, and what to do."""
+    """Return an HTML table of the codes of a kind, "limits" or "faults", that any of the recordings has.
+
+    A row has the code, then for each recording what `told` says of it, empty where it was not there. Then come why, and
+    what to do. `told` is given the code's spans and the recording's length, s. A code that is not `explained` has
+    neither.
+    """
     names = dict.fromkeys(code for each in of for code in each.overview.codes[kind])
     texts = {str(code): known for code, known in explained.items()}
     rows = []
@@ -129,7 +138,10 @@ def _moments(codes: Codes, _lasts_s: float) -> str:
 
 
 def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each mark, one recording after the other: seconds since its start, its text in its column."""
+    """Return a row for each mark, one recording after the other: when, and its text in that recording's column.
+
+    Seconds count from that recording's start.
+    """
     rows = []
     for place, each in enumerate(of):
         for mark in each.overview.marks:
@@ -140,7 +152,10 @@ def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
 
 
 def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each quantity that was believed and acted at a recording's end."""
+    """Return a row for each quantity that was believed and acted at any recording's end: its name, and a text for each.
+
+    Value, deviation and unit stand there; empty where it did not act. Reads the files again. Raises as `moments`.
+    """
     found = []
     for each in of:
         end_ns = each.overview.end_ns
