@@ -5,11 +5,12 @@ import importlib
 import io
 import json
 import math
+import os
 import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +33,7 @@ from tormagd_client.messages import (
     encode,
 )
 
+PATIENCE_S = 20.0
 COLUMNS = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "left_duty", "right_duty")
 
 
@@ -181,7 +183,7 @@ class FakeDaemon(threading.Thread):
         super().__init__(daemon=True)
         self.directory = directory
         self.control = f"ipc://{directory}/control"
-        self.at = ("--endpoint", self.control)
+        self.at = ("--endpoint", self.control, "--wait", "20")  # patient: the machine may be busy
         self.answers: dict[str, Callable[[], dict[str, Any]]] = {
             "status": lambda: {"ok": True, "result": status(setpoints=self.taken())},
             "describe": lambda: {"ok": True, "result": DESCRIPTION},
@@ -206,6 +208,14 @@ class FakeDaemon(threading.Thread):
         counts = Counter(setpoint.source for setpoint in self.setpoints)
         by_source = {name: SOURCE | {"accepted": count} for name, count in counts.items()}
         return status()["setpoints"] | {"by_source": by_source if self.taken_by_source else {}}
+
+    def arrived(self, count: int) -> list[Setpoint]:
+        """What it was sent, once that is so many."""
+        until_s = time.monotonic() + PATIENCE_S
+        while len(self.setpoints) < count:
+            assert time.monotonic() < until_s, f"{len(self.setpoints)} of {count} setpoints arrived"
+            time.sleep(0.01)
+        return self.setpoints
 
     def refuse(self, command: str, code: str) -> None:
         error = {"code": code, "message": f"cannot {command}", "hint": "do this first"}
@@ -290,6 +300,50 @@ def ctl(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
         return Ran(code, *capsys.readouterr())
 
     return run
+
+
+class Terminal(io.StringIO):
+    """A terminal, with what a person has typed."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+class Files:
+    """Files below `root`, which stands for a machine's own."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def write(self, texts: Mapping[str, str]) -> None:
+        """Each file's text, by its path."""
+        for path, text in texts.items():
+            (self.root / path).parent.mkdir(parents=True, exist_ok=True)
+            (self.root / path).write_text(text)
+
+    def process(self, number: int, name: str, *opened: str) -> None:
+        """A process of this name that has these paths open."""
+        self.write({f"proc/{number}/comm": f"{name}\n"})
+        (self.root / f"proc/{number}/fd").mkdir()
+        for descriptor, path in enumerate(opened):
+            (self.root / f"proc/{number}/fd/{descriptor}").symlink_to(path)
+
+    def inode(self, path: str) -> str:
+        """A file as the kernel's list of locks names it."""
+        status = (self.root / path).stat()
+        return f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Files:
+    """A machine without any file."""
+    return Files(tmp_path)
+
+
+@pytest.fixture
+def terminal() -> type[Terminal]:
+    """Makes a stream that is a terminal."""
+    return Terminal
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
-import json
-import os
 import resource
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -9,21 +8,14 @@ import pytest
 from firmware_protocol.build import COST, REMEDY, Build
 from tormagd.config import Config, Device, RealTime
 from tormagd.ctl import doctor as checks, headroom
-from tormagd.ctl.doctor import Severity, examine, judged
+from tormagd.ctl.doctor import Severity, judged
 from tormagd.ctl.machine import Machine
-from tormagd.ctl.main import main
 from tormagd_client.endpoints import Endpoints, in_folder
 
 LIMITS = """Limit                     Soft Limit           Hard Limit           Units
 Max locked memory         {memlock}            unlimited            bytes
 Max realtime priority     {rtprio}             {rtprio}
 """
-
-
-def write(root: Path, path: str, text: str) -> None:
-    file = root / path
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text)
 
 
 GOOD = {
@@ -42,24 +34,22 @@ GOOD = {
 
 
 @pytest.fixture
-def good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def good(machine: Any, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A machine on which nothing is to be wished for."""
     monkeypatch.setattr(checks, "settle", lambda: Build(True, ""))
-    for path, text in GOOD.items():
-        write(tmp_path, path, text)
-    (tmp_path / "dev/tormag").symlink_to("ttyUSB0")
-    (tmp_path / "run/tormag").mkdir(parents=True)
-    return tmp_path
+    machine.write(GOOD)
+    (machine.root / "dev/tormag").symlink_to("ttyUSB0")
+    (machine.root / "run/tormag").mkdir(parents=True)
+    return machine.root
 
 
 REALTIME = Config(realtime=RealTime(fifo_priority=50, lock_memory=True))
 
 
 def test_a_good_machine_has_nothing_to_remedy(good):
-    findings = examine(REALTIME, Machine(good))
-    assert [(f.name, f.found) for f in findings if f.verdict is not Severity.OK] == []
-    assert len({f.name for f in findings}) == len(checks.CHECKS)
-    assert judged(REALTIME, Machine(good)).exit_code == 0
+    outcome = judged(REALTIME, Machine(good))
+    assert [each for each in outcome.result["checks"] if each["verdict"] != "ok"] == []
+    assert (outcome.result["ok"], outcome.exit_code) == (len(checks.CHECKS), 0)
 
 
 PINNED = Config(realtime=RealTime(cpus=(1, 9)))
@@ -121,6 +111,7 @@ CASES = [
         "warn",
         "16 ms",
     ),
+    (checks.port, Config(), {}, "ok", "/dev/tormag (/dev/ttyUSB0)"),
     (checks.port, CAN, {}, "warn", "no network interface can0"),
     (checks.port, CAN, {"sys/class/net/can0/operstate": "up"}, "ok", "network interface can0"),
     (checks.run_directory, ELSEWHERE, {}, "fail", "/run/elsewhere does not exist"),
@@ -129,10 +120,9 @@ CASES = [
 
 
 @pytest.mark.parametrize(("check", "config", "files", "verdict", "found"), CASES)
-def test_each_trouble_is_found_and_has_a_remedy(good, check, config, files, verdict, found):
+def test_each_trouble_is_found_and_has_a_remedy(good, machine, check, config, files, verdict, found):
     """What the configuration does not ask for only warns, and capabilities stand for limits."""
-    for path, text in files.items():
-        write(good, path, text)
+    machine.write(files)
     finding = check(config, Machine(good))
     assert finding.verdict == verdict
     assert found in finding.found
@@ -157,9 +147,9 @@ def told(good, fake_daemon, status_with):
     return found
 
 
-def test_a_daemon_that_runs_says_itself_what_it_was_granted(good, told):
+def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
     """Whatever whoever calls is allowed: nothing that was refused is unlimited, and nothing that is set recommended."""
-    write(good, "proc/swaps", SWAPPING["proc/swaps"])
+    machine.write(SWAPPING)
     refused = told(REFUSED)
     assert [name for name, each in refused.items() if each["verdict"] == "fail"] == ["sched_fifo", "memlock"]
     assert (refused["sched_fifo"]["found"], "LimitRTPRIO=90" in refused["sched_fifo"]["remedy"]) == (
@@ -168,8 +158,7 @@ def test_a_daemon_that_runs_says_itself_what_it_was_granted(good, told):
     )
     assert (refused["swap"]["verdict"], "unlimited" in str(refused["memlock"]["found"])) == ("warn", False)
     assert not [each for each in refused.values() if each["remedy"].startswith("set realtime.")]
-    for path, text in NOTHING.items():  # what whoever calls may not do changes nothing
-        write(good, path, text)
+    machine.write(NOTHING)  # what whoever calls may not do changes nothing
     granted = told()
     assert {each["verdict"] for each in granted.values()} == {"ok"}
     assert (granted["daemon"]["found"], granted["sched_fifo"]["found"]) == (
@@ -219,37 +208,33 @@ def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_t
     )
 
 
-def test_port_missing_taken_or_not_ours(good):
+def test_a_port_that_is_not_there_is_missed(good):
     (good / "dev/ttyUSB0").unlink()
     assert "does not exist" in checks.port(Config(), Machine(good)).found
-    write(good, "dev/ttyUSB0", "")
-    assert checks.port(Config(), Machine(good)).found == "/dev/tormag (/dev/ttyUSB0)"
 
-    (good / "proc/4242/fd").mkdir(parents=True)
-    (good / "proc/4242/fd/3").symlink_to("/dev/ttyUSB0")
-    write(good, "proc/4242/comm", "minicom\n")
+
+@pytest.mark.parametrize(
+    ("name", "verdict", "found"),
+    [("minicom", "fail", "minicom (process 4242)"), ("tormagd", "ok", "tormagd (process 4242)")],
+)
+def test_only_another_program_takes_the_port_away(good, machine, name, verdict, found):
+    machine.process(4242, name, "/dev/ttyUSB0")
     finding = checks.port_holder(Config(), Machine(good))
-    assert (finding.verdict, finding.found) == (Severity.FAIL, "minicom (process 4242)")
-    write(good, "proc/4242/comm", "tormagd\n")
-    assert checks.port_holder(Config(), Machine(good)).verdict is Severity.OK
+    assert (finding.verdict, finding.found) == (verdict, found)
 
 
-def test_who_made_a_pseudo_terminal_is_not_its_holder(good):
+def test_who_made_a_pseudo_terminal_is_not_its_holder(good, machine):
     config = Config(device=Device(port="/dev/pts/3"))
-    write(good, "dev/pts/3", "")
-    (good / "proc/4242/fd").mkdir(parents=True)
-    (good / "proc/4242/fd/3").symlink_to("/dev/pts/3")
-    write(good, "proc/4242/comm", "python\n")
+    machine.write({"dev/pts/3": ""})
+    machine.process(4242, "python", "/dev/pts/3")
     assert checks.port_holder(config, Machine(good)).verdict is Severity.OK
-    status = (good / "dev/pts/3").stat()
-    inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
-    write(good, "proc/locks", f"1: FLOCK  ADVISORY  WRITE 4242 {inode} 0 EOF\n")
+    machine.write({"proc/locks": f"1: FLOCK  ADVISORY  WRITE 4242 {machine.inode('dev/pts/3')} 0 EOF\n"})
     assert checks.port_holder(config, Machine(good)).found == "python (process 4242)"
 
 
 def test_an_empty_root_is_examined_without_error(tmp_path):
-    assert all(finding.found for finding in examine(Config(), Machine(tmp_path)))
-    assert judged(Config(), Machine(tmp_path)).exit_code == 1
+    outcome = judged(Config(), Machine(tmp_path))
+    assert (all(each["found"] for each in outcome.result["checks"]), outcome.exit_code) == (True, 1)
 
 
 def test_this_machine_agrees_with_the_kernels_own_answers():
@@ -259,9 +244,8 @@ def test_this_machine_agrees_with_the_kernels_own_answers():
     assert machine.limit("Max realtime priority") == resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
 
 
-def test_json_counts_and_lines(capsys):
-    assert main(["--json", "doctor"]) in (0, 1)
-    result = json.loads(capsys.readouterr().out)["result"]
+def test_json_counts_and_lines(ctl):
+    result = ctl("--json", "doctor").result
     assert len(result["checks"]) == result["ok"] + result["warn"] + result["fail"] == len(checks.CHECKS) + 1
     assert set(result["checks"][0]) == {"name", "verdict", "found", "remedy"}
 
@@ -335,12 +319,14 @@ def test_each_trouble_that_was_measured_is_a_finding(good, found, name, verdict)
     assert judged(REALTIME, Machine(good), found).exit_code == (1 if verdict == "fail" else 0)
 
 
-def test_what_others_took_is_the_difference_of_two_looks(good):
-    write(good, "proc/stat", "cpu  100 0 0 800 0 0 0 100 0 0\ncpu0 1 2\n")
-    write(good, "proc/pressure/cpu", "some avg10=0.28 avg60=0.49 avg300=2.26 total=1000000\nfull avg10=0.0 total=7\n")
-    before = Machine(good).taken()
-    write(good, "proc/stat", "cpu  150 0 0 1700 0 0 0 150 30 30\ncpu0 1 2\n")
-    write(good, "proc/pressure/cpu", "some avg10=0.28 avg60=0.49 avg300=2.26 total=1500000\n")
-    assert headroom.shares(before, Machine(good).taken(), 5.0) == (pytest.approx(0.05), pytest.approx(0.1))
+def test_what_others_took_is_the_difference_of_two_looks(good, machine):
+    def look(counts, total_us):
+        pressure = f"some avg10=0.28 avg60=0.49 avg300=2.26 total={total_us}\nfull avg10=0.0 total=7\n"
+        machine.write({"proc/stat": f"cpu  {counts}\ncpu0 1 2\n", "proc/pressure/cpu": pressure})
+        return Machine(good).taken()
+
+    before = look("100 0 0 800 0 0 0 100 0 0", 1_000_000)
+    after = look("150 0 0 1700 0 0 0 150 30 30", 1_500_000)
+    assert headroom.shares(before, after, 5.0) == (pytest.approx(0.05), pytest.approx(0.1))
     (good / "proc/pressure/cpu").unlink()
     assert headroom.shares(before, Machine(good).taken(), 5.0)[1] is None

@@ -23,22 +23,12 @@ ON_BOARD = SimpleNamespace(device="/dev/ttyS0", description="n/a", vid=None, pid
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(machine: Any) -> Path:
     """Two ports, /dev/tormag leading to the one with a chip of its own."""
     timer = "sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
-    for path, text in (("dev/ttyUSB0", ""), ("dev/ttyS0", ""), (timer, "16\n"), ("proc/locks", "")):
-        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / path).write_text(text)
-    (tmp_path / "dev/tormag").symlink_to("ttyUSB0")
-    return tmp_path
-
-
-def process(root: Path, number: int, name: str, *opened: str) -> None:
-    folder = root / "proc" / str(number)
-    (folder / "fd").mkdir(parents=True)
-    (folder / "comm").write_text(name + "\n")
-    for descriptor, path in enumerate(opened):
-        (folder / "fd" / str(descriptor)).symlink_to(path)
+    machine.write({"dev/ttyUSB0": "", "dev/ttyS0": "", timer: "16\n", "proc/locks": ""})
+    (machine.root / "dev/tormag").symlink_to("ttyUSB0")
+    return machine.root
 
 
 def test_the_configured_port_is_known_by_where_its_name_leads(root: Path) -> None:
@@ -48,11 +38,10 @@ def test_the_configured_port_is_known_by_where_its_name_leads(root: Path) -> Non
     assert (board.is_configured, board.usb_id, board.latency_ms) == (False, None, None)
 
 
-def test_open_files_and_locks_name_the_holders(root: Path) -> None:
-    process(root, 4242, "minicom", "/dev/null", "/dev/ttyUSB0")
-    process(root, 77, "tormagd")  # of another user: its lock is seen, its files are not
-    status = (root / "dev/ttyUSB0").stat()
-    inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+def test_open_files_and_locks_name_the_holders(root: Path, machine: Any) -> None:
+    machine.process(4242, "minicom", "/dev/null", "/dev/ttyUSB0")
+    machine.process(77, "tormagd")  # of another user: its lock is seen, its files are not
+    inode = machine.inode("dev/ttyUSB0")
     (root / "proc/locks").write_text(
         f"1: FLOCK  ADVISORY  WRITE 77 {inode} 0 EOF\n2: POSIX  ADVISORY  WRITE 4242 {inode} 0 EOF\n3: strange\n"
     )
@@ -60,9 +49,8 @@ def test_open_files_and_locks_name_the_holders(root: Path) -> None:
     assert chip.holders == (Holder(77, "tormagd", True), Holder(4242, "minicom", False))
 
 
-def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root: Path) -> None:
-    (root / "dev/pts").mkdir()
-    (root / "dev/pts/3").write_text("")
+def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root: Path, machine: Any) -> None:
+    machine.write({"dev/pts/3": ""})
     (root / "dev/tormag").unlink()
     (root / "dev/tormag").symlink_to("pts/3")
     (entry,) = survey(Config(), Machine(root), [], []).serial
@@ -71,19 +59,16 @@ def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root:
     assert survey(Config(), Machine(root), [], []).serial == ()
 
 
-def test_can_channels_say_whether_they_are_up(root: Path) -> None:
-    for name, state in (("can0", "up"), ("can1", "down")):
-        (root / f"sys/class/net/{name}").mkdir(parents=True)
-        (root / f"sys/class/net/{name}/operstate").write_text(state)
+def test_can_channels_say_whether_they_are_up(root: Path, machine: Any) -> None:
+    machine.write({f"sys/class/net/{name}/operstate": state for name, state in (("can0", "up"), ("can1", "down"))})
     channels = (("socketcan", "can0"), ("socketcan", "can1"), ("udp_multicast", "239.74.163.2"))
     detected = [{"interface": interface, "channel": channel} for interface, channel in channels]
     found = survey(Config(device=Device(port="can0")), Machine(root), [], detected).can
     assert [(each.channel, each.is_up) for each in found] == [("can0", True), ("can1", False), ("239.74.163.2", None)]
 
 
-def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(root: Path) -> None:
-    (root / "tmp").mkdir()
-    (root / "tmp/can").write_text("")
+def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(root: Path, machine: Any) -> None:
+    machine.write({"tmp/can": ""})
     device = Device(backend="can", port="/tmp/can", options={"interface": "tormagsim"})
     other = {"interface": "tormagsim", "channel": "/tmp/tormagsim-1/can"}
     for detected in ([other], [other, {"interface": "tormagsim", "channel": "/tmp/can"}]):
@@ -95,10 +80,9 @@ def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(ro
         ]
 
 
-def test_the_text_says_what_it_cannot_see(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    process(root, 4242, "minicom", "/dev/ttyUSB0")
-    process(root, 5, "secret")
-    (root / "proc/5/fd").rmdir()
+def test_the_text_says_what_it_cannot_see(root: Path, machine: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine.process(4242, "minicom", "/dev/ttyUSB0")
+    machine.process(5, "secret")
     listing, of_another = Path.iterdir, Mock(side_effect=PermissionError)
     monkeypatch.setattr(Path, "iterdir", lambda path: of_another() if path == root / "proc/5/fd" else listing(path))
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [FTDI])

@@ -4,7 +4,6 @@ Only forces are asked for, so every limit of the daemon stays in force. They are
 ramps show friction, fast ones the speed term, jumps the inertia.
 """
 
-import csv
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -88,12 +87,9 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
             columns = run.play(waveform)
     log = motor_log(columns, side)
     rows = len(log["t_s"])
-    with path.open("x", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(LOG_COLUMNS)
-        writer.writerows(
-            [f"{value:.6f}" for value in row] for row in zip(*(log[name] for name in LOG_COLUMNS), strict=True)
-        )
+    with path.open("x", encoding="utf-8") as file:
+        table = np.column_stack([log[name] for name in LOG_COLUMNS])
+        np.savetxt(file, table, "%.6f", ",", header=",".join(LOG_COLUMNS), comments="")
     result = {"file": str(path), "side": side, "rows": rows, "seconds": round(float(log["t_s"][-1]), 3)}
     text = f"{path}: {rows} rows of the {side} carriage. next: tormag-lab identify-motor {path}"
     return Outcome(result, text)

@@ -80,10 +80,10 @@ def commission(
         if serial_number is None:
             raise CommandError(Exit.REFUSED, "no_device", "no device is connected", "tormagctl firmware says why")
         path = folder / f"{serial_number:08x}.json"
-        before = _read(path)
-        if is_resumed and before is None:
-            raise usage_error(f"{path}: there is nothing to resume", "leave --resume out")
-        if is_resumed and before:
+        before = _decoded(path, Report, "it is no report: move it away") if path.exists() else None
+        if is_resumed:
+            if before is None:
+                raise usage_error(f"{path}: there is nothing to resume", "leave --resume out")
             if before.motor != config.motor:  # a calibration came into force: what was found is of another motor
                 raise usage_error(f"{path}: [motor] has changed since, in the daemon", "leave --resume out")
             report = before.resumed(weight_N)
@@ -107,7 +107,10 @@ def commission(
 
 
 class Kept:
-    """A report that is written to its file, with the page beside it, after each step."""
+    """A report that is written to its file, with the page beside it, after each step.
+
+    `report` is the report so far.
+    """
 
     def __init__(self, path: Path, report: Report) -> None:
         """Begin with `report`, and write it. Raises CommandError (USAGE) where it cannot be written."""
@@ -151,11 +154,6 @@ class Kept:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with in_place_of(self._path.with_suffix(suffix)) as beside:
                 beside.write_text(text, encoding="utf-8")
-
-
-def _read(path: Path) -> Report | None:
-    """Read a report; None where there is none. Raises CommandError (USAGE) for a file that is no report."""
-    return _decoded(path, Report, "it is no report: move it away") if path.exists() else None
 
 
 def _failed_checks(path: Path) -> list[tuple[str, str, str]]:

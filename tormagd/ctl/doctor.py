@@ -85,8 +85,7 @@ def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_
 
     Judges the configuration of the daemon that answers within `wait_s`, else `config`, read from `config_file`; None
     means the defaults. A daemon that cannot be asked is a warning. The result is as of `judged`. The outcome is REFUSED
-    where a check failed. Measuring takes six seconds of both processors' time. Raises CommandError (REFUSED) where it
-    fails.
+    where a check failed. Measuring takes some six seconds. Raises CommandError (REFUSED) where it fails.
     """
     machine = Machine(Path("/"))
     known: Running | ClientError = running(endpoints, wait_s)
@@ -127,7 +126,10 @@ def judged(
     if isinstance(known, Running):
         findings = (*of_daemon(known), *(check(_in_force(known), machine) for check in OF_MACHINE))
     else:
-        findings = (*nobody(known), *examine(config, machine))
+        findings = tuple(check(config, machine) for check in CHECKS)
+    if isinstance(known, ClientError):
+        unasked = f"none was asked ({known.message}); what it would be granted is judged by who calls this"
+        findings = (Finding("daemon", Severity.WARN, unasked, known.hint), *findings)
     if found is not None:
         findings += examine_headroom(config, found)
     count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Severity}
@@ -146,19 +148,6 @@ def judged(
 def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Severity = Severity.WARN) -> Finding:
     """Return an OK finding without a remedy, or one with `remedy` and the verdict `otherwise`."""
     return Finding(name, Severity.OK, found) if is_good else Finding(name, otherwise, found, remedy)
-
-
-def examine(config: Config, machine: Machine) -> tuple[Finding, ...]:
-    """Run every check, and return the findings in the order of the report."""
-    return tuple(check(config, machine) for check in CHECKS)
-
-
-def nobody(why: ClientError | None) -> tuple[Finding, ...]:
-    """Return a warning that no daemon could be asked, and why; empty for None."""
-    if why is None:
-        return ()
-    found = f"none was asked ({why.message}); what it would be granted is judged by who calls this"
-    return (Finding("daemon", Severity.WARN, found, why.hint),)
 
 
 def of_daemon(known: Running) -> tuple[Finding, ...]:

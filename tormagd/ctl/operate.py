@@ -144,8 +144,8 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     """Home both carriages, and with `is_waiting` wait until they are homed, showing progress on a terminal.
 
     The result has `operating_state` and `is_connected`, and after waiting the `seconds`. Raises CommandError (FAULT)
-    where the device is in FAULT meanwhile. REFUSED is a homing that does not begin within BEGIN_S, leaves the device
-    not homed, or takes over `timeout_s`; then it goes on. Raises as `Client.request`.
+    where the device is in FAULT meanwhile. REFUSED is a homing that does not begin within BEGIN_S, or leaves the device
+    not homed. REFUSED is also one that takes over `timeout_s`; it goes on. Raises as `Client.request`.
     """
     was_homed = client.status().is_homed
     result = client.request("home")

@@ -54,9 +54,9 @@ def key_of(config: Config) -> bytes:
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
     """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder.
 
-    What the daemon runs is asked and written first, and again at the end: its device may have been connected meanwhile.
-    The result is as of `_record`. The outcome is REFUSED where ticks were lost, UNREACHABLE where the daemon was gone
-    at the end.
+    `path` is a new file that ends in .mcap, or a folder that is there. What the daemon runs is asked and written first,
+    and again at the end: its device may have been connected meanwhile. The result is as of `_record`. The outcome is
+    REFUSED where ticks were lost, UNREACHABLE where the daemon was gone at the end.
 
     Raises CommandError (USAGE) where the folder is missing, where the file exists or cannot be made, and as `key_of`.
     UNREACHABLE is a daemon that publishes nothing within `wait_s`, or does not answer: then there is no file. REFUSED
@@ -118,13 +118,11 @@ def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_inter
 
     Nothing is received here. Looks once even for a `wait_s` of 0.
     """
-    poller = zmq.Poller()
-    for socket in sockets:
-        poller.register(socket, zmq.POLLIN)
     end_s = time.monotonic() + wait_s
-    while not (ready := poller.poll(POLL_MS)) and time.monotonic() < end_s and not is_interrupted():
-        pass
-    return bool(ready)
+    while True:
+        ready, _, _ = zmq.select(list(sockets), [], [], POLL_MS / 1e3)
+        if ready or time.monotonic() >= end_s or is_interrupted():
+            return bool(ready)
 
 
 def _record(

@@ -39,7 +39,7 @@ def report(config: Config, sources: list[Path], target: Path) -> Outcome:
 
     The result has `file`, and the `seals`' states by path. The outcome is REFUSED where one was altered, or could not
     be checked with the configured key; the page is written all the same. Raises CommandError (USAGE) for more than two,
-    one that cannot be read or is empty, or a page that cannot be written.
+    and one that cannot be read or is empty. It also does where the page cannot be written, as without its folder.
     """
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"

@@ -218,9 +218,11 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
 
 
 def _from_answers(name: str) -> Tables:
-    """Ask a person on stderr for each value of a scene, each with a proposal, and return its tables, without an insert.
+    """Ask a person on stderr for each value of the scene `name`, each with a proposal, and return its tables, without
+    an insert.
 
-    Values are not checked here. Raises CommandError (USAGE) where stdin is no terminal, or ends.
+    A number is asked for until it is one; that it is allowed is not checked here. Raises CommandError (USAGE) where
+    stdin is no terminal, or ends.
     """
     if not is_terminal(sys.stdin):
         raise usage_error(

@@ -99,7 +99,8 @@ def status_text(known: Status, colour: Colour) -> str:
 def _peers(peers: PeersReport, colour: Colour) -> list[str]:
     """Return lines on peers that were refused or sent too much: both counts, the newest refusal, the worst sender.
 
-    Empty where nobody was.
+    Of these two a line tells endpoint, address, key, reason and how often. Empty where nobody was refused, and nothing
+    dropped.
     """
     return [
         *_said("peers     ", peers.refused and f"{peers.refused} refused", colour.yellow),
@@ -245,12 +246,8 @@ def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint
 
     A code without details has its line alone. `paint` colours the codes.
     """
-    known = {explained.code: explained for explained in details}
-    unknown = Explained("", "", "")
-    told = ((code, known.get(code, unknown)) for code in codes)
-    return [
-        line for code, why in told for line in (f"{label:<9} {paint(code)}", *_explained(why.cause, why.remedy, str))
-    ]
+    why = {each.code: _explained(each.cause, each.remedy, str) for each in details}
+    return [line for code in codes for line in (f"{label:<9} {paint(code)}", *why.get(code, ()))]
 
 
 def _explained(cause: str, remedy: str, paint: Callable[[str], str]) -> list[str]:
@@ -329,7 +326,7 @@ def _quality(link: LinkReport) -> str:
     """Say what share of Drives was unanswered and of frames damaged in the last second, and how many messages found the
     wire full.
 
-    "not known yet" where either share is None.
+    "not known yet" where either share is None; a count that is None shows as `-`.
     """
     if link.unanswered_share is None or link.damaged_share is None:
         return "not known yet"
@@ -340,7 +337,8 @@ def _quality(link: LinkReport) -> str:
 
 
 def _clock(known: ClockReport | None) -> str:
-    """Say how the device's clock fits the host's: drift, ppm, offset, s, and how far the fit is off, us.
+    """Say how the device's clock fits the host's: drift, ppm, offset, s, how far the fit is off, us, and over how many
+    windows.
 
     For None says that a fit takes some seconds.
     """

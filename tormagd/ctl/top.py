@@ -70,8 +70,8 @@ class Watcher:
     def look(self) -> Seen:
         """Take what has arrived and return what is known by now, without waiting; asks for the status now and then.
 
-        The telemetry returned goes on growing. A silent daemon raises nothing: `silent_s` grows. Raises as
-        `Client.answer`, and UnreachableError for a message that is no telemetry.
+        The telemetry returned is the one that later calls add to. A silent daemon raises nothing: `silent_s` grows.
+        Raises as `Client.answer`, and UnreachableError for a message that is no telemetry.
         """
         now_s = time.monotonic()
         try:

@@ -195,11 +195,10 @@ def _timing(status: Status, width: int) -> Table:
 
 
 def _codes(seen: Seen, width: int) -> Table:
-    """Return rows of faults, then of limits that held in the telemetry kept, the longest first, each with cause and
-    remedy.
+    """Return rows of the newest faults, then of limits that held in the telemetry kept, the longest first.
 
-    A limit has its share of that time; one that does not hold now is dim. A code that is not explained stands alone.
-    Without any, one row says so.
+    Each has its cause and remedy, where they are known. A limit has its share of the snapshots; one that does not hold
+    now is dim. Without any, one row says so.
     """
     newest = seen.telemetry[-1] if seen.telemetry else seen.status
     times = Counter(code for each in seen.telemetry for code in each.limits)

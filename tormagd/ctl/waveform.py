@@ -47,10 +47,11 @@ def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
 
 
 def _lines(times_s: Sequence[float], forces_N: Sequence[float], *others: Sequence[float] | None) -> Waveform:
-    """Return straight lines between samples of force at `times_s`, of which the first counts as 0.
+    """Return straight lines between samples of force at `times_s`, s, which is to begin with 0.
 
     `others` are displacement, mm, and rate, mm/s, or fewer, each of as many values; None where there is none. Needs two
-    samples or more, at times that rise; that is not checked. Before the first and after the last, their values hold.
+    samples or more, at times that rise; nothing of this is checked. Before the first and after the last, their values
+    hold.
     """
 
     def at(t_s: float) -> Sample:

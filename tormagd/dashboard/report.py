@@ -64,9 +64,11 @@ def _succession(of: Sequence[RecordingFile]) -> list[str]:
 
 
 def _figures(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a table's rows: a name, and for each recording its times, forces, counts, scene and device, as text.
+    """Return a table's rows: a name, and a text for each recording.
 
-    What a recording does not say is empty, or in words. Times are UTC.
+    They are when it began, UTC, how long it lasts and was enabled, how well the force was followed and for how long.
+    Then come the ranges of forces, counts, scene, device and version. What a recording does not say is empty, or in
+    words.
     """
 
     def known(each: RecordingFile) -> dict[str, str]:
@@ -142,13 +144,11 @@ def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
 
     Seconds count from that recording's start.
     """
-    rows = []
-    for place, each in enumerate(of):
-        for mark in each.overview.marks:
-            cells = [""] * len(of)
-            cells[place] = mark.text
-            rows.append([f"{(mark.t_ns - each.overview.start_ns) * 1e-9:.2f} s", *cells])
-    return rows
+    return [
+        [f"{(mark.t_ns - each.overview.start_ns) * 1e-9:.2f} s", *(mark.text if it is each else "" for it in of)]
+        for each in of
+        for mark in each.overview.marks
+    ]
 
 
 def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:

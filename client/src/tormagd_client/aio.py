@@ -28,6 +28,7 @@ from tormagd_client.messages import (
 from tormagd_client.wire import (
     SUBSCRIBED,
     Connections,
+    Pending,
     Told,
     answered,
     arm_report,
@@ -119,7 +120,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
 
     async def _heard(self, topic: bytes, kind: type[Told]) -> AsyncIterator[Told]:
         """Subscribe to `topic` and yield its messages without an end. Raises MessageError."""
-        socket = self._listening(topic)
+        socket = self._socket(zmq.SUB, self._endpoints.telemetry, topic)
         while True:
             yield decode((await socket.recv_multipart())[-1], kind)
 
@@ -135,7 +136,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         """Send a command and return its result, one command at a time. Raises UnreachableError after `wait_s`, and as
         `answered`."""
         async with self._turn:
-            control, pending = self._socket(zmq.DEALER, self._endpoints.control), self._pending(command)
+            control, pending = self._socket(zmq.DEALER, self._endpoints.control), Pending(next(self._ids), command)
             try:
                 async with asyncio.timeout(wait_s):
                     await control.send(asked(pending, args))

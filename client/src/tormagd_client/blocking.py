@@ -59,7 +59,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
 
         To a daemon that cannot be reached nothing is sent: no answer comes then.
         """
-        pending = self._pending(command)
+        pending = Pending(next(self._ids), command)
         # a daemon that refused the key is no peer of the socket: sending would block for ever
         with contextlib.suppress(zmq.Again):
             self._socket(zmq.DEALER, self._endpoints.control).send(asked(pending, args), zmq.NOBLOCK)
@@ -153,7 +153,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
     def _arrived(self, topic: bytes, kind: type[Told], wait_s: float) -> list[Told]:
         """Return all messages of `topic` that have arrived, waiting up to `wait_s` for the first. Raises
         MessageError."""
-        socket = self._listening(topic)
+        socket = self._socket(zmq.SUB, self._endpoints.telemetry, topic)
         arrived: list[Told] = []
         while socket.poll(0 if arrived else round(wait_s * 1e3)):
             arrived.append(decode(socket.recv_multipart()[-1], kind))

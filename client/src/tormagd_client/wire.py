@@ -278,12 +278,6 @@ class Connections(Generic[SocketT]):
             self._sockets[kind, topic] = opened(self._context.socket(kind), address, self._keys, topic)
         return self._sockets[kind, topic]
 
-    def _listening(self, topic: bytes) -> SocketT:
-        return self._socket(zmq.SUB, self._endpoints.telemetry, topic)
-
-    def _pending(self, command: str) -> Pending:
-        return Pending(next(self._ids), command)
-
     def _unanswered(self, wait_s: float) -> UnreachableError:
         return unreachable(self._endpoints.control, f"no answer within {wait_s:g} s")
 
