@@ -20,7 +20,12 @@ class Tip:
         self.found, self.place_mm = ContactEstimator(), 0.0
         self._draw = random.Random(seed)
 
-    def go(self, to_mm: float) -> None:
+    def go(self, *places_mm: float) -> None:
+        """From place to place."""
+        for to_mm in places_mm:
+            self._go(to_mm)
+
+    def _go(self, to_mm: float) -> None:
         """At its speed; or, where it is there, a second of rest."""
         step_mm = SPEED_MM_S / HZ
         steps = round(abs(to_mm - self.place_mm) / step_mm)
@@ -47,9 +52,7 @@ def test_a_wall_is_known_once_it_was_touched_and_stays_known(stiffness_N_mm: flo
     tip = Tip(12.0, stiffness_N_mm, seed=seed)
     tip.go(12.0)
     assert tip.found.contact is None
-    tip.go(14.0)
-    tip.expect()
-    for to_mm in (14.0, 14.0, 2.0, 2.0, 11.0, 14.0):
+    for to_mm in (14.0, 14.0, 14.0, 2.0, 2.0, 11.0, 14.0):
         tip.go(to_mm)
         tip.expect()
 
@@ -58,27 +61,30 @@ def test_a_wall_is_known_once_it_was_touched_and_stays_known(stiffness_N_mm: flo
 @pytest.mark.parametrize("moves_mm", [-5.0, 5.0])
 def test_a_wall_that_has_moved_is_followed_within_a_second_of_touching_it_again(moves_mm: float, seed: int) -> None:
     tip = Tip(12.0, 0.5, seed=seed)
-    tip.go(15.0)
-    tip.go(0.0)
+    tip.go(15.0, 0.0)
     tip.wall_mm += moves_mm
-    tip.go(tip.wall_mm)
-    tip.go(tip.wall_mm + 0.5 * SPEED_MM_S)
+    tip.go(tip.wall_mm, tip.wall_mm + 0.5 * SPEED_MM_S)
     tip.expect()
 
 
-def test_between_the_walls_there_is_none_to_tell() -> None:
+@pytest.mark.parametrize(
+    ("before_mm", "wall_mm", "to_mm"),
+    [((15.0, 0.0), 20.0, 15.0), ((), 12.0, 12.6)],
+    ids=["between the walls", "what noise allows no word of"],
+)
+def test_where_there_is_no_wall_to_tell_none_is_told(
+    before_mm: tuple[float, ...], wall_mm: float, to_mm: float
+) -> None:
     tip = Tip(12.0, 0.5)
-    tip.go(15.0)
-    tip.go(0.0)
-    tip.wall_mm = 20.0
-    tip.go(15.0)
+    tip.go(*before_mm)
+    tip.wall_mm = wall_mm
+    tip.go(to_mm)
     assert tip.found.contact is None
 
 
 def test_another_stiffness_is_learned_too() -> None:
     tip = Tip(12.0, 0.5)
-    tip.go(16.0)
-    tip.go(8.0)
+    tip.go(16.0, 8.0)
     tip.stiffness_N_mm = 1.0
     tip.go(16.0)
     tip.expect()
@@ -93,17 +99,10 @@ def test_friction_alone_is_no_wall(friction_N: float) -> None:
     assert tip.found.friction_N == pytest.approx(friction_N, abs=0.02)
 
 
-def test_what_noise_allows_no_word_of_is_not_told() -> None:
-    tip = Tip(12.0, 0.5)
-    tip.go(12.6)
-    assert tip.found.contact is None
-
-
 def test_without_noise_it_is_the_wall() -> None:
     estimator = ContactEstimator()
     for step in range(2_000):
         place_mm = 0.01 * step
         estimator.update(place_mm, 0.2 + 0.8 * max(place_mm - 10.0, 0.0), 1.0)
-    contact = estimator.contact
-    assert isinstance(contact, Contact)
+    contact = estimator.contact or Contact(handle_mm=0.0, stiffness_N_mm=0.0)
     assert (contact.handle_mm, contact.stiffness_N_mm) == (pytest.approx(10.0, abs=0.1), pytest.approx(0.8, rel=0.02))

@@ -31,14 +31,10 @@ for name in tormagd_client.__all__:
 
 
 def imported(source: Path) -> set[str]:
-    found = set()
-    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-        match node:
-            case ast.Import(names=names):
-                found |= {each.name.partition(".")[0] for each in names}
-            case ast.ImportFrom(module=str(module)):
-                found.add(module.partition(".")[0])
-    return found
+    nodes = list(ast.walk(ast.parse(source.read_text(encoding="utf-8"))))
+    names = {each.name for node in nodes if isinstance(node, ast.Import) for each in node.names}
+    names |= {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
+    return {name.partition(".")[0] for name in names}
 
 
 def project(folder: Path) -> dict:

@@ -148,14 +148,8 @@ def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
     assert result["rerun"]["gaps"] <= box["dropped"]
 
 
-def client() -> str:
-    """The README's client."""
-    (script,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    return str(script)
-
-
 def test_the_client_in_the_readme_sees_the_force_follow(rig, tmp_path):
-    script = client()
+    (script,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     assert len(script.splitlines()) <= 18
     profile = tmp_path / "profile.csv"
     rows = [(k * 0.02, 0.6 + min(k * 0.01, 0.9)) for k in range(150)]

@@ -1,7 +1,7 @@
 """The ROS 2 example's translation, without ROS: CRTK's messages as anything that has their fields."""
 
-import importlib.util
 import math
+import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,10 +11,8 @@ import pytest
 from tormagd_client.messages import Motion, Setpoint, Telemetry, Tick, decode
 from tormagd_client.wire import Numbering
 
-PATH = Path(__file__).parents[2] / "examples" / "ros2" / "translation.py"
-spec = importlib.util.spec_from_file_location("translation", PATH)
-translation = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(translation)
+names = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "ros2" / "translation.py"))
+translation = SimpleNamespace(**names)
 
 STATE = Telemetry(
     v=1,

@@ -4,6 +4,7 @@ import runpy
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -18,18 +19,13 @@ def test_each_pair_is_offered_as_often_as_the_others_in_an_order_of_the_seed() -
 
 
 def test_what_is_told_counts_by_the_order_that_was_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    walls: list[float] = []
-
-    def offered(folder: str, wall_N_mm: float, number: int, say: object) -> bool:
-        walls.append(wall_N_mm)
-        return len(walls) <= 4
-
+    offered = Mock(side_effect=[True, True, True, True, False, False])
     rows: list[list[object]] = []
     monkeypatch.setitem(trials.run.__globals__, "offered", offered)
     answers = iter(["1", "neither", "1"])
     pairs = [(2.0, True), (1.5, False), (1.1, True)]  # of the last there is no wall
     told = trials.run("folder", rows.append, pairs, lambda question: next(answers))
-    assert walls[:4] == pytest.approx([0.6, 0.3, 0.3, 0.45])
+    assert [call.args[1] for call in offered.call_args_list[:4]] == pytest.approx([0.6, 0.3, 0.3, 0.45])
     assert (told[2.0], told[1.5], told[1.1]) == ([True], [False], [])
     assert rows == [[1, 2.0, 1, "1"], [2, 1.5, 2, "1"]]
 
