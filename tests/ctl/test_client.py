@@ -3,7 +3,8 @@
 import asyncio
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
+from functools import partialmethod
 from itertools import repeat
 from typing import Any
 from unittest.mock import Mock
@@ -31,17 +32,12 @@ class Blocking:
     def __getattr__(self, name: str) -> Callable[..., Any]:
         return lambda *arguments, **named: self._runner.run(getattr(self._client, name)(*arguments, **named))
 
-    def telemetry(self, wait_s: float) -> list[Any]:
-        return self._first(self._client.telemetry(), wait_s)
+    def _first(self, topic: str, wait_s: float) -> list[Any]:
+        return [self._runner.run(asyncio.wait_for(anext(getattr(self._client, topic)()), wait_s))]
 
-    def motions(self, wait_s: float) -> list[Any]:
-        return self._first(self._client.motions(), wait_s)
-
-    def verdicts(self, wait_s: float) -> list[Any]:
-        return self._first(self._client.verdicts(), wait_s)
-
-    def _first(self, heard: AsyncIterator[Any], wait_s: float) -> list[Any]:
-        return [self._runner.run(asyncio.wait_for(anext(heard), wait_s))]
+    telemetry = partialmethod(_first, "telemetry")
+    motions = partialmethod(_first, "motions")
+    verdicts = partialmethod(_first, "verdicts")
 
     def close(self) -> None:
         self._client.close()
@@ -176,10 +172,7 @@ def test_setpoints_are_numbered_stamped_and_checked(client, fake_daemon):
     with pytest.raises(ValueError, match=r"servo_cf = -1\.0: allowed is"):
         client.publish(-1.0)
     client.publish(1.7)
-    until_s = time.monotonic() + PATIENCE_S
-    while len(fake_daemon.setpoints) < 3 and time.monotonic() < until_s:
-        client.request("status")
-    first, second, third = fake_daemon.setpoints
+    first, second, third = fake_daemon.arrived(3)
     assert [(it.source, it.seq, it.servo_cf) for it in fake_daemon.setpoints] == [
         ("me", 0, 1.5),
         ("me", 1, 1.6),
@@ -209,10 +202,7 @@ def test_a_law_of_the_handles_way_is_published_as_a_contact_or_what_has_its_name
         client.publish(0.4, contact={"handle_mm": 12.0, "stiffness_N_mm": -1.0})
     with pytest.raises(ValueError, match=r"contact = \{'place': 12\.0\}: allowed are handle_mm"):
         client.publish(0.4, contact={"place": 12.0})
-    until_s = time.monotonic() + PATIENCE_S
-    while len(fake_daemon.setpoints) < 2 and time.monotonic() < until_s:
-        client.request("status")
-    first, second = fake_daemon.setpoints
+    first, second = fake_daemon.arrived(2)
     assert (first.withdraw_cf, first.contact, second.withdraw_cf) == (0.1, wall, None)
     assert second.contact == Contact(handle_mm=12.0, stiffness_N_mm=0.5, friction_N=0.1)
 

@@ -32,7 +32,7 @@ from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import in_folder
-from tormagd_client.messages import BeliefReport, Description, Status, encode
+from tormagd_client.messages import BeliefReport, Description, ProfileReport, Status, encode
 
 START_NS = 1_790_000_000_000_000_000
 PORTRAIT = {"force_N": [0.5, 1.0, 3.0], "rate_N_s": [1.0, 2.0, 8.0]}
@@ -125,15 +125,15 @@ async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
 
 
 async def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telemetry_with) -> None:
-    described: dict[str, Any] = {"version": "0", "build": "", "configuration": {}, "scene": {}, "model": ""}
-    described |= {"firmware": None, "profile": {"is_used": False, "age_s": None, "refusal": ""}, "serial_number": None}
-
+    profile = ProfileReport(is_used=False, age_s=None, refusal="")
+    unknown: dict[str, Any] = {"configuration": {}, "scene": {}, "firmware": None, "serial_number": None}
+    described = Description(version="0", build="", model="", profile=profile, **unknown)
     context = zmq.Context()
     publishes = context.socket(zmq.XPUB)
     publishes.setsockopt(zmq.XPUB_VERBOSE, 1)  # or only the first of them is told
     publishes.bind(f"ipc://{run_dir}/telemetry")
     async with AsyncClient(in_folder(str(run_dir)), 0.1) as client:
-        shown = Live(client, msgspec.convert(status_with(), Status), msgspec.convert(described, Description))
+        shown = Live(client, msgspec.convert(status_with(), Status), described)
         listening = asyncio.create_task(shown.run())
         async with served(shown) as asks:
             streams = [await asks.get("/live") for _ in range(10)]
@@ -295,12 +295,6 @@ class Page:
                     raise RuntimeError(f"{method}: {said['error']}")
                 return said["result"]
 
-    async def open(self, address: str) -> None:
-        """Goes to a page."""
-        for domain in ("Runtime", "Log", "Page"):
-            await self.tell(f"{domain}.enable")
-        await self.tell("Page.navigate", url=address)
-
     async def resize(self, width: int, height: int) -> None:
         """Gives the window another size."""
         await self.tell(
@@ -357,7 +351,9 @@ async def page_of(shown: Live | Recorded, tmp_path: Path, width: int, height: in
     """The page in a window of this size; it has complained of nothing in the end."""
     async with served(shown) as asks, browser(tmp_path) as page:
         await page.resize(width, height)
-        await page.open(str(asks.make_url("/")))
+        for domain in ("Runtime", "Log", "Page"):
+            await page.tell(f"{domain}.enable")
+        await page.tell("Page.navigate", url=str(asks.make_url("/")))
         yield page
         assert page.complaints == []
 

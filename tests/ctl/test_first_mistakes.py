@@ -3,6 +3,7 @@
 import json
 import shlex
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -23,6 +24,8 @@ tolerance_rms_N = 0.05
 name = "MRE-50-40"
 model = "cut.safetensors"
 """
+FORCES = {"f.csv": "t_s,force_N\n0,1\n1,1.2\n2,1.4\n"}
+NEW = "tormagctl scene new a.toml --force f.csv"
 OPEN = '[endpoints]\nsetpoint = "tcp://0.0.0.0:5555"\n'
 KEYED = OPEN + '[endpoints.curve]\nserver_secret = "server.key_secret"\n'
 CORONARY, BRAIN = (Path(scene_path(name)).read_text(encoding="utf-8") for name in ("coronary", "brain"))
@@ -72,6 +75,17 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl guide recovery", 2, "no such guide; did you mean `recover`?", {}),
     ("tormagctl calibrate", 2, "calibrate takes one of three things", {}),
     ("tormagctl calibrate --insert MRE-50-40 --rates 1", 2, "--rates: '1': allowed are 3..60 rates", {}),
+    ("tormagctl calibrate --out m", 2, "--motors", {}),
+    ("tormagctl calibrate --device --out m", 2, "--out is not for --device", {}),
+    ("tormagctl calibrate --device --motors --out m", 2, "--device", {}),
+    ("tormagctl calibrate --motors", 2, "--out is missing", {}),
+    ("tormagctl calibrate --insert A --motors --out m", 2, "--motors", {}),
+    ("tormagctl calibrate --motors --csv t --out m", 2, "--csv is for --insert alone", {}),
+    ("tormagctl calibrate --motors --law --out m", 2, "--law is for --insert alone", {}),
+    ("tormagctl calibrate --insert A --out there", 2, "--out there exists", {"there": "precious"}),
+    ("tormagctl calibrate --insert A --out none/m", 2, "none is not a directory", {}),
+    ("tormagctl calibrate --insert A --out m", 2, "--yes", {}),
+    ("tormagctl record nowhere", 2, "nowhere: no such folder", {}),
     ("tormagctl keys generate", 2, "the following arguments are required: DIR|FILE", {}),
     ("tormagctl keys show /nowhere/a.key", 2, "/nowhere/a.key", {}),
     ("tormagctl keys show a.key", 2, "a.key", {"a.key": "no key"}),
@@ -89,6 +103,14 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     (f"tormagctl scene show {'x' * 300}", 2, "File name too long", {}),
     ("tormagctl scene new", 2, "the file to write is missing", {}),
     ("tormagctl scene new a.toml", 2, "allowed is a new file in a folder that exists", {"a.toml": ""}),
+    (f"{NEW} --scale 0", 2, "has no range", FORCES),
+    (f"{NEW} --column torque_mNm", 2, "row 1 has no column torque_mNm", FORCES),
+    (f"{NEW} --offset -2", 2, "force_N = -1: allowed is 0..1000 N", FORCES),
+    (f"{NEW} --scale nan", 2, "--scale", FORCES),
+    (f"{NEW} --insert MRE-70-10", 1, "torque_mre_70", FORCES),
+    ("tormagctl scene new f.toml --force f.csv --offset 0.1", 2, "f.csv exists, where the scene's forces go", FORCES),
+    ("tormagctl scene check pulse --plant no_plant", 2, "no_plant", {}),
+    ("tormagctl scene show pulse --plant sample_1", 2, "--plant: allowed only", {}),
     ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene check pulse --tolerance 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene explain pulse --share 0.5", 2, "tormagctl scene check NAME with one of", {}),
@@ -170,30 +192,26 @@ def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_pat
     # a sentence, and what to do next
     assert [line for line in more if not line.startswith("  ")] == []
     assert "  next: " in said or command.startswith("tormagd --check")
+    # nothing is made, and what was there stays
+    assert {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()} == files
 
 
 JSON = [row for row in MISTAKES if row[0].startswith("tormagctl") and "--measure" not in row[0]]
 
 
-def test_with_json_each_of_them_is_one_object(tmp_path, monkeypatch, capsys, checked_here):
-    """Of those that are wrong in the command line itself, too."""
+@pytest.mark.parametrize(("command", "code", "says", "files"), JSON, ids=[row[0][:60] for row in JSON])
+def test_with_json_it_is_one_object(command, code, says, files, tmp_path, monkeypatch, capsys, checked_here):
+    """Also where the command line itself is wrong."""
     monkeypatch.chdir(tmp_path)
-    for command, code, says, files in JSON:
-        capsys.readouterr()
-        assert (ended(f"{command} --json", files), command) == (code, command)
-        out, err = capsys.readouterr()
-        told = json.loads(out)
-        assert (list(told), told["ok"], told["result"]) == (["command", "ok", "result", "error"], False, None)
-        assert told["command"] in command
-        assert told["error"]["message"] in err
-        assert str(says) in f"{told['error']['message']} next: {told['error']['hint']}"
-        for file in files:
-            Path(file).unlink()
+    assert ended(f"{command} --json", files) == code
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    assert (list(told), told["ok"], told["result"]) == (["command", "ok", "result", "error"], False, None)
+    assert told["command"] in command
+    assert told["error"]["message"] in err
+    assert says in f"{told['error']['message']} next: {told['error']['hint']}"
 
 
 def test_who_may_not_enter_the_sockets_folder_is_told_the_group(monkeypatch):
-    def refused(_path):
-        raise PermissionError
-
-    monkeypatch.setattr(Path, "stat", refused)
+    monkeypatch.setattr(Path, "stat", Mock(side_effect=PermissionError))
     assert unreachable("ipc:///run/tormag/control", "no answer").hint.startswith("you may not enter /run/tormag: join")

@@ -9,25 +9,23 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
 from tormagd.ctl.watch import held_back
-from tormagd.ctl.waveform import SHAPES, read_csv, shape
+from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
 from tormagd.force_file import ForceFileError
 from tormagd_client.messages import Setpoint, Status
 
 
-def send(daemon, ctl, *arguments: str) -> dict:
-    return ctl("--endpoint", daemon.control, "--json", "send", *arguments).ended(0).result
+@pytest.fixture
+def published(fake_daemon: Any, ctl: Any) -> Any:
+    """Sends, and gives the result and all setpoints that have arrived, when these have."""
 
+    def run(*arguments: str) -> tuple[dict[str, Any], list[Setpoint]]:
+        before = len(fake_daemon.setpoints)
+        result = ctl(*fake_daemon.at, "--json", "send", *arguments).ended(0).result
+        return result, fake_daemon.arrived(before + result["sent"])
 
-def wait_for(daemon, count: int) -> None:
-    """Until the fake daemon has read what was sent: it answers a request only after an earlier round of reading."""
-    for _ in range(200):
-        if len(daemon.setpoints) >= count:
-            return
-        assert main(["--endpoint", daemon.control, "--json", "status"]) == 0
-    raise AssertionError(f"{len(daemon.setpoints)} of {count} setpoints arrived")
+    return run
 
 
 def after_s(setpoint: Setpoint, first: Setpoint) -> float:
@@ -40,10 +38,8 @@ def file(tmp_path):
     return tmp_path / "task.csv"
 
 
-def test_every_setpoint_arrives_from_the_first_on(fake_daemon, ctl):
-    result = send(fake_daemon, ctl, "ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
-    wait_for(fake_daemon, result["sent"])
-    arrived = fake_daemon.setpoints
+def test_every_setpoint_arrives_from_the_first_on(published):
+    result, arrived = published("ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
     assert result["sent"] + result["skipped"] == 61
     assert (len(arrived), arrived[0].servo_cf, arrived[-1].servo_cf) == (result["sent"], 1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
@@ -54,47 +50,39 @@ def test_every_setpoint_arrives_from_the_first_on(fake_daemon, ctl):
     assert [setpoint.seq for setpoint in arrived] == list(range(result["sent"]))
 
 
-def test_a_second_run_of_the_same_source_is_newer(fake_daemon, ctl):
+def test_a_second_run_of_the_same_source_is_newer(published):
     options = ("step", "--duration", "0.02", "--source", "me", "--valid-for-ms", "70")
-    first = send(fake_daemon, ctl, *options)
-    wait_for(fake_daemon, first["sent"] + send(fake_daemon, ctl, *options)["sent"])
-    numbers = [(setpoint.session, setpoint.seq) for setpoint in fake_daemon.setpoints]
+    first, _ = published(*options)
+    _, arrived = published(*options)
+    numbers = [(setpoint.session, setpoint.seq) for setpoint in arrived]
     assert numbers[0][1] == numbers[first["sent"]][1] == 0
     assert numbers == sorted(set(numbers))
-    assert {(s.source, s.valid_for_ms) for s in fake_daemon.setpoints} == {("me", 70.0)}
+    assert {(s.source, s.valid_for_ms) for s in arrived} == {("me", 70.0)}
 
 
-def test_a_preview_is_what_will_be_sent(fake_daemon, ctl):
-    wait_for(
-        fake_daemon,
-        send(fake_daemon, ctl, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")["sent"],
-    )
-    arrived = fake_daemon.setpoints
+def test_a_preview_is_what_will_be_sent(published):
+    _, arrived = published("sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")
     forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
     for setpoint in arrived:
         assert (len(setpoint.preview_N), setpoint.preview_dt_ms) == (5, 10.0)
         for after, force in enumerate(setpoint.preview_N, start=1):
             later = min(round(100.0 * after_s(setpoint, arrived[0])) + after, 20)
             assert force == pytest.approx(forces.get(later, force), abs=1e-9)
-    assert (
-        "--preview-ms = 300"
-        in ctl(*fake_daemon.at, "send", "sine", "--rate", "1000", "--preview-ms", "300").ended(2).err
-    )
 
 
-def test_a_file_is_sent_with_its_handle_motion(fake_daemon, ctl, tmp_path, file):
-    file.write_text("t_s,force_N,displacement_mm,rate_mm_s\n10,1,0,5\n10.1,2,2,5\n")
-    result = send(fake_daemon, ctl, str(file), "--rate", "100")
-    wait_for(fake_daemon, result["sent"])
-    assert result["sent"] + result["skipped"] == 11
-    last = fake_daemon.setpoints[-1]
-    assert (last.servo_cf, last.displacement_mm, last.rate_mm_s) == pytest.approx((2.0, 2.0, 5.0))
-
-
-def test_duration_cuts_a_file_short(fake_daemon, ctl, tmp_path, file):
-    file.write_text("t_s,force_N\n0,1\n100,2\n")
-    result = send(fake_daemon, ctl, str(file), "--rate", "100", "--duration", "0.05")
-    assert result["sent"] + result["skipped"] == 6
+@pytest.mark.parametrize(
+    ("content", "options", "count", "last"),
+    [
+        ("t_s,force_N,displacement_mm,rate_mm_s\n10,1,0,5\n10.1,2,2,5\n", (), 11, (2.0, 2.0, 5.0)),
+        ("t_s,force_N\n0,1\n100,2\n", ("--duration", "0.05"), 6, (1.0005, None, None)),
+    ],
+    ids=["with its handle motion", "cut short by duration"],
+)
+def test_a_file_is_sent(published, file, content, options, count, last):
+    file.write_text(content)
+    result, (*_, sent) = published(str(file), "--rate", "100", *options)
+    assert result["sent"] + result["skipped"] == count
+    assert (sent.servo_cf, sent.displacement_mm, sent.rate_mm_s) == pytest.approx(last)
 
 
 @pytest.mark.parametrize(
@@ -169,13 +157,17 @@ def test_shapes_stay_between_their_two_forces_and_reach_both(name):
     assert (min(forces), max(forces)) == pytest.approx((1.2, 1.8), abs=1e-3)
 
 
-def test_shapes_have_their_frequency_and_their_step():
-    step = shape("step", 1.0, 2.0, 1.0, 4.0)
-    assert (step.at(1.999).force_N, step.at(2.0).force_N) == (1.0, 2.0)
-    sine = shape("sine", 1.0, 2.0, 2.0, 4.0)
-    assert (sine.at(0.25).force_N, sine.at(0.5).force_N) == pytest.approx((2.0, 1.0))
-    pulse = shape("pulse", 1.0, 2.0, 0.5, 4.0)
-    assert pulse.at(0.5).force_N == pytest.approx(pulse.at(2.5).force_N)
+@pytest.mark.parametrize(
+    ("name", "frequency_hz", "forces_N"),
+    [
+        ("step", 1.0, {1.999: 1.0, 2.0: 2.0}),
+        ("sine", 2.0, {0.25: 2.0, 0.5: 1.0}),
+        ("pulse", 0.5, dict.fromkeys((0.5, 2.5), 1.0 + beat(0.25))),
+    ],
+)
+def test_shapes_have_their_frequency_and_their_step(name, frequency_hz, forces_N):
+    waveform = shape(name, 1.0, 2.0, frequency_hz, 4.0)
+    assert [waveform.at(t_s).force_N for t_s in forces_N] == pytest.approx([*forces_N.values()])
 
 
 # -- it is done when its setpoints were rendered, and says why when they were not --------------------------------------
@@ -203,13 +195,19 @@ def seen(status_with: Any, source_with: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("state", "limits", "is_over"),
-    [("holds", [], False), ("holds", ["F_MIN", "RATE", "TAKEOVER"], False), ("stale", ["RANGE"], True)],
+    ("state", "limits", "is_over", "code"),
+    [
+        ("holds", [], False, ""),
+        ("holds", ["F_MIN", "RATE", "TAKEOVER"], False, ""),
+        ("stale", ["RANGE"], True, ""),
+        ("refused", [], True, "other_source"),
+    ],
 )
 def test_what_is_taken_while_enabled_is_rendered_and_when_sending_is_over_the_newest_may_be_stale(
-    seen, state, limits, is_over
+    seen, state, limits, is_over, code
 ):
-    assert held_back(seen({"state": state}, limits=limits), "me", is_over=is_over) is None
+    held = held_back(seen({"state": state}, limits=limits), "me", is_over=is_over)
+    assert (held.code if held else "") == code
 
 
 @pytest.mark.parametrize(
@@ -236,10 +234,6 @@ def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes,
     assert hint in held.value.hint
 
 
-def test_when_sending_is_over_another_source_still_counts(seen):
-    assert held_back(seen({"state": "refused"}), "me", is_over=True).code == "other_source"
-
-
 @pytest.fixture
 def sent(fake_daemon: Any, ctl: Any) -> Any:
     """Sends a step of 0.4 s."""
@@ -250,13 +244,8 @@ def sent(fake_daemon: Any, ctl: Any) -> Any:
 def test_what_was_rendered_is_told(fake_daemon, sent):
     fake_daemon.says(limits=["RATE"])
     done = sent().ended(0)
-    result = done.result
-    assert (done.err, result["accepted"], result["rendered_share"], result["limits"]) == (
-        "",
-        result["sent"],
-        1.0,
-        ["RATE"],
-    )
+    expected = {"accepted": done.result["sent"], "rendered_share": 1.0, "limits": ["RATE"]}
+    assert (done.err, done.result) == ("", done.result | expected)
 
 
 @pytest.mark.parametrize(
@@ -326,21 +315,21 @@ def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, ctl, tmp_path, a
     assert fake_daemon.setpoints == []
 
 
-def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, capsys):
+def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, ctl):
     fake_daemon.says(operating_state="DISABLED")
-    assert main(["--endpoint", fake_daemon.control, "send", "step", "--duration", "0.05", "--blind"]) == 0
-    assert "whether they were taken is not known" in capsys.readouterr().out
-    assert fake_daemon.commands == []
+    done = ctl(*fake_daemon.at, "send", "step", "--duration", "0.05", "--blind").ended(0)
+    assert ("whether they were taken is not known" in done.out, fake_daemon.commands) == (True, [])
 
 
-def test_a_key_that_may_only_publish_is_told_how(run_dir, tmp_path, capsys):
-    assert main(["keys", "generate", str(tmp_path / "keys"), "--publish", "robot"]) == 0
+def test_a_key_that_may_only_publish_is_told_how(run_dir, tmp_path, ctl):
+    ctl("keys", "generate", str(tmp_path / "keys"), "--publish", "robot").ended(0)
     keys = ("--key", str(tmp_path / "keys/robot.key_secret"), "--server-key", str(tmp_path / "keys/server.key"))
-    assert main(["--endpoint", f"ipc://{run_dir}/control", *keys, "--wait", "0.05", "send", "step"]) == 3
-    assert "with a key that may only publish: --blind" in capsys.readouterr().err
+    told = ctl("--endpoint", f"ipc://{run_dir}/control", *keys, "--wait", "0.05", "send", "step").ended(3).err
+    assert "with a key that may only publish: --blind" in told
 
 
-def test_a_daemon_that_takes_setpoints_and_does_not_answer_is_not_reached(fake_daemon, run_dir, tmp_path):
+def test_a_daemon_that_takes_setpoints_and_does_not_answer_is_not_reached(fake_daemon, run_dir, tmp_path, ctl):
     config = tmp_path / "tormagd.toml"
     config.write_text(f'[endpoints]\ncontrol = "ipc://{run_dir}/nobody"\nsetpoint = "ipc://{run_dir}/setpoint"\n')
-    assert (main(["--config", str(config), "--wait", "0.1", "send", "step"]), fake_daemon.setpoints) == (3, [])
+    ctl("--config", str(config), "--wait", "0.1", "send", "step").ended(3)
+    assert fake_daemon.setpoints == []

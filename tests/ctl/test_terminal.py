@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.ctl.main import main
 from tormagd.ctl.outcome import Colour
 from tormagd.daemon.log import LogFormatter
 from tormagd.output import write_line
@@ -83,15 +82,12 @@ def test_a_narrow_terminal_gets_lines_that_go_on_under_their_own_words(fake_daem
     assert "\naorta_1         Aorta cannulation, use\n             case 1 of table" in f"\n{ctl('scene', 'list').out}"
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_our_own_colours_and_lines_stay_on_a_terminal_that_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_our_own_colours_and_lines_stay_on_a_terminal_that_wants_them(
+    monkeypatch: pytest.MonkeyPatch, terminal: Any
+) -> None:
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
-    stream = Terminal()
+    stream = terminal()
     colour = Colour(stream)
     text = "\n".join(paint("x") for paint in (colour.red, colour.green, colour.yellow, colour.bold))
     write_line(text, stream)
@@ -149,10 +145,9 @@ def test_a_file_cannot_either(tmp_path: Path, ctl: Any, what: str) -> None:
     assert r"\u001b[2J" in captured.err or r"\x1b[2J" in captured.err
 
 
-def test_a_scene_is_shown_without_obeying_it(tmp_path: Path, capsys: pytest.CaptureFixture[str], ctl: Any) -> None:
-    assert main(["scene", "show", "pulse"]) == 0
+def test_a_scene_is_shown_without_obeying_it(tmp_path: Path, ctl: Any) -> None:
     path = tmp_path / "a.toml"
-    path.write_text(capsys.readouterr().out.replace('description = "', 'description = "\\u009b2J\\u001b[2J'))
+    path.write_text(ctl("scene", "show", "pulse").out.replace('description = "', 'description = "\\u009b2J\\u001b[2J'))
     printed = ctl("scene", "show", str(path)).ended(0).out
     assert is_harmless(printed)
     assert r'description = "\u009b2J\u001b[2J' in printed
