@@ -32,8 +32,9 @@ from tormagd.ctl.calibrate_run import Progress, Range
 from tormagd.ctl.outcome import CommandError
 from tormagd.lab.training import calibration
 from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
+from tormagd.lab.training.dataset import Dataset
 from tormagd.model.displacement import MOVING_MM_S, Turn
-from tormagd.model.model_file import load_model
+from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.inserts import insert
 from tormagd.simulation.device import VirtualDevice
@@ -82,7 +83,7 @@ def column(name):
     return calibration.COLUMNS.index(name)
 
 
-def fitted(data):
+def fitted(data: Dataset) -> ForceModel:
     """The model of usable data."""
     require_usable(data)
     return fit(data, INSERT, CREATED, hidden=12, epochs=60)
