@@ -200,7 +200,7 @@ class ClosedLoop:
         self._output: Duty | None = None
         self._asked: Question | None = None
         self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
-        self.connection = Connection(config.device, self._port.open, self._lose_link)
+        self.connection = Connection(config.device, self._port.open, stepper.lose_link)
         self.connection.open(0.0)
 
     @property
@@ -243,9 +243,7 @@ class ClosedLoop:
         now_s = self.now_s
         self._port.advance(now_s)
         self.connection.receive(now_s)
-        if plan is None:
-            self._infer(now_s, setpoint)
-        used = self._newest_plan() if plan is None else plan
+        used = self._infer(now_s, setpoint) if plan is None else plan
         measurement, stepper = self.connection.measurement, self.stepper
         output = stepper.step(now_s, measurement, used)
         self.connection.exchange(
@@ -300,27 +298,23 @@ class ClosedLoop:
         if self.stepper.safety.operating_state is not OperatingState.ENABLED:
             raise RuntimeError(f"not enabled: {self.stepper.safety}")
 
-    def _newest_plan(self) -> Plan:
-        """Return the planner's newest plan. Raises ValueError without a planner."""
-        if self.planner is None:
-            raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
-        return self.planner.planned
+    def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> Plan:
+        """Plan at `now_s` where the setpoint is new or the inference period is over; return the newest plan.
 
-    def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """Plan where a setpoint is new or the inference period is over; without a planner do nothing.
-
-        `setpoint` None: no publisher. Before, a search's answer that is due is handed over. After, a forecast is made,
-        and the plan's question to a search is noted, unless one is pending.
+        `setpoint` is the newest; None: no publisher. A new plan is preceded by a search's answer, if one is due, and
+        followed by a forecast. Its question to a search is noted, unless one is pending. Raises ValueError without a
+        planner, and DomainError where planning fails.
         """
         planner = self.planner
         if planner is None:
-            return
+            raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
         is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
         if is_new or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
             self._answer_question(planner, now_s)
             planner.plan(now_s, setpoint, self.stepper.measured, self.stepper.is_followed)
             planner.foresee()
             self._asked = self._asked or planner.question
+        return planner.planned
 
     def _answer_question(self, planner: Planner, now_s: float) -> None:
         """Answer the pending question once SEARCH_S is over, as a search in a process of its own would; else do
@@ -345,9 +339,6 @@ class ClosedLoop:
                 return
         link = f"{self.connection.state} {self.connection.cause}"
         raise RuntimeError(f"the device did not {what} within {HOMING_S:g} s: {link}")
-
-    def _lose_link(self) -> None:
-        self.stepper.lose_link()
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
