@@ -62,11 +62,11 @@ def read_table(
             reader = csv.reader(file, strict=True)
             header = [name.strip() for name in next(reader, [])]
             others = [name for name in header if name not in allowed] if has_others else []
-            columns = _check_header(path, header, [*allowed, *others], (*optional, *others))
-            table = {name: array("d") for name in columns if name in allowed}
+            _check_header(path, header, [*allowed, *others], (*optional, *others))
+            table = {name: array("d") for name in header if name in allowed}
             for cells in reader:
                 if cells:
-                    row = _check_row(path, reader.line_num, columns, cells, table["t_s"][-1:], allowed)
+                    row = _check_row(path, reader.line_num, header, cells, table["t_s"][-1:], allowed)
                     for name, value in zip(table, row, strict=True):
                         table[name].append(value)
     except OSError as error:
@@ -80,8 +80,8 @@ def read_table(
     return table
 
 
-def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> list[str]:
-    """Return `columns`, the names in the first row of the file at `path`.
+def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> None:
+    """Check `columns`, the names in the first row of the file at `path`; any order is allowed.
 
     `known` names all allowed columns; those of them that are in `optional` may be missing. Raises ForceFileError for
     another column that is missing, for an unknown one, and for one that is there twice.
@@ -97,7 +97,6 @@ def _check_header(path: Path, columns: list[str], known: list[str], optional: tu
             raise ForceFileError(f"{path}: row 1: column {name[:40]!r} is not known: {allowed}")
         if name in columns[:index]:
             raise ForceFileError(f"{path}: row 1: column {name} is there twice")
-    return columns
 
 
 def _check_row(
