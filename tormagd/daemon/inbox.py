@@ -173,13 +173,6 @@ class SetpointInbox:
         in_force = self.playout.in_force
         return None if in_force is None else in_force.setpoint
 
-    def newest_is(self) -> tuple[str, int]:
-        """Return source and `seq` of the setpoint to plan for. Raises ValueError while there is none."""
-        in_force = self.playout.in_force
-        if in_force is None:
-            raise ValueError("no setpoint is in force: allowed is to ask while `newest` is one")
-        return in_force.source, in_force.seq
-
     def passed_over(self) -> tuple[str, int] | None:
         """Return source and newest `seq` of the source last refused because another one holds the brake.
 

@@ -50,8 +50,8 @@ class Topics:
 
     def verdict(self) -> Verdict | None:
         """Return the verdict on the newest setpoint, as things are now; None without a setpoint."""
-        inbox = self._endpoint.inbox
-        return None if inbox.newest is None else self._verdict(*inbox.newest_is(), self._judge())
+        in_force = self._endpoint.inbox.playout.in_force
+        return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
         """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without a device.
@@ -77,12 +77,13 @@ class Topics:
 
         Each is judged once. Returns False where neither is new.
         """
-        inbox, is_said = self._endpoint.inbox, False
+        in_force, is_said = self._endpoint.inbox.playout.in_force, False
         # a setpoint is a new object, even where its source begins its numbers anew
-        if inbox.newest is not None and inbox.newest is not self._judged:
-            self._judged, is_said = inbox.newest, True
-            self._endpoint.publish_topic(VERDICT_TOPIC, self._verdict(*inbox.newest_is(), self._judge()))
-        other = inbox.passed_over()
+        if in_force is not None and in_force is not self._judged:
+            self._judged, is_said = in_force, True
+            verdict = self._verdict(in_force.source, in_force.seq, self._judge())
+            self._endpoint.publish_topic(VERDICT_TOPIC, verdict)
+        other = self._endpoint.inbox.passed_over()
         if other is not None and other != self._passed_over:
             self._passed_over, is_said = other, True
             refused = Judged(CANNOT, None, (str(Limit.OTHER_SOURCE),))
