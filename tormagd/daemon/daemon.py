@@ -113,12 +113,12 @@ class Daemon:
             self._phases,
             self._causes,
             self._box,
+            SceneChange(self._build, self._require_disabled, self._run_scene),
             refused,
             config_file,
         )
-        self._telemetry.scene_change = SceneChange(self._build, self._require_disabled, self._run_scene)
         self._box.begin(self._control.stepper, self._inference.planner, self._connection)
-        admission, telemetry = self._endpoint.admission, self._telemetry
+        telemetry = self._telemetry
         self._phases.begin(
             [
                 ("receive", self._receive),
@@ -133,7 +133,7 @@ class Daemon:
                 ("forecast", self._inference.foresee),
                 ("tell", telemetry.tell),
                 ("answers", telemetry.serve),
-                ("admission", lambda _beat: admission.update()),
+                ("admission", lambda _beat: self._endpoint.admission.update()),
             ],
         )
         self._ended = asyncio.Event()

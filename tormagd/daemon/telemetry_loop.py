@@ -86,13 +86,14 @@ class TelemetryLoop:
         phases: Phases,
         causes: Causes,
         box: BlackBox,
+        scene_change: SceneChange,
         not_granted: list[str],
         config_file: str | None,
     ) -> None:
         self._not_granted, self._config_file = tuple(not_granted), config_file
         self._control, self._inference = control, inference
         self._calibrations, self._connection, self._endpoint = calibrations, connection, endpoint
-        self._phases, self._causes, self._box = phases, causes, box
+        self._phases, self._causes, self._box, self._scene_change = phases, causes, box, scene_change
         self.timing = RateGroup("telemetry", 1_000_000_000 // config.rates.telemetry_hz)
         self._groups = [control.timing, inference.timing, self.timing]
         if inference.beside is not None:
@@ -102,8 +103,6 @@ class TelemetryLoop:
         self._ticks: list[TickRecord] = []
         self._way = Way(core.scene.budget)
         self.topics = Topics(config, core, control, inference, endpoint)
-        self.scene_change: SceneChange | None = None
-        "What changes the scene; None until the daemon sets it."
         self._service = Service()
         self._mark: Mark | None = None
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // config.rates.telemetry_hz
@@ -181,7 +180,7 @@ class TelemetryLoop:
     def _look_at_device(self) -> None:
         """Let calibrations and profiles look at the connected device; the profile of one that is awaited waits, too."""
         serial_number, is_driven = self._serial_number(), self._control.stepper.safety.is_driven
-        change = None if self.scene_change is None else self.scene_change.newest
+        change = self._scene_change.newest
         is_idle = not (is_driven or self.is_busy()) and (change is None or change.is_over)
         self._calibrations.look(serial_number, self.config, is_idle=is_idle)
         is_awaited = self._calibrations.is_awaited(serial_number)
@@ -373,8 +372,8 @@ class TelemetryLoop:
             return {"file": str(self.keep("REQUEST", 0.0))}
         if request.command == "arm":
             self._control.arm(self.conditions())
-        elif request.command == "use-scene" and self.scene_change is not None:
-            self.scene_change.begin(request.args.get("scene"))
+        elif request.command == "use-scene":
+            self._scene_change.begin(request.args.get("scene"))
         else:
             self._control.command(request.command, self.conditions())
         return {
@@ -482,7 +481,7 @@ class TelemetryLoop:
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, is_homed_))),
             arm=self._arm_report(),
-            scene_change=None if self.scene_change is None else self.scene_change.newest,
+            scene_change=self._scene_change.newest,
             is_open=self.is_open(),
             following=self._following.report(),
         )
