@@ -43,11 +43,6 @@ class TomlError(ValueError):
     """A text that is refused: not TOML (with its line), nested too deeply, too long a line, or an impossible number."""
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file and return its tables. Raises as `toml_text` and `toml_tables` do."""
-    return toml_tables(toml_text(path))
-
-
 def toml_text(path: Path) -> str:
     """Read a text file of at most MAX_BYTES, in UTF-8, and return its text.
 

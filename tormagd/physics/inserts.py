@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 
 from tormagd.physics.errors import DomainError, require, require_that
 from tormagd.physics.force import Elastomer
-from tormagd.toml_file import read_toml
+from tormagd.toml_file import toml_tables, toml_text
 
 CIP_DENSITY_G_CC = 7.87
 SLACKER_DENSITY_G_CC = 0.97
@@ -134,7 +134,7 @@ class _File(Struct, frozen=True, forbid_unknown_fields=True):
     insert: list[Insert]
 
 
-_FILE = msgspec.convert(read_toml(Path(__file__).with_name("inserts.toml")), _File)
+_FILE = msgspec.convert(toml_tables(toml_text(Path(__file__).with_name("inserts.toml"))), _File)
 MATRICES = {matrix.shore_hardness: matrix for matrix in _FILE.matrix}
 INSERTS = {item.name: item for item in _FILE.insert}
 
