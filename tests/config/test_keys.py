@@ -1,7 +1,9 @@
 """Key files: what is made, and what is refused with a sentence."""
 
 import os
+import shutil
 import stat
+from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 
@@ -70,6 +72,10 @@ def test_the_lists_say_who_may_do_what(folder: Path) -> None:
     (folder / "observe/README").write_text("not a key")
     keys = ring(folder)
     assert keys.server == load_pair(folder / "server.key_secret")
+    (folder / "publish/broken.key").write_text("nothing")
+    with pytest.raises(ConfigError, match=r"broken\.key holds no public key"):
+        keys.load_allowed()
+    # what was read before stays
     roles = sorted((listed.name, sorted(listed.roles)) for listed in keys.allowed.values())
     assert roles == [("observer", ["observe"]), ("operater", ["operate"]), ("other", ["observe", "publish"])]
 
@@ -111,21 +117,27 @@ def test_a_file_that_is_no_key_is_named(folder: Path, content: str | bytes, name
         ring(folder)
 
 
-def test_what_is_no_file_is_not_waited_for(folder: Path) -> None:
-    os.mkfifo(folder / "publish/pipe.key", 0o600)
-    with pytest.raises(ConfigError, match=r"pipe.key: allowed is a regular file"):
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: os.mkfifo(folder / "publish/pipe.key", 0o600), "publish/pipe.key: allowed is a regular file"),
+        (lambda folder: shutil.rmtree(folder / "observe"), "observe: No such file or directory: make it"),
+    ],
+)
+def test_what_is_no_file_or_missing_is_named_and_not_waited_for(
+    folder: Path, spoil: Callable[[Path], object], said: str
+) -> None:
+    spoil(folder)
+    with pytest.raises(ConfigError, match=f"^{folder}/{said}"):
         ring(folder)
-    with pytest.raises(ConfigError, match=r"^/dev/zero: allowed is a regular file"):
-        load_pair(Path("/dev/zero"))
 
 
-def test_what_is_missing_is_named(folder: Path) -> None:
-    (folder / "observe/observer.key").unlink()
-    (folder / "observe").rmdir()
-    with pytest.raises(ConfigError, match=f"^{folder}/observe: No such file or directory: make it"):
-        ring(folder)
-    with pytest.raises(ConfigError, match=r"^/nowhere/a.key_secret: No such file"):
-        load_pair(Path("/nowhere/a.key_secret"))
+@pytest.mark.parametrize(
+    ("path", "said"), [("/dev/zero", "allowed is a regular file"), ("/nowhere/a.key_secret", "No such file")]
+)
+def test_a_pair_is_read_of_a_file_that_is_one(path: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{path}: {said}"):
+        load_pair(Path(path))
 
 
 def test_keys_that_do_not_belong_together_are_refused(folder: Path) -> None:

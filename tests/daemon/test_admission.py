@@ -19,7 +19,7 @@ from tormagd.daemon import admission
 from tormagd.daemon.admission import CONNECTIONS_PER_PEER, PLAIN
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.keys import KeyRing
-from tormagd_client.endpoints import ConfigError, Curve, Endpoints
+from tormagd_client.endpoints import Curve, Endpoints
 from tormagd_client.keys import KeyPair, fingerprint, generate, load_pair
 from tormagd_client.messages import VERSION, PeerReport, Reply, Request, decode, encode
 
@@ -47,10 +47,6 @@ class Rig:
         generate("server", self.keys, self.keys)
         for name, role in (("robot", "publish"), ("console", "operate"), ("viewer", "observe")):
             generate(name, self.keys, self.keys / role)
-        # one that is listed for everything
-        generate("bench", self.keys, self.keys / "publish")
-        (self.keys / "operate/bench.key").write_bytes((self.keys / "publish/bench.key").read_bytes())
-        (self.keys / "operate/bench.key").chmod(0o600)
         self.addresses = {
             name: f"ipc://{folder}/{name}" if scheme == "ipc" else f"tcp://127.0.0.1:{port}"
             for name, port in zip(NAMES, free_ports(len(NAMES)), strict=True)
@@ -225,14 +221,6 @@ def test_a_key_opens_only_what_it_is_listed_for(rig: Rig, name: str, who: str) -
     assert rig.answered == []
 
 
-def test_a_key_in_two_folders_has_both_roles(rig: Rig) -> None:
-    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("bench"))
-    client = rig.peer(zmq.DEALER, "control", rig.pair("bench"))
-    client.send(request("enable"))
-    rig.until(lambda: client.poll(0) and publisher.poll(0))
-    assert rig.answered == ["enable"]
-
-
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("what", "keys", "server", "reason", "key"),
@@ -319,14 +307,6 @@ def test_a_list_that_is_read_again_lets_in_and_shuts_out(rig: Rig, caplog: pytes
     rig.until(lambda: rig.endpoint.report().dropped == 1, "the first dropped")
     assert rig.endpoint.inbox.accepted == 1
     rig.until(lambda: rig.endpoint.report().connections["recording"] == 0, "the viewer cut off")
-
-
-def test_lists_that_are_no_good_leave_the_old_ones(rig: Rig) -> None:
-    (rig.keys / "publish/broken.key").write_text("nothing")
-    with pytest.raises(ConfigError, match=r"broken\.key holds no public key"):
-        rig.ring.load_allowed()
-    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
-    rig.until(lambda: publisher.poll(0))
 
 
 @over_tcp
