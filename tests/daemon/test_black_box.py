@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -129,10 +130,12 @@ def test_a_request_waits_for_a_process_that_is_held_up(rig: Rig) -> None:
         assert (rig.box.report().newest, rig.box.report().refusal) == (path.name, written.refusal)
 
 
-@pytest.mark.parametrize("notices", ["look", "tick"])
-def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: str) -> None:
+@pytest.mark.parametrize(
+    "notices", [lambda rig: rig.box.look(), lambda rig: rig.tick(PART_TICKS), lambda rig: rig.box.close()]
+)
+def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: Callable[[Rig], None]) -> None:
     rig.its.close()
-    rig.box.look() if notices == "look" else rig.tick(PART_TICKS)
+    notices(rig)
     assert "ended" in rig.box.report().refusal
     rig.tick(100)
     assert rig.box.journal.take() == []
@@ -146,12 +149,6 @@ def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) 
     rig.tick()
     assert "cannot be written" in rig.box.report().refusal
     rig.tick(100)
-
-
-def test_a_process_that_has_ended_hinders_no_end(rig: Rig) -> None:
-    rig.its.close()
-    rig.box.close()
-    assert "ended" in rig.box.report().refusal
 
 
 def test_it_says_when_it_ends(rig: Rig) -> None:

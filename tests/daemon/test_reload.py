@@ -11,6 +11,7 @@ def test_what_only_a_loop_looks_at_is_taken_over():
     again = reread(RUNNING, read)
     assert set(again.taken) == set(LIVE), "a key in the list that is not carried over would be told as in force"
     assert again == (read, ("realtime.watchdog_ms", "sources.playout_ms", "sources.priority"), ())
+    assert reread(again.config, read) == (read, (), ())
 
 
 def test_what_something_was_built_from_is_named_and_stays():
@@ -38,7 +39,3 @@ def test_what_something_was_built_from_is_named_and_stays():
         RUNNING, realtime=msgspec.structs.replace(RUNNING.realtime, watchdog_ms=800.0)
     )
     assert reread(again.config, read).taken == ()
-
-
-def test_the_same_is_no_news():
-    assert reread(RUNNING, Config()) == (RUNNING, (), ())

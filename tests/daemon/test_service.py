@@ -90,27 +90,29 @@ def test_without_fresh_plans_it_is_not_fed(planned_s):
     assert not ready().is_alive(1.0, LIMIT_S, planned_s, LinkState.RUNNING, 1.0)
 
 
-def line(**changes: Any) -> str:
-    known: dict[str, Any] = {
-        "link": LinkState.RUNNING,
-        "cause": "",
-        "remedy": "",
-        "state": "DISABLED",
-        "is_homed": True,
-        "faults": [],
-        "scene": "coronary",
-    }
-    return status_line(**(known | changes))
+KNOWN: dict[str, Any] = {
+    "link": LinkState.RUNNING,
+    "cause": "",
+    "remedy": "",
+    "state": "DISABLED",
+    "is_homed": True,
+    "faults": [],
+    "scene": "coronary",
+}
 
 
-def test_the_status_line_says_how_it_stands_and_what_is_next():
-    assert line(state="ENABLED") == "ENABLED, scene coronary"
-    assert line(is_homed=False) == "DISABLED, scene coronary; next: tormagctl arm"
-    assert line(state="FAULT", faults=["SKEW", "STOPPED"]) == "FAULT: SKEW, STOPPED; next: tormagctl status"
-
-
-def test_what_the_device_or_the_kernel_says_makes_no_lines_of_its_own():
-    assert (
-        line(link=LinkState.BACK_OFF, cause="no port\nREADY=1", remedy="plug it in")
-        == "DISABLED, scene coronary; waiting for the device (BACK_OFF): no port READY=1; plug it in"
-    )
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"state": "ENABLED"}, "ENABLED, scene coronary"),
+        ({"is_homed": False}, "DISABLED, scene coronary; next: tormagctl arm"),
+        ({"state": "FAULT", "faults": ["SKEW", "STOPPED"]}, "FAULT: SKEW, STOPPED; next: tormagctl status"),
+        # what the device or the kernel says makes no lines of its own
+        (
+            {"link": LinkState.BACK_OFF, "cause": "no port\nREADY=1", "remedy": "plug it in"},
+            "DISABLED, scene coronary; waiting for the device (BACK_OFF): no port READY=1; plug it in",
+        ),
+    ],
+)
+def test_the_status_line_says_how_it_stands_and_what_is_next(changes: dict[str, Any], line: str):
+    assert status_line(**(KNOWN | changes)) == line

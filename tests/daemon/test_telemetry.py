@@ -254,24 +254,17 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
         pytest.approx(20_000.0, abs=1.0),
         pytest.approx(20_000.0, rel=0.04),
     )
-    # one that has gone stale ends no way
-    way.ticked(9.0, planned(-math.inf))
-    way.to_duty.refresh()
-    assert way.report(None, 0.013).to_duty_us.max == pytest.approx(20_000.0, abs=1.0)
-
-
-def test_the_whole_way_is_the_sum_of_what_is_known_of_its_parts() -> None:
-    way = Way(Budget())
-    for tick in range(1, 100):
-        way.ticked(tick * 1e-2, planned(tick * 1e-2 - 0.02))
-    way.to_duty.refresh()
-    found = way.report(400.0, 0.013)
+    # the whole is the sum of what is known of its parts
     assert (found.device_us, found.carriages_ms, found.total_ms) == (
         400.0,
         13.0,
         pytest.approx(20.0 + 0.4 + 13.0, abs=0.7),
     )
-    assert way.report(None, 0.013).total_ms is None
+    # one that has gone stale ends no way
+    way.ticked(9.0, planned(-math.inf))
+    way.to_duty.refresh()
+    found = way.report(None, 0.013)
+    assert (found.to_duty_us.max, found.total_ms) == (pytest.approx(20_000.0, abs=1.0), None)
 
 
 def test_the_ways_budget_is_the_scenes_where_it_states_one() -> None:

@@ -63,21 +63,20 @@ def test_it_arrives_when_the_gap_has_gone_there_and_the_carriages_have_come(core
 
 
 @pytest.mark.parametrize(
-    ("limits", "why"),
+    ("asked_N", "limits", "why"),
     [
-        ((Limit.RANGE,), ("RANGE",)),
-        ((Limit.RANGE, Limit.F_MAX, Limit.RATE), ("RANGE", "F_MAX")),
-        ((Limit.STANDBY, Limit.OTHER_SOURCE), ("STANDBY",)),
+        (3.0, (Limit.RANGE,), ("RANGE",)),
+        (3.0, (Limit.RANGE, Limit.F_MAX, Limit.RATE), ("RANGE", "F_MAX")),
+        (3.0, (Limit.STANDBY, Limit.OTHER_SOURCE), ("STANDBY",)),
+        # one that is too old
+        (None, (Limit.STALE, Limit.SENSOR), ("STALE",)),
+        (None, (Limit.STALE, Limit.OTHER_SOURCE), ("STALE", "OTHER_SOURCE")),
     ],
 )
-def test_it_cannot_where_a_limit_holds_it(core: Core, limits: tuple[Limit, ...], why: tuple[str, ...]) -> None:
-    assert found(core, plan(3.0, limits)) == (CANNOT, None, why)
-
-
-def test_a_setpoint_that_is_too_old_cannot(core: Core) -> None:
-    assert found(core, plan(None, (Limit.STALE, Limit.SENSOR))) == (CANNOT, None, ("STALE",))
-    both = (Limit.STALE, Limit.OTHER_SOURCE)
-    assert found(core, plan(None, both)) == (CANNOT, None, ("STALE", "OTHER_SOURCE"))
+def test_it_cannot_where_a_limit_holds_it(
+    core: Core, asked_N: float | None, limits: tuple[Limit, ...], why: tuple[str, ...]
+) -> None:
+    assert found(core, plan(asked_N, limits)) == (CANNOT, None, why)
 
 
 @pytest.mark.parametrize("limit", [Limit.RATE, Limit.TAKEOVER, Limit.OTHER_SOURCE, Limit.LOW_CONFIDENCE])
