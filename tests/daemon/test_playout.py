@@ -55,7 +55,6 @@ def test_each_setpoint_is_followed_a_stated_time_after_its_stamp(seed: int, play
     assert len(found) >= (1.0 - playout_ms * 1e-3) / PERIOD_S - 1.0
     assert all(-1e-9 <= late_s - playout_ms * 1e-3 < TICK_S + 1e-9 for late_s, _ in found)
     report = listening.inbox.report(1.0).playout
-    assert report is not None
     assert (report.playout_ms, report.setpoints, report.late) == (playout_ms, listening.inbox.accepted, 0)
 
 
@@ -64,7 +63,6 @@ def test_what_comes_too_late_is_followed_at_once_and_counted() -> None:
     listening.listen(lambda seq: 0.0805 if seq % 20 == 10 else 0.01 + 0.004 * (seq % 2), 4.0)
     listening.inbox.refresh(4.0)
     report = listening.inbox.report(4.0).playout
-    assert report is not None
     # the late one holds those behind it back: 81, 71, .. 31 ms after their stamps
     assert (report.setpoints, report.late) == (399, 20 * 6)
     assert report.held_us.p50 == pytest.approx(16e3, rel=0.05)
@@ -91,7 +89,6 @@ def test_jitter_names_the_playout_that_takes_it_out_and_is_gone_with_it() -> Non
     assert listening.inbox.told(2.5)[Limit.SOURCE_JITTER].remedy.startswith("set sources.playout_ms = 50,")
     listening = Listening(50.0)
     listening.listen(way_s, 2.5)
-    assert listening.inbox.newest is not None
     assert listening.inbox.newest.limits == ()
 
 

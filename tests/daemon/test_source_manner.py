@@ -6,7 +6,6 @@ from collections.abc import Callable
 import msgpack
 import pytest
 
-from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.source_manner import Needs
 from tormagd.safety.codes import Limit
@@ -38,38 +37,39 @@ CASES: list[tuple[float, Delay, float, tuple[Limit, ...]]] = [
 ]
 
 
-def heard(rate_hz: float, delay: Delay, lost: float, seed: int, lasts_s: float = 2.1) -> SetpointInbox:
-    """An inbox after two seconds of it; one connection's messages do not overtake each other."""
-    inbox, noise, arrives_s = SetpointInbox(), random.Random(seed), 0.0
-    inbox._needs = NEEDS
-    for number in range(round(lasts_s * rate_hz)):
+@pytest.fixture
+def inbox() -> SetpointInbox:
+    made = SetpointInbox()
+    made._needs = NEEDS
+    return made
+
+
+def hear(
+    inbox: SetpointInbox, rate_hz: float, delay: Delay, lost: float, seed: int, from_s: float = 0.0, to_s: float = 2.1
+) -> None:
+    """All that is sent from one time to the other; one connection's messages do not overtake each other."""
+    noise, arrives_s = random.Random(seed), 0.0
+    for number in range(round(from_s * rate_hz), round(to_s * rate_hz)):
         sent_s = number / rate_hz
         arrives_s = max(arrives_s, sent_s + delay(noise))
         message = {"v": 1, "source": "a", "seq": number, "stamp_ns": START_NS + round(sent_s * 1e9), "servo_cf": 1.0}
         if noise.random() >= lost:
             inbox.take(msgpack.packb(message | {"valid_for_ms": 1_000.0}), arrives_s, START_NS + round(arrives_s * 1e9))
-    return inbox
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("rate_hz", "delay", "lost", "limits"), CASES)
 def test_the_cause_is_named_within_two_seconds(
-    rate_hz: float, delay: Delay, lost: float, limits: tuple[Limit, ...], seed: int
+    inbox: SetpointInbox, rate_hz: float, delay: Delay, lost: float, limits: tuple[Limit, ...], seed: int
 ) -> None:
-    inbox = heard(rate_hz, delay, lost, seed)
-    newest = inbox.newest
-    assert isinstance(newest, TimedSetpoint)
-    assert set(newest.limits) == set(limits)
+    hear(inbox, rate_hz, delay, lost, seed)
+    assert set(inbox.newest.limits) == set(limits)
     told = inbox.told(2.1)
     assert all(told[limit].cause and told[limit].remedy for limit in limits)
 
 
-def test_what_is_over_is_not_told_any_more() -> None:
-    inbox = heard(500.0, lambda noise: 0.02 + noise.uniform(0.0, 0.03) * (noise.random() < 0.5), 0.0, 1)
-    assert inbox.newest is not None
+def test_what_is_over_is_not_told_any_more(inbox: SetpointInbox) -> None:
+    hear(inbox, 500.0, lambda noise: 0.02 + noise.uniform(0.0, 0.03) * (noise.random() < 0.5), 0.0, 1)
     assert inbox.newest.limits == (Limit.SOURCE_JITTER,)
-    for number in range(2_000, 3_100):
-        sent_s = number / 500.0
-        message = {"v": 1, "source": "a", "seq": number, "stamp_ns": START_NS + round(sent_s * 1e9), "servo_cf": 1.0}
-        inbox.take(msgpack.packb(message | {"valid_for_ms": 1_000.0}), sent_s + 0.03, START_NS + round(sent_s * 1e9))
+    hear(inbox, 500.0, steady(0.03), 0.0, 1, 4.0, 6.2)
     assert inbox.newest.limits == ()
