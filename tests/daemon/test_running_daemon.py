@@ -649,9 +649,8 @@ def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(arm
     armed.ask(1.6, by=console)
     armed.ask(0.9)
     status = armed.until(lambda status: "OTHER_SOURCE" in status["limits"], "the other one is named")
-    told = {each["code"]: each for each in status["limit_details"]}["OTHER_SOURCE"]
-    assert told["cause"] == "'console' sends setpoints too, and 'test' holds the brake"
-    assert told["remedy"].endswith("tormagctl take console")
+    causes = {each["code"]: each["cause"] for each in status["limit_details"]}
+    assert causes["OTHER_SOURCE"] == "'console' sends setpoints too, and 'test' holds the brake"
     assert status["setpoint_cf"] == 0.9
     assert (armed.refused("take"), armed.refused("take", source="nobody")) == ("bad_source", "unknown_source")
     assert armed.command("take", source="console") == {"source": "console", "instead_of": "test"}
