@@ -95,11 +95,12 @@ class _Connections:
         self.cut: set[int] = set()
 
     def told(self) -> str | None:
-        """Note that libzmq has rejected a peer for its key.
+        """Note that libzmq has rejected a peer for its key, and return whom the caller has to count as refused for
+        that.
 
-        Normally returns None: that peer was counted when its key was refused. Otherwise another connection, which broke
-        off its handshake, had been counted in its place. Returns the address of that other connection, empty where it
-        is not known.
+        Normally None: the peer was counted when its key was refused. Otherwise another connection, which broke off its
+        handshake, had been counted in its place. Returns the address of that connection, empty where it is not known,
+        and adds it to `turned_away`.
         """
         if self.untold:
             self.untold -= 1
@@ -109,10 +110,11 @@ class _Connections:
         return address
 
     def left_untold(self, address: str) -> bool:
-        """Tell whether a connection that broke off its handshake is counted as a refused key, and note it then.
+        """Tell whether a peer that broke off its handshake was counted already, when its key was refused.
 
-        It is where the key of a peer at `address` was refused and libzmq has not rejected it yet. An empty `address` is
-        unknown, and stands for the oldest such peer. Each such key answers True once; False changes nothing.
+        True where libzmq has not rejected a refused key yet, and `left` finds such a peer at `address`. That peer is
+        removed from `turned_away` and noted for `told`, so each refused key answers True once. An empty `address` is
+        unknown, and stands for the oldest such peer. False changes nothing.
         """
         if not self.untold or (taken := self.left(address)) is None:
             return False
@@ -126,9 +128,10 @@ class _Connections:
         return next((address for address, count in self.admitted.items() if count > still[address]), "")
 
     def left(self, address: str) -> str | None:
-        """Remove a peer whose key was refused from `turned_away`, and return its address; None where there is none.
+        """Remove one entry of `address` from `turned_away`, and return it; None where there is none.
 
-        An empty `address`, of a peer that was gone before it was seen, stands for the oldest refused one.
+        An empty `address`, of a peer that was gone before it was seen, stands for the oldest entry, which is then
+        returned.
         """
         if not address and self.turned_away:  # the peer had gone before its address was read
             return self.turned_away.popleft()
@@ -165,8 +168,8 @@ class Admission:
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
         """Begin to watch the connections of the endpoint `name`, and set the options of its socket if it is guarded.
 
-        Call before `bind`. A guarded socket asks for CURVE keys. Raises OSError where `is_guarded` and the daemon has
-        no keys.
+        Call before `bind`, once for each endpoint; `name` is one of MAY, which is not checked. A guarded socket asks
+        for CURVE keys. Raises OSError where `is_guarded` and the daemon has no keys.
         """
         if is_guarded:
             if self._keys is None:
@@ -204,7 +207,7 @@ class Admission:
             known.endpoint.disable_monitor()
 
     def has_role(self, public: str, roles: frozenset[str]) -> bool:
-        """Tell whether the key `public`, in Z85, is now listed for at least one of `roles`.
+        """Tell whether the key `public`, 40 characters (Z85), is now listed for at least one of `roles`.
 
         False for one that is not listed. Ask for each message: a peer may have been taken off the list after it was let
         in.
@@ -246,19 +249,20 @@ class Admission:
                     self.cut_off(name)
 
     def cut_off(self, name: str, whose: str = "") -> None:
-        """End the connections of the address `whose` to the endpoint `name`; an empty `whose` ends all.
+        """Shut down the connections from the address `whose` to the endpoint `name`; an empty `whose` ends all.
 
-        A peer that may connect comes back by itself.
+        Does not wait: they are counted until `update` has handled their ends. A peer that may connect comes back by
+        itself. Raises KeyError for an endpoint that was not given to `guard`.
         """
         for descriptor, address in self._endpoints[name].addresses.items():
             if address == whose or not whose:
                 _end(descriptor, address)
 
     def _admit(self) -> None:
-        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most.
+        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most. Never waits.
 
-        200 lets the peer in, 400 does not. A peer that is let in has its key as user id. Each answer is counted, as in
-        `_is_admitted`.
+        The answer's status 200 lets the peer in, 400 does not. A peer that is let in has its key as user id. Each
+        answer is counted, as in `_is_admitted`.
         """
         for _ in range(AT_ONCE):
             if not self._arrivals.has(self._zap):
@@ -275,8 +279,8 @@ class Admission:
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
         """Tell whether the key `public` may use the endpoint `name`, and count the answer.
 
-        A refused key is counted with the reason and noted: its connection is closed soon. An admitted publisher that
-        returns at once counts as cut off for a message that was too long.
+        A refused key is counted in `refusals` with the reason, and noted: its connection is closed soon. An admission
+        is counted for its address. A publisher that is admitted within RECONNECT_S of leaving counts in `oversize`.
         """
         known = self._endpoints[name]
         if self.has_role(public, MAY[name]):
@@ -293,8 +297,8 @@ class Admission:
     def _watch(self, known: _Connections) -> None:
         """Handle the waiting events of one endpoint's monitor, AT_ONCE at most: connected, closed, handshake failed.
 
-        Cuts off connections beyond the allowed number. A peer counts as refused once its connection is closed; a
-        publisher that comes back at once to an open endpoint counts in `oversize`.
+        Cuts off connections beyond the allowed number. A peer counts as refused once its connection is closed, unless
+        that was counted with its key. A publisher that comes back at once to an open endpoint counts in `oversize`.
         """
         for _ in range(AT_ONCE):
             if not self._arrivals.has(known.monitor):
@@ -316,9 +320,10 @@ class Admission:
                 known.failed = PLAIN if known.is_guarded else "left in the handshake"
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
-        """Note a new connection, and end it where its address or its endpoint has too many.
+        """Note a new connection and its address, and end it where its address or its endpoint has too many.
 
-        On an open endpoint, a publisher that returns at once counts as cut off for a message that was too long.
+        One whose peer has gone already is only noted. On an open endpoint, a publisher that returns at once counts in
+        `oversize`.
         """
         address = known.addresses[descriptor] = _address(descriptor)
         if not address:
@@ -333,8 +338,8 @@ class Admission:
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
         """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many.
 
-        A refused key that was counted already is not counted again. A publisher that had got in is noted in `left`: it
-        may come back at once. A connection of an unknown address whose handshake did not fail stands for one that was
+        Nothing is counted where it was when the key was refused. A publisher that had got in is noted in `left`: it may
+        come back at once. A connection of an unknown address whose handshake did not fail stands for one that was
         admitted.
         """
         address = known.addresses.pop(descriptor, "")
@@ -360,7 +365,7 @@ class Admission:
     def _count_oversize(self, name: str, address: str) -> None:
         """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget that leaving.
 
-        Only for the endpoint `setpoint`. A program that quickly opens another socket counts, too.
+        Does nothing for other endpoints than `setpoint`. A program that quickly opens another socket counts, too.
         """
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
         # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
@@ -378,7 +383,7 @@ class Admission:
 def _address(descriptor: int) -> str:
     """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`.
 
-    Empty where the peer has gone.
+    Empty where the peer has gone, or `descriptor` is no socket. `descriptor` stays open.
     """
     try:
         with socket.socket(fileno=os.dup(descriptor)) as connection:

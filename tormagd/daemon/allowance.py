@@ -7,7 +7,10 @@ PEERS = 256
 
 
 class Allowance:
-    """A token bucket for each peer: `per_s` messages a second, and a `burst` at once. No sockets, no clock."""
+    """A token bucket for each peer: `per_s` messages a second, and a `burst` at once. No sockets, no clock.
+
+    Neither figure is checked; both are to be positive.
+    """
 
     def __init__(self, per_s: float, burst: float) -> None:
         self._per_s, self._burst = per_s, burst
@@ -17,8 +20,9 @@ class Allowance:
     def grants(self, peer: Peer, now_s: float) -> bool:
         """Tell whether one more message of `peer` may be read at `now_s`; if so, it is taken from the peer's bucket.
 
-        A new peer begins with a full bucket. Of more than PEERS peers, the one heard longest ago is forgotten, and
-        would begin anew. `now_s` must not fall.
+        A new peer begins with a full bucket, and none holds more than `burst`. Of more than PEERS peers, the one heard
+        longest ago is forgotten, and would begin anew. A refused message counts as heard. `now_s` must not fall, which
+        is not checked.
         """
         if peer not in self._buckets and len(self._buckets) >= PEERS:
             del self._buckets[min(self._buckets, key=self._buckets.__getitem__)]

@@ -47,9 +47,10 @@ class Arming:
     def advance(self, now_s: float, safety: SafetyState, present: Conditions, give: Callable[[str], None]) -> None:
         """Give the next command by calling `give`, once its time has come; end in ENABLED or at a refusal.
 
-        `give` raises RefusedError. Refusals named in WAITS are tried again for PATIENCE_S; any other ends the arming.
-        So do a new fault, a device that is not connected, and one that is still busy MOVES_S after a command. Nothing
-        is raised: `refusal` says why the arming ended. Once over, it does nothing.
+        Call it again and again: each call gives one command at most, and no command is given twice. `give` raises
+        RefusedError. Refusals in WAITS are tried again for PATIENCE_S; any other ends the arming. So do a new fault, a
+        device that is not connected, and one still busy MOVES_S after a command. RefusedError is never raised:
+        `refusal` says why it ended. Once over, it does nothing.
         """
         if self.is_over:
             return
@@ -68,15 +69,17 @@ class Arming:
             self.end(error)
 
     def _require_no_news(self, safety: SafetyState) -> None:
-        """Raise RefusedError where a fault is latched that the person has not seen, or any after `clear-fault`."""
+        """Raise RefusedError for a latched fault that the person has not seen; after `clear-fault`, for any."""
         news = [fault for fault in safety.faults if fault not in self._faults or Event.CLEAR_FAULT in self.given]
         if news:
             raise RefusedError("fault", f"a fault came while arming: {', '.join(news)}", "tormagctl status")
 
     def _attempt(self, now_s: float, command: Event, give: Callable[[str], None]) -> None:
-        """Give `command` and note it. Raises RefusedError where it is refused, or was given and has not led on.
+        """Give `command` and note it in `given`. Raises RefusedError where it is refused, or was given and has not led
+        on.
 
-        Refusals in WAITS are passed over for PATIENCE_S after the last command or motion.
+        Refusals in WAITS are passed over, and nothing is noted, until PATIENCE_S after the last command or motion. A
+        command that was given before counts as refused with `busy`, which is one of these.
         """
         try:
             if command in self.given:
@@ -91,9 +94,9 @@ class Arming:
 
 
 def _next(safety: SafetyState, present: Conditions) -> Event:
-    """Return the next command towards ENABLED; `clear-fault` first where only the device has latched a fault.
+    """Return the next command towards ENABLED; `clear-fault` where only the device has latched a fault.
 
-    Not to be called in ENABLED: there is none.
+    Not to be called in ENABLED: there is none, and IndexError is raised.
     """
     if present.device_latched and safety.operating_state is OperatingState.DISABLED:
         return Event.CLEAR_FAULT

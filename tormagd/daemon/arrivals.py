@@ -38,7 +38,8 @@ class Arrivals:
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
         """Tell whether a message waits in a watched socket; False for one that is not watched.
 
-        A message that came after the last `look` is seen only where the socket counts as ready.
+        A message that came after the last `look` is seen only where the socket counts as ready. A socket that is found
+        empty counts as ready no longer.
         """
         if socket not in self._ready:
             return False

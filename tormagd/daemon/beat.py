@@ -35,7 +35,10 @@ Part = tuple[str, Callable[[Beat], object]]
 
 
 class Delay(NamedTuple):
-    """Delay of a late beat: from when it was due until it drove the device, and the part that took most of it."""
+    """Delay of a late beat: from when it was due until it drove the device, ns.
+
+    `culprit` is the part that took most of it, or KERNEL; `share_ns` is what it took.
+    """
 
     took_ns: int
     culprit: str
@@ -78,16 +81,16 @@ class Phases:
     def begin(self, phases: list[Part], slices: list[Part]) -> None:
         """Set the phases and slices of every beat from now on, each name with its function, and empty `spent`.
 
-        Needs a slice at least, and names that differ. Call it before the first `run`.
+        Needs at least one slice, and names that differ, which is not checked. Call it before the first `run`.
         """
         self._phases, self._slices = phases, slices
         self.spent = {name: Histogram() for name, _ in (*phases, *slices)}
 
     def run(self, due_ns: int, merged: int) -> None:
-        """Run one beat that was due at `due_ns`, and stands for `merged` missed ones, too.
+        """Run one beat that was due at `due_ns` of the monotonic clock, and stands for `merged` missed ones, too.
 
-        Runs all phases, then one slice. Where the last beat's slice had work, slices run in turn until one has work
-        again. The times of every COUNTED-th beat go into `spent`.
+        Runs all phases, then one slice, the next in turn. Where the last beat's slice had work, slices run in turn
+        until one has work again. No exception of a part leaves it. The times of every COUNTED-th beat go into `spent`.
         """
         beat = Beat(due_ns, self._clock_ns(), merged)
         self._last_ran, self._ran = self._ran, []
@@ -112,8 +115,9 @@ class Phases:
         """Return the delay of the device since `due_ns`, and the part that took most of it. Call in the phase that
         drives.
 
-        Where the thread did not run for more than half of the delay, by `cpu_ns`, KERNEL is to blame. A shorter pause
-        counts for the part in which it fell. Counts the part in `blamed`, and keeps the worst delay for `tell`.
+        Counts that part in `blamed`, and keeps the worst delay for `tell`. Where the thread did not run for more than
+        half of the delay, by `cpu_ns`, KERNEL is to blame. A shorter pause counts for the part in which it fell. The
+        last beat's parts count as far as they ran after `due_ns`. Processor time for the next call counts from now.
         """
         done_ns = self._clock_ns()
         took_ns = done_ns - due_ns
@@ -137,8 +141,8 @@ class Phases:
     def tell(self) -> None:
         """Log the number of late beats and the worst of them since the last line, at most once in NEWS_NS.
 
-        The line is an error where the worst delay was over `stall_ns`, else a warning. Without late beats nothing is
-        logged.
+        Late beats are those of `blame`. The line is an error where the worst delay was over `stall_ns`, else a warning.
+        Without late beats nothing is logged; what comes too soon for a line is told with the next one.
         """
         now_ns = self._clock_ns()
         if self._late and now_ns >= self._tell_ns:
@@ -154,7 +158,8 @@ class Phases:
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
         """Run one part and keep its times; return False, and keep none, where it returned False: it had nothing to do.
 
-        An exception is logged and counts as something done.
+        Any other result counts as something done. So does an exception, which is logged unless its message is that
+        part's last one.
         """
         start_ns = self._clock_ns()
         try:

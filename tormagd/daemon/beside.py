@@ -12,8 +12,9 @@ MAX_PACKET = 65_536
 def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
     """Start `python -m module DESCRIPTOR`, with the socket `its_end` as that descriptor, and return the process.
 
-    It gets no signal of our process group: it is to end once our end of the socket is closed. Its stdin is empty, its
-    stdout and stderr are ours. The caller closes `its_end` here. Raises OSError.
+    Does not wait for it. It gets no signal of our process group: it is to end once our end of the socket is closed. Its
+    stdin is empty, its stdout and stderr are ours. The caller closes `its_end` here, and waits for the process. Raises
+    OSError where it does not start; a wrong `module` shows only in its end.
     """
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
@@ -37,9 +38,10 @@ class Beside:
         "Whether the process was found to have ended, or this end is closed."
 
     def send(self, data: bytes) -> bool:
-        """Send one packet, and return whether the socket took it.
+        """Send one packet without waiting, and return whether the socket took it, which does not say that it was read.
 
-        False where the socket is full, the packet is too long, or the process has ended; the last sets `is_gone`.
+        False where the socket is full, the packet is too long, `close` was called, or the process has ended. The last
+        sets `is_gone`.
         """
         try:
             self.socket.send(data)
@@ -52,7 +54,7 @@ class Beside:
     def receive(self, wait_s: float = 0.0) -> bytes | None:
         """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process has ended.
 
-        The end of the process sets `is_gone`. Of a packet over MAX_PACKET bytes the rest is lost.
+        0 does not wait. The end of the process sets `is_gone`. Of a packet over MAX_PACKET bytes the rest is lost.
         """
         try:
             if wait_s:

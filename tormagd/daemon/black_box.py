@@ -101,18 +101,19 @@ class BlackBox:
         self._asked: deque[Write] = deque(maxlen=MAX_ASKED)
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
-        """Begin the journal with the states before the first tick. It also takes what passes through `connection`.
+        """Begin the journal with a snapshot of both states, which are those before the first tick.
 
-        Does nothing without a keeper.
+        The journal becomes `connection.traffic`: it also takes what passes to and from the device. Does nothing without
+        a keeper.
         """
         if self._beside is not None:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
-        """Begin anew with the core of another scene, from these states. Does nothing without a keeper.
+        """Begin anew with the core of another scene, from a snapshot of these states. Does nothing without a keeper.
 
-        The keeper gets the new `header` and forgets all entries of the scene before.
+        The keeper gets the new `header` and forgets all entries of the scene before, as do journal and packer here.
         """
         if self._beside is None or self._folder is None:
             return
@@ -122,11 +123,11 @@ class BlackBox:
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
-        """Add the record of a control period to the journal. Does nothing without a keeper.
+        """Add the record of a control period to the journal, and encode all entries since the last call.
 
-        Every PART_TICKS periods the entries go to the keeper. What its socket does not take is lost and counted. After
-        a loss, and every SNAPSHOT_S, a snapshot of both states follows. An entry that cannot be encoded ends the black
-        box.
+        Does nothing without a keeper. Every PART_TICKS periods the entries go to the keeper; what its socket does not
+        take is lost, and the part is counted. After a loss, and every SNAPSHOT_S, a snapshot of both states follows. An
+        entry that cannot be encoded ends the black box, and is logged.
         """
         if self._beside is None:
             return
@@ -148,11 +149,12 @@ class BlackBox:
             self._snapshot(stepper, planner)
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
-        """Ask the keeper to write a black box, and return the path that it will have.
+        """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
+        the ms.
 
-        `reason` becomes part of its name, `details` of its contents. It also holds what comes in the next `after_s`.
-        Clears the last refusal; `look` notes how the writing ended. A ninth request that waits drops the oldest. Raises
-        RefusedError without a keeper.
+        `reason` is not checked for what a file's name may hold. `details`, of the caller's choice, goes into the file's
+        metadata. The box also holds what comes in the next `after_s`. Clears the last refusal; `look` notes how the
+        writing ended. A ninth request that waits drops the oldest. Raises RefusedError without a keeper.
         """
         if self._folder is None or self._beside is None:
             raise RefusedError(
@@ -171,7 +173,7 @@ class BlackBox:
     def look(self) -> None:
         """Send the keeper the requests that wait, and note its answers in `report` and in the log. Never waits.
 
-        A keeper that has ended ends the black box.
+        A keeper that has ended ends the black box for good: nothing starts another. Without a keeper nothing happens.
         """
         self._send_requests()
         while self._beside is not None and (data := self._beside.receive()) is not None:
@@ -188,10 +190,10 @@ class BlackBox:
         self._stop_if_gone()
 
     def report(self) -> BlackBoxReport:
-        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost.
+        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since the start.
 
-        File and failure show once `look` has noted them. A text is empty where there is none: no folder, no file in
-        this run, nothing wrong.
+        File and failure show once `look` has noted them; the next request for a box clears the failure. A text is empty
+        where there is none: no folder, no file in this run, nothing wrong.
         """
         return BlackBoxReport(
             folder="" if self._folder is None else str(self._folder),
@@ -203,7 +205,7 @@ class BlackBox:
     def close(self) -> None:
         """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and leave it then.
 
-        Does nothing without a keeper.
+        Call it at the end: nothing is kept any more. Does nothing without a keeper.
         """
         beside = self._beside
         if beside is not None:
@@ -235,9 +237,9 @@ class BlackBox:
             self._stop("the process that keeps it has ended")
 
     def _stop(self, reason: str) -> None:
-        """End the black box: close the socket, and empty and stop the journal. Control goes on.
+        """End the black box: close the socket, stop the journal and drop its entries. Control goes on.
 
-        `reason` goes into the log and into `report`.
+        `reason` goes into the log, as an error, and into `report`. The keeper sees a closed socket without an End.
         """
         self._refusal = reason
         log.error("no black box is kept any more: %s; next: start the daemon again", reason)

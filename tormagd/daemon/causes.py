@@ -25,9 +25,10 @@ class Causes:
         self._told: dict[str, str] = {}
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:
-        """Note a stall in `stall`, where the step that just ran has taken its own delay for one.
+        """Set `stall` where the step that just ran has taken its own delay for a stall; else change nothing.
 
-        `delay` says what to blame. A stall whose length, ms, is the known one's changes nothing.
+        `delay` names the part to blame; the length is the step's own, ms to a tenth. A stall of the same length as the
+        last counts as the same one.
         """
         sight, known, stall_ms = stepper.measure.sight, self.stall, round(stepper.measure.sight.stall_s * 1e3, 1)
         if sight.stalled_s == stepper.time_s and (known is None or known.ms != stall_ms):
@@ -36,8 +37,8 @@ class Causes:
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
         """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes.
 
-        `measurement` is None without a device: only HOST_STALL then has figures. A fault without figures keeps its
-        cause in words alone.
+        `measurement` is the newest; None without a device: only HOST_STALL then has figures. A fault without figures
+        keeps its cause in words alone, and what was remembered of it before is dropped. The figures serve `of_faults`.
         """
         figures = {} if measurement is None else _figures(stepper, measurement)
         for fault in faults:
@@ -58,9 +59,10 @@ class Causes:
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
-        """Return each fault with its cause, in figures of when it was latched where there are any, and its remedy.
+        """Return each fault with its cause and its remedy, in the order of `faults`.
 
-        They stay in their order. Raises KeyError for a code that FAULTS does not have.
+        A cause has the figures of when the fault was given to `tell`, where there are any. Raises KeyError for a code
+        that FAULTS does not have.
         """
         return explanations(faults, FAULTS, self._told)
 
@@ -71,11 +73,11 @@ class Causes:
         of_sources: Mapping[Limit, Explanation],
         measurement: Measurement | None,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause, in figures where there are any, and its remedy; in their order.
+        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of `limits`.
 
-        `replaced` names the inputs that the model was held to its range in. `of_sources` are explanations of limits
-        about publishers, and go before those of LIMITS. `measurement` is the newest; None without a device. Raises
-        KeyError for a code that neither has.
+        `replaced` names the model's inputs that were held to its range; only MODEL_RANGE uses it. `of_sources` are
+        explanations of limits about publishers, and go before those of LIMITS. `measurement` is the newest; None
+        without a device: LINK_DEGRADED and CLOCK then have no figures. Raises KeyError for a code that neither has.
         """
         told = {Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered"}
         told |= {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"}
@@ -90,7 +92,11 @@ class Causes:
 
 
 def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
-    """Return figures for the faults that have any, from the measurement and from what the step remembers."""
+    """Return figures, as texts, for those faults that have any now; the others are no keys.
+
+    Ages and distances are of `measurement` at the last step. ENCODER is a key only after a leap of an encoder. The
+    faults of homing and opening are those that the step itself has found.
+    """
     leap, homing, opening = stepper.measure.leap, stepper.homing, stepper.opening
     return {
         Fault.SENSE_STALE: f"for {(stepper.time_s - measurement.sensed_s) * 1e3:.0f} ms",
@@ -108,8 +114,9 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
 def explanations(
     codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str] = MappingProxyType({})
 ) -> tuple[Explained, ...]:
-    """Return each code with its cause and remedy from `table`; a cause in `told` goes before the table's.
+    """Return each code with its cause and remedy from `table`, in the order of `codes`; empty for none.
 
-    Raises KeyError for a code that `table` does not have, also where `told` has it.
+    A cause in `told` goes before the table's; other keys of it do not matter. Raises KeyError for a code that `table`
+    does not have, also where `told` has it.
     """
     return tuple(Explained(str(code), told.get(code, table[code].cause), table[code].remedy) for code in codes)

@@ -39,8 +39,8 @@ class ControlLoop:
         """Step the core along `plan` with the newest measurement, and send its output to the device.
 
         Without a device the measurement is None: the core is stepped all the same, and the connection may open its
-        port. Keeps output, plan and measurement for telemetry. Notes in the journal that a step ran, not the tick's
-        record. Records the beat's times in `timing`.
+        port. Keeps output, plan and measurement in `output`, `used` and `measurement`. Notes in the journal that a step
+        ran, not the tick's record. Records the beat's times, from when it was due to now, in `timing`.
         """
         now_s = time.monotonic()  # now, not when the beat began: a stall within the beat counts, too
         self.used, self.measurement = plan, self._connection.measurement
@@ -66,8 +66,8 @@ class ControlLoop:
     def arm(self, conditions: Conditions) -> None:
         """Begin an arming, or go on with the one under way, and give its next command if its time has come.
 
-        An arming that begins may clear the faults that are latched now. Raises RefusedError where the arming ends
-        refused in this call.
+        An arming that begins may clear the faults that are latched now. It is rarely over with this call: see
+        `go_on_arming` and `arming.is_over`. Raises RefusedError where it ends refused in this call.
         """
         if self.arming is None or self.arming.is_over:
             self.arming = Arming(time.monotonic(), self.stepper.safety.faults)
@@ -76,9 +76,10 @@ class ControlLoop:
             raise self.arming.refusal
 
     def go_on_arming(self, conditions: Conditions) -> None:
-        """Give the next command of an arming under way, if its time has come; else do nothing.
+        """Give the next command of an arming under way, if its time has come; else do nothing. Call it again and again.
 
-        A refusal ends the arming and is logged, not raised.
+        Without an arming, or after its end, nothing is done. A refusal ends the arming, is logged and kept in
+        `arming.refusal`, and is not raised.
         """
         arming = self.arming
         if arming is None or arming.is_over:
@@ -88,7 +89,11 @@ class ControlLoop:
             log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
 
     def _give(self, name: str, conditions: Conditions) -> None:
-        """Give a command to the core; note it in the journal, and log it if taken. Raises RefusedError if refused."""
+        """Give an operator's command to the core under `conditions`, and log it if taken. Raises RefusedError if
+        refused.
+
+        The journal notes it in either case.
+        """
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
             self.stepper.command(name, now_s, conditions)

@@ -148,9 +148,10 @@ class Daemon:
     async def run(self) -> None:
         """Open the device and run until SIGTERM or SIGINT; then open the gap, keep the profile and close everything.
 
-        Systemd is told that it stops. The black box is finished, and the search's process ended. SIGHUP reads keys and
-        configuration again. Freezes the garbage collector and shortens the interpreter's switch interval, both for the
-        whole process. Raises OSError where the kernel gives no timer.
+        The end takes up to LONGEST_RETRACT_S and NAMED_S. Systemd is told that the daemon stops. The black box is
+        finished, and the search's process ended. SIGHUP reads keys and configuration again. Freezes the garbage
+        collector and shortens the interpreter's switch interval, both for the whole process. A device that cannot be
+        opened is tried again while it runs. Raises OSError where the kernel gives no timer. Call it once.
         """
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, self._ended.set)
@@ -201,8 +202,9 @@ class Daemon:
     def _drive(self, beat: Beat) -> None:
         """Drive the device along the newest plan.
 
-        A tick more than a period late is put down to the part that delayed it. New faults are explained in the log, and
-        a black box is written that goes on for AFTER_FAULT_S.
+        A tick that ends more than a period after it was due is put down to the part that delayed it. New faults are
+        explained in the log. A black box named after the first is asked for, which goes on for AFTER_FAULT_S; without a
+        black box nothing is.
         """
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
@@ -217,10 +219,11 @@ class Daemon:
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
 
     async def _build(self, scene: str) -> Core:
-        """Build the core of another scene at the running rates, and wait until the profile is on the disk.
+        """Build the core of another scene at the running rates, in another thread; wait for a profile that is being
+        written.
 
-        Raises ConfigError for a scene that is refused. It also does where the search of either scene runs in its own
-        process.
+        The running core stays. Raises ConfigError for a scene that is refused. It also does where the search of either
+        scene runs in its own process.
         """
         # in a thread: no beat waits for it
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
@@ -234,7 +237,11 @@ class Daemon:
         self._control.command("use-scene", self._telemetry.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
-        """Replace the running core by `core`, made for `scene`; what was learned stays where insert and model do."""
+        """Replace the running core by `core`, made for `scene`, as `_run_core` does.
+
+        What was learned of the device stays where insert and model do. The scene also becomes that of the configuration
+        without calibration.
+        """
         before, learned = self._core, self._inference.planner.believe.learned()
         self._calibrations.configured = msgspec.structs.replace(self._calibrations.configured, scene=scene)
         self._run_core(msgspec.structs.replace(self._config, scene=scene), core)
@@ -244,8 +251,9 @@ class Daemon:
     def _run_core(self, config: Config, core: Core) -> None:
         """Replace the running core by `core`, made of `config`, between two beats.
 
-        Operating state, faults and homing stay. Nothing is known of the device. The newest setpoint is forgotten,
-        profiles are read again, telemetry reports on the new core, and the black box begins anew.
+        Operating state, latched faults and the device's own homing stay. What was learned of the device is forgotten,
+        and its profile is read again. So is the newest setpoint. Telemetry reports on the new core, and the black box
+        begins anew. Rates have to be the same, which is not checked.
         """
         control, inference, now_s = self._control, self._inference, time.monotonic()
         safety, stepper, planner = control.stepper.safety, core.stepper(now_s), core.planner(now_s)
@@ -268,8 +276,8 @@ class Daemon:
         """Read keys and configuration again, and take over what may change while control runs.
 
         The device's calibration is read again, too. Logs which keys of the configuration changed, and which wait for a
-        restart. Lists of keys that are refused stay
-        as they were; so does a configuration that is refused. Neither raises.
+        restart. Lists of keys that are refused stay as they were, and so does a configuration that is refused: both are
+        logged, not raised. The event loop reports any other error.
         """
         # in threads: no beat waits for a file
         try:
@@ -296,10 +304,10 @@ class Daemon:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     async def _open_gap(self) -> None:
-        """Command the device to open, and wait for it, LONGEST_RETRACT_S at most.
+        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the beat goes on.
 
-        In FAULT or without a device nothing is commanded. A gap that is still closed is waited for NAMED_S more: its
-        fault is then logged.
+        In FAULT or without a device nothing is commanded. Where the gap is still closed then, wait NAMED_S more: its
+        fault is then logged. Nothing is returned or raised where it stays closed.
         """
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())

@@ -110,10 +110,11 @@ class Endpoint:
         self.listeners = Listeners()
 
     def take_setpoints(self) -> bool:
-        """Read the waiting setpoints, DRAIN messages at most; return True if another setpoint is in force.
+        """Read the waiting setpoints, DRAIN messages at most, into `inbox`; return True if another setpoint is in
+        force.
 
-        What a publisher sends beyond its allowance, or with a key that is off the list, is dropped and counted. A
-        message of several parts is refused. Nothing is raised.
+        One that waited in the playout may be it. What a publisher sends beyond its allowance, or with a key that is off
+        the list, is dropped and counted. A message of several parts is refused. Nothing is raised.
         """
         is_newer = False
         for _ in range(DRAIN):
@@ -149,10 +150,11 @@ class Endpoint:
         self._send(self._recording, "recording", encode_ticks(rows, columns))
 
     def take_requests(self, answer: Answer) -> None:
-        """Take waiting requests from the socket: TAKEN at most, for TAKEN_NS. Answer `stop` and `disable` at once.
+        """Take waiting requests from the socket, TAKEN at most, for TAKEN_NS; answer `stop` and `disable` at once.
 
         All others wait for `serve`; what is more than may wait is dropped and counted. `answer` returns the result of a
-        request, or raises RefusedError.
+        request, or raises RefusedError, which becomes the reply. Any other error of `answer` is raised, and that
+        request gets no reply.
         """
         until_ns = time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
@@ -170,9 +172,9 @@ class Endpoint:
     def serve(self, answer: Answer, most: int) -> int:
         """Answer the waiting requests, `most` at most, for about ANSWERS_NS; return the number answered.
 
-        `answer` returns the result of a request, or raises RefusedError, which becomes the reply. A request that cannot
-        be decoded, is not permitted or was overtaken is answered with the reason. A reply to a client that has gone is
-        dropped.
+        `answer` returns the result of a request, or raises RefusedError, which becomes the reply; any other error is
+        raised. A request that cannot be decoded, is not permitted or was overtaken is answered with the reason. A reply
+        to a client that has gone is dropped.
         """
         until_ns = time.monotonic_ns() + ANSWERS_NS
         for number in range(most):
@@ -209,10 +211,10 @@ class Endpoint:
         self._context.destroy(linger=0)
 
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
-        """Return a new socket of this kind, guarded where it has to be, bound to `address`, with bounded queues.
+        """Return a new socket of this `kind`, guarded where it has to be, bound to `address`, with bounded queues.
 
-        The file of an `ipc://` address is made, and removed by `close`. An XPUB tells every subscription. Raises
-        OSError naming the endpoint.
+        Of an `ipc://` address the file is made, and removed by `close`. An XPUB passes on every subscription, also
+        repeated ones. Raises OSError naming the endpoint, the address and why it cannot be bound.
         """
         made = self._context.socket(kind)
         options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
@@ -235,9 +237,10 @@ class Endpoint:
         return made
 
     def _send(self, to: "zmq.Socket[bytes]", name: str, *parts: bytes) -> None:
-        """Send to all subscribers, then read their subscriptions, DRAIN at most.
+        """Send to all subscribers, then read what they say, DRAIN messages at most. Never waits.
 
-        Topics are counted in `listeners`. A subscriber that says more than its allowance is cut off and counted.
+        Those that do not keep up miss it. Subscriptions to topics of the telemetry socket are counted in `listeners`. A
+        subscriber that says more than its allowance is cut off and counted.
         """
         # drops for a subscriber that does not keep up; it never blocks
         with contextlib.suppress(zmq.Again):
@@ -262,9 +265,10 @@ class Endpoint:
         return Peer(str(frame.get("Peer-Address")), key)
 
     def _next_request(self) -> Waiting | None:
-        """Read the next message, which must be waiting; None for a further part of a message read before.
+        """Read the next message; None for a further part of a message read before, which is dropped.
 
-        A message of too many parts is returned without data, so that it is answered as no request.
+        A message must be waiting: zmq.Again is raised otherwise. One of too many parts is returned without data, so
+        that it is answered as no request. The request keeps how often the gap had been told to open by now.
         """
         if self._is_in_parts_of_request:
             self._is_in_parts_of_request = self._control.recv(zmq.NOBLOCK, copy=False).more
@@ -281,8 +285,8 @@ class Endpoint:
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
         """Carry out and answer a `stop` or `disable`, and return True, also where it was refused.
 
-        Where it succeeds, requests that came before it count as overtaken. Returns False, with nothing done, for
-        anything else.
+        Where it succeeds, `requests.opens` rises, so that requests that came before it count as overtaken. Returns
+        False, with nothing done, for anything else, also for what cannot be decoded.
         """
         try:
             request = decode(waiting.data, Request)
@@ -296,7 +300,11 @@ class Endpoint:
         return True
 
     def _answered(self, waiting: Waiting, answer: Answer) -> Reply:
-        """Carry out a request, and return the reply. What cannot be decoded is answered with `bad_request`."""
+        """Carry out a request, and return the reply. What cannot be decoded is answered with `bad_request`, and has no
+        id.
+
+        A refusal becomes the reply, as in `_carried_out`.
+        """
         try:
             request = decode(waiting.data, Request)
         except MessageError as error:
@@ -305,7 +313,11 @@ class Endpoint:
         return self._carried_out(request, waiting, answer)
 
     def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:
-        """Carry out a request that is permitted, and return the reply. Any RefusedError becomes the reply."""
+        """Carry out a request that is permitted, and return the reply; a RefusedError becomes the reply, with `ok`
+        False.
+
+        Any other error of `answer` is raised.
+        """
         try:
             self._require_permitted(request, waiting)
             return Reply(v=VERSION, id=request.id, ok=True, result=answer(request))
@@ -313,9 +325,10 @@ class Endpoint:
             return Reply(v=VERSION, id=request.id, ok=False, error=ErrorReply(error.code, error.message, error.hint))
 
     def _require_permitted(self, request: Request, waiting: Waiting) -> None:
-        """Raise RefusedError where the peer's key lacks the role for a request; count it as dropped.
+        """Raise RefusedError where the peer's key lacks the role for a request, and count it as dropped.
 
-        Also raise it where a `stop` or `disable` came later and was carried out before. Questions are never overtaken.
+        Peers of an open endpoint have no key, and may do everything. Raise it also where a `stop` or `disable` came
+        later and was carried out before; `status` and `describe` are never overtaken.
         """
         is_observed, key = request.command in OBSERVED, waiting.peer.key
         if key and not self.admission.has_role(key, MAY["control"] if is_observed else OPERATOR):
@@ -344,7 +357,8 @@ class Endpoint:
 def context(io_priority: int) -> "zmq.Context[zmq.Socket[bytes]]":
     """Return a ZeroMQ context whose threads run at this priority of SCHED_FIFO; 0: at none, as ordinary threads.
 
-    A refused priority ends the process when the first socket is made: see `realtime.priority_of_threads`.
+    The caller closes it. A refused priority ends the process when the first socket is made: see
+    `realtime.priority_of_threads`.
     """
     made = zmq.Context()
     if io_priority:

@@ -42,7 +42,8 @@ class Heartbeat:
     def beats(self) -> int:
         """Return the number of beats due since the last call: 0 if none is, more than 1 if some were missed.
 
-        Sets `due_ns` to when the newest was due. Never waits.
+        Sets `due_ns`, of the monotonic clock, to when the newest was due; the first is due a period after the timer was
+        made. Never waits. Not to be called after `close`.
         """
         try:
             expirations: int = struct.unpack("=Q", os.read(self._fd, 8))[0]

@@ -22,7 +22,8 @@ def is_passed(hold: Hold, source: str, priority: tuple[str, ...], *, is_stale: b
     """Tell whether a message of `source`, which does not hold the brake, makes it the holder.
 
     It does where the holder's newest setpoint is too old (`is_stale`). It also does where `source` comes before the
-    holder in `priority`, unless an operator has chosen the holder. Sources that are not listed come last.
+    holder in `priority`, the first of all, unless an operator has chosen the holder. Sources that are not listed come
+    last, all alike. Nothing is changed.
     """
     # an operator's choice goes before the configured order, and what is not listed comes after all that is
     ranks = {name: place for place, name in enumerate(priority)}

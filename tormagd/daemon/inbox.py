@@ -70,9 +70,10 @@ class _Source:
         self.refresh(now_s)
 
     def refresh(self, now_s: float) -> bool:
-        """Update the reported figures: delays, the clock's line, and what is wrong with clock or stamps.
+        """Update the reported figures: delays, the clock's line `fit`, and `cause` and `remedy` of wrong clock or
+        stamps.
 
-        Returns True if something is newly wrong, once the clock's offset is known.
+        Returns True if something is newly wrong since the last call, once the clock's offset is known.
         """
         self.delays.refresh()
         self.fit = self.clock.line.fit()
@@ -87,11 +88,10 @@ class _Source:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
-        """Make `setpoint` the source's newest, heard at `now_s` and stamped by `delay_s`, its age on arrival.
+        """Make `setpoint` the source's newest, heard at `now_s` and stamped `delay_s`, its age on arrival, before.
 
-        `delay_s` is by the corrected clock; below 0 counts as 0. Once the clock's offset is known, delay and manner of
-        sending are judged by the scene's `needs`. With `playout_s` it is judged by its age when
-        it is followed.
+        `delay_s` is by the corrected clock; below 0 counts as 0. Once the clock's offset is known, the scene's `needs`
+        judge delay and manner of sending. With `playout_s`, s, they judge the age when it is followed.
         """
         clock = self.clock
         if clock.is_settled:
@@ -132,10 +132,11 @@ class SetpointInbox:
         self._turn = 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
-        """Decode and judge one message; return True if another setpoint is in force after it. Nothing is raised.
+        """Decode and judge one message, and count it; return True if another setpoint is in force after it.
 
-        Old or repeated messages count in `dropped`, refused ones in `refused`. `last_refusal` says why, unless another
-        source holds the brake. `now_s` is the control clock, `realtime_ns` CLOCK_REALTIME of the same moment.
+        Nothing is raised. Old or repeated messages count in `dropped`, refused ones in `refused`, others in `accepted`.
+        `last_refusal` says why, unless another source holds the brake. `now_s` is the control clock, `realtime_ns`
+        CLOCK_REALTIME of the same moment. False also stands for a setpoint that waits in the playout.
         """
         try:
             setpoint = decode(data, Setpoint)
@@ -149,9 +150,9 @@ class SetpointInbox:
     def give(self, name: str, now_s: float) -> None:
         """Make the source `name` the holder of the brake, as an operator's choice.
 
-        Its newest setpoint becomes the one to plan for when it is due, and a log line is queued, unless it is the
-        holder already. Sources of higher priority do not take the brake from it. Raises RefusedError for a source that
-        is not known, or whose newest setpoint is no longer valid.
+        Its newest setpoint becomes the one to plan for when it is due, and a log line is queued for `tell`. The holder
+        itself only becomes the operator's choice. Sources of higher priority do not take the brake from it, until it is
+        stale. Raises RefusedError for a source that is not known, or whose newest setpoint is no longer valid.
         """
         source = self._sources.get(name)
         if source is None:
@@ -191,9 +192,10 @@ class SetpointInbox:
         self.has_way, self._needs = scene.element == "torque", needs_of(scene)
 
     def withdraw(self, reason: str) -> None:
-        """Forget the setpoint to plan for and those that wait, and count one as refused for `reason`.
+        """Forget the setpoint to plan for and those that wait; count one refused message, with `reason` as
+        `last_refusal`.
 
-        Without a setpoint to plan for do nothing.
+        Holder and sources stay. Without a setpoint to plan for do nothing, also where some wait.
         """
         if self.playout.in_force is not None:
             self.playout.forget()
@@ -211,9 +213,10 @@ class SetpointInbox:
             log.warning("%s", self._news.popleft())
 
     def told(self, now_s: float) -> dict[Limit, Explanation]:
-        """Return explanations of the limits about sources, as things are now, in force or not.
+        """Return explanations of the limits about sources, as things are now, whether the limits are in force or not.
 
-        Empty while no source holds the brake.
+        STALE and OTHER_SOURCE are always keys, the others where the holder's manner of sending is wrong. Empty while no
+        source holds the brake.
         """
         holder = self._sources.get(self.hold.source)
         if holder is None:
@@ -222,9 +225,9 @@ class SetpointInbox:
         return why | holder.manner.found
 
     def refresh(self, now_s: float) -> None:
-        """Update the reported figures of the playout, and of one source, each in turn.
+        """Update the reported figures of the playout, and those of one source, the next in turn.
 
-        Queues a log line if that source's clock is newly wrong.
+        Queues a log line if that source's clock or stamps are newly wrong. Does nothing before the first source.
         """
         if self._sources:
             self._turn += 1
@@ -238,8 +241,8 @@ class SetpointInbox:
         """Return counts, the last refusal, and each source's `seq`, with full reports on the holder and the newest
         others.
 
-        There are REPORTED full reports at most. At `now_s` a source is stale or not, and silent for so long. Delays and
-        the judgement of a clock are of the source's last `refresh`.
+        There are REPORTED full reports at most, the holder's first. At `now_s` a source is stale or not, and silent for
+        so long. Delays and the judgement of a clock are those of the source's last `refresh`.
         """
         newest = sorted(self._sources, key=lambda name: (name != self.hold.source, -self._sources[name].heard_s))
         return SetpointReport(
@@ -255,11 +258,12 @@ class SetpointInbox:
         )
 
     def _judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> bool:
-        """Judge a decoded setpoint; return True if another one is in force after it.
+        """Judge a decoded setpoint and count it; return True if another one is in force after it.
 
-        A stray of its sequence is dropped and counted. One whose source may not take the brake, or that is stale itself
-        beside another holder, is refused and counted; `last_refusal` stays. A new run of the holder's begins a ramp.
-        Raises MessageError for one source too many, for stamps that do not count ns, and for a stamp too far ahead.
+        A stray of its sequence is dropped. One whose source may not take the brake, or that is stale itself beside
+        another holder, is refused; `last_refusal` stays. A new run of the holder's begins a ramp. Raises MessageError
+        for one source too many, for stamps that do not count ns, and for a stamp too far ahead: the caller counts
+        these.
         """
         source, order = self._sources.get(setpoint.source), Order.NEWER
         if source is None:
@@ -299,12 +303,19 @@ class SetpointInbox:
         return self._play(source, now_s)
 
     def _play(self, source: _Source, now_s: float) -> bool:
-        """Give the source's newest setpoint to the playout; return True if another one is in force after it."""
+        """Give the source's newest setpoint to the playout; return True if another one is in force after it.
+
+        False where it has to wait.
+        """
         setpoint = source.setpoint
         return self.playout.update(now_s, Taken(self._timed(source, now_s), setpoint.source, setpoint.seq))
 
     def _hand_over(self, name: str, why: str, *, is_given: bool = False) -> None:
-        """Make the source `name` the holder, and queue a log line that says `why`, unless it is the first."""
+        """Make the source `name` the holder; queue a log line that says `why`, and begin a ramp.
+
+        The first holder ever has neither. `is_given` marks an operator's choice. A source that was passed over is so no
+        longer.
+        """
         if self.hold.source:
             self._news.append(f"source {name!r} holds the brake instead of {self.hold.source!r}: {why}")
         # of the first ever, there is nobody to take over from
@@ -316,7 +327,7 @@ class SetpointInbox:
         """Return the source's newest setpoint, stamped on the control clock, for the planner.
 
         Its limits: OTHER_SOURCE while another source, or a second publisher of the same name, sends too; and what its
-        `manner` found.
+        `manner` found. An absent preview is empty, with a step of 0; other absent fields are None.
         """
         setpoint = source.setpoint
         wall = setpoint.contact
@@ -338,10 +349,10 @@ class SetpointInbox:
         )
 
     def _make_room(self, name: str, now_s: float) -> None:
-        """Forget a source where SOURCES are kept, so that `name` can be added. Raises MessageError where none may go.
+        """Forget one source where SOURCES are kept, so that `name` can be added. Raises MessageError where none may go.
 
-        The source that was silent for longest goes, if for over SILENT_S. Otherwise one that has no priority goes
-        for one that has. The holder stays.
+        The source that was silent for longest goes, if for over SILENT_S. Otherwise the most silent one without
+        priority goes for one that has. The holder stays. With fewer sources nothing happens.
         """
         if len(self._sources) < SOURCES:
             return
@@ -356,7 +367,11 @@ class SetpointInbox:
         del self._sources[oldest.setpoint.source]
 
     def _why_stale(self, holder: _Source, now_s: float) -> Explanation:
-        """Explain a stale setpoint: the holder has fallen silent, its messages come late, or they wait too long."""
+        """Return why a setpoint of the `holder` is stale: it has fallen silent, its messages come late, or they wait
+        too long.
+
+        It is not checked whether one is: where none of these is so, it says that they come late.
+        """
         name, silent_ms = self.hold.source, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
@@ -379,7 +394,11 @@ class SetpointInbox:
         )
 
     def _why_other(self, holder: _Source, now_s: float) -> Explanation:
-        """Explain competing setpoints: two publishers of one name, or another source beside the holder."""
+        """Return why setpoints compete: two publishers of the holder's name, or else the source that was passed over
+        last.
+
+        It is not checked whether any does; without another source its name is empty.
+        """
         if holder.sequence.is_doubled(now_s):
             return Explanation(
                 f"two publishers call themselves {self.hold.source!r}, or one repeats itself: one of them is followed",
@@ -393,8 +412,9 @@ class SetpointInbox:
     def _source_report(self, name: str, now_s: float) -> SourceReport:
         """Return the report on one known source, with the figures of its last `refresh`.
 
-        Raises KeyError for an unknown one. `state` is `stale` for a setpoint that is no longer valid, else `holds` for
-        the holder of the brake, else `refused`.
+        `state` is `stale` for a setpoint that is no longer valid, else `holds` for the holder of the brake, else
+        `refused`. `clock_behind_ms` is None until the offset is known, `clock` until there is a line. Raises KeyError
+        for an unknown source.
         """
         source = self._sources[name]
         clock, sequence = source.clock, source.sequence
@@ -447,9 +467,9 @@ def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: 
 def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: int) -> tuple[str, str]:
     """Return what is wrong with a publisher's clock, and the remedy; two empty texts where nothing is.
 
-    Told are an offset that is not known yet, one beyond AHEAD_S, and a clock that was never set. So are a clock set
+    Wrong are an offset that is not known yet, one beyond AHEAD_S, and a clock that was never set. So are a clock set
     within STEP_NAMED_S, and a drift surely over MAX_DRIFT_PPM. `fit` is the clock's line, None without one. `stamp_ns`
-    is its newest stamp.
+    is the publisher's newest stamp.
     """
     if not clock.is_settled:
         return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"

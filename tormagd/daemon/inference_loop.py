@@ -54,17 +54,20 @@ class InferenceLoop:
     def confirm(self, wrong: Disputed) -> None:
         """Take the operator's word that the device has changed, or that its sensor is wrong; note it in the journal.
 
-        Without a dispute the planner does nothing, but the journal has it.
+        `wrong` is "device" or "sensor", which is not checked. Without a dispute the planner does nothing, but the
+        journal has it.
         """
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
-        """Make a plan if a setpoint has come (`is_asked`) or if one is due; else do nothing.
+        """Make a plan if a setpoint has come (`is_asked`) or if one is due; else do nothing. It becomes
+        `planner.planned`.
 
         `measured` is the last step's measurement, None while the device is silent. `is_followed` says whether that step
-        followed the plan. Where planning fails, nothing is raised: the newest setpoint is withdrawn, the planner is
-        reset, and `on_failure` is called.
+        followed the plan. The next is due a period after this one was; what was missed is not made up for. Where
+        planning fails, nothing is raised: the newest setpoint is withdrawn, the planner is reset, and `on_failure` is
+        called. Records the times in `timing`.
         """
         period_ns = self.timing.period_ns
         # counted from when beats are due, not when they begin: lateness does not lower the rate
@@ -78,10 +81,10 @@ class InferenceLoop:
         self._due_ns = period_ns + (self._due_ns if is_regular else beat.due_ns)
 
     def foresee(self, _beat: Beat) -> bool:
-        """Make the forecast for the next plans, if one is due; return False where none is.
+        """Make the forecast for the next plans, if one is due; return False where none is. The journal notes it.
 
-        Where that fails, nothing is raised: the newest setpoint is withdrawn, the planner is reset, and `on_failure` is
-        called.
+        Where that fails, True is returned and nothing raised: the newest setpoint is withdrawn, the planner is reset,
+        and `on_failure` is called.
         """
         try:
             is_made = self.planner.foresee()
@@ -113,9 +116,11 @@ class InferenceLoop:
             beside.ask(self.planner.question)
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
-        """Reset the planner after a plan or forecast that failed, withdraw the newest setpoint, and call `on_failure`.
+        """Reset the planner at `now_s` after a plan or forecast that failed, withdraw the setpoint, and call
+        `on_failure`.
 
-        The journal notes it. `error` is logged, unless its message is that of the last one.
+        The setpoint counts as refused. The journal notes the reset. `error` is logged with its trace, unless its
+        message is that of the last one.
         """
         if str(error) != self._failure:  # the first failure is news, the same one again is not
             self._failure = str(error)

@@ -30,16 +30,18 @@ class Listeners:
     def hear(self, word: bytes, peer: Peer | None) -> None:
         """Count what a subscriber says to an XPUB socket: byte 1 to subscribe or 0 to end, then the topic's name.
 
-        `peer` is None where libzmq ends the subscription of a peer that has gone. Other topics are passed over.
+        `peer` is None where libzmq ends the subscription of a peer that has gone. Words about other topics, also empty
+        ones, are passed over.
         """
         for topic in TOPICS:
             if word[1:] == topic:
                 self._count(topic, self._asked[topic], peer, is_subscription=word[0] == 1)
 
     def _count(self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
-        """Count one subscription to `topic`, or its end. Peers beyond PEERS are counted together.
+        """Count one subscription to `topic`, or its end, in `asked`. Peers beyond PEERS are counted together.
 
-        It is not known whose subscription libzmq ends. So a topic has no listener once as many are gone as are counted.
+        `peer` None with an end: it is not known whose subscription libzmq ends. So a topic has no listener once as many
+        are gone as are counted.
         """
         if peer not in asked and (len(asked) >= PEERS or not is_subscription):
             peer = None if peer is None else Peer(OTHERS)

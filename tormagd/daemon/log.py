@@ -8,9 +8,9 @@ from tormagd_client.printable import printable
 
 
 def log_to_stderr() -> None:
-    """Send the log of this process to stderr, a line a record.
+    """Send the log of this process, from INFO on, to stderr, a line a record: level, logger's name and message.
 
-    Times are added only on a terminal: a journal has its own.
+    Times are added only on a terminal: a journal has its own. Does nothing where the process logs already.
     """
     handler = logging.StreamHandler(sys.stderr)
     time_first = "%(asctime)s " if sys.stderr is not None and sys.stderr.isatty() else ""

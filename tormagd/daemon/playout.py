@@ -51,10 +51,11 @@ class Playout:
         return self._waiting[-1] if self._waiting else self.in_force
 
     def update(self, now_s: float, taken: Taken | None = None) -> bool:
-        """Take a setpoint, if there is one, and put the newest that is due in force; return True where it is another.
+        """Take a setpoint, if there is one, and put the newest that is due in force; return True where `in_force`
+        changed.
 
-        Those that wait for the same time as `taken`, or a later one, are replaced by it. One that is held back and due
-        already counts as late.
+        Those that wait for the same time as `taken`, or a later one, are dropped for it. One that is held back and due
+        already is followed at once, and counts as late. Of over MAX_WAITING the oldest are dropped.
         """
         if taken is not None:
             self._count(now_s, taken)
@@ -69,7 +70,8 @@ class Playout:
     def report(self, playout_ms: float) -> PlayoutReport | None:
         """Return the delay that is added, the jitter that is taken out, and counts; None where `playout_ms` is 0.
 
-        `playout_ms` is the one in force. Percentiles are those of the last refresh of `held`.
+        `playout_ms` is the one in force. Counts are since the start, the jitter is RFC 3550's running mean. Percentiles
+        are those of the last refresh of `held`.
         """
         if playout_ms == 0.0:
             return None
@@ -82,7 +84,10 @@ class Playout:
         )
 
     def _count(self, now_s: float, taken: Taken) -> None:
-        """Count a setpoint that is to be held, for how long, and by how much that differs from the one before."""
+        """Count a setpoint that is to be held, for how long, and by how much that differs from the one before.
+
+        Does nothing for one without a playout. One that is due already counts as held for 0 s, and as late.
+        """
         if taken.setpoint.playout_s == 0.0:
             return
         held_s = max(taken.due_s - now_s, 0.0)

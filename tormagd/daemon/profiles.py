@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 def state_folder(configured: str, name: str) -> Path | None:
     """Return the folder `configured`, or else `name` in the service's $STATE_DIRECTORY; None without either.
 
-    Of several folders in $STATE_DIRECTORY the first counts. The folder need not exist.
+    An empty `configured` is none. Of several folders in $STATE_DIRECTORY the first counts. The folder need not exist,
+    and is not made.
     """
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(configured) if configured else Path(state, name) if state else None
@@ -48,7 +49,8 @@ class ProfileFolder:
     def read(self, serial_number: int) -> Profile | None:
         """Read the profile of the device with this serial number, and return it; None where there is no file.
 
-        Raises ProfileError for a file that cannot be read or does not fit device, insert, model or bounds.
+        Raises ProfileError, naming the file, where it cannot be read, is over MAX_BYTES, or is no profile. It does,
+        too, for another device, insert or model, and for values out of bounds; other `gains` are no reason.
         """
         path = self.path(serial_number)
         try:
@@ -66,7 +68,8 @@ class ProfileFolder:
     def write(self, profile: Profile) -> None:
         """Write `profile` to its device's file, by way of another file: the old one stays until the new one is whole.
 
-        Makes the folder where it is missing. Raises ProfileError where nothing could be written.
+        Makes the folder, and those above it, where they are missing. Whether it fits insert and model is not checked.
+        Raises ProfileError, naming the file, where it could not be written.
         """
         path = self.path(profile.serial_number)
         try:
@@ -99,10 +102,11 @@ class Profiles:
         self._refusal = "" if folder is not None else "no folder is named for profiles"
 
     def look(self, serial_number: int | None, is_driven: bool) -> None:
-        """Note the connected device's serial number, None where it is not known, and whether it is driven.
+        """Note the connected device's serial number, None where it is not known, and whether it is driven. Never waits.
 
-        A new device's profile begins to be read; what was learned of another device is dropped first. Once a device is
-        no longer driven, its profile is kept. A profile that the device contradicts counts as unused, and is logged.
+        A new device's profile begins to be read; what was learned of another device is dropped first. None changes no
+        device. Once a device is no longer driven, its profile is kept, as by `keep`. A profile that the device
+        contradicts counts as unused, and is logged. Needs a running event loop.
         """
         if serial_number is not None and serial_number != self._serial_number:
             if self._serial_number is not None:
@@ -122,10 +126,10 @@ class Profiles:
         self._was_driven = is_driven
 
     def keep(self) -> None:
-        """Begin to write what was learned as the device's profile, in another thread.
+        """Begin to write what was learned as the device's profile, in another thread; `finished` waits for it.
 
-        Does nothing without a folder or device, where nothing is new since the profile was read or written, and while
-        the sensor is disputed.
+        Does nothing without a folder or device, and while the sensor is disputed. So it does where nothing was learned,
+        or nothing new since the profile was read or written. A failure is logged and reported.
         """
         learned, is_disputed = self._believe.learned(), self._believe.sensor.is_disputed
         is_news = learned.device is not UNSEEN and learned != self._on_disk
@@ -159,7 +163,8 @@ class Profiles:
     def report(self) -> ProfileReport:
         """Return whether a profile is used, how old the one on the disk is, its folder, and why none is used or kept.
 
-        The age, s, is None where none was read or written; texts are empty without a folder or a reason.
+        The age, s, is None where none was read or written for this device; texts are empty without a folder or a
+        reason.
         """
         return ProfileReport(
             is_used=self._is_used,
@@ -172,7 +177,7 @@ class Profiles:
         """Teach the profile that was read, note its digest, and log its age.
 
         One that was refused is logged, and `report` says why. It is dropped where another device is connected by now,
-        or where this one has shown itself. Without a file nothing happens.
+        or where this one has already shown its strength. Without a file nothing happens.
         """
         try:
             profile = reading.result()
@@ -193,7 +198,10 @@ class Profiles:
         log.info("the device's profile of %.1f hours ago is used: scale %.3f", hours, profile.scale)
 
     def _note(self, writing: "asyncio.Future[None]") -> None:
-        """Note whether a profile was written; after a failure the next `keep` writes again."""
+        """Note whether a profile was written. A failure is logged and reported, and the next `keep` writes again.
+
+        A success ends an earlier refusal.
+        """
         try:
             writing.result()
         except ProfileError as error:

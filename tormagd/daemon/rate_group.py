@@ -40,7 +40,8 @@ class Histogram:
     def add(self, now_s: float, value_us: float) -> None:
         """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0, and so does NaN.
 
-        Forgets durations from two horizons ago. `report` stays as it is until `refresh`. Infinity is not allowed.
+        Forgets durations from two horizons ago. `report` stays as it is until `refresh`. What is beyond the last bin,
+        about 67 s, counts in it; infinity raises OverflowError.
         """
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s
@@ -53,7 +54,8 @@ class Histogram:
     def refresh(self) -> None:
         """Compute `report` anew from what is counted: p50, p99, p99.9 and the largest, us; 0 while nothing is.
 
-        A percentile is the upper edge of its bin, but not above the largest.
+        A percentile is the upper edge of its bin, but not above the largest, which is rounded to 0.1 us. What was added
+        longer ago than two horizons is still in it where nothing was added since.
         """
         most = round(max(self._max_now, self._max_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
@@ -67,7 +69,10 @@ class Histogram:
 
 
 def _bin(value_us: float) -> int:
-    """Return the bin of a duration, us; what is longer than the last bin falls into that."""
+    """Return the bin of a duration, us, from 0; what is longer than the last bin falls into that.
+
+    A duration that is not above 0, or NaN, is in bin 0. Infinity raises OverflowError.
+    """
     whole = int(value_us) if value_us > 0.0 else 0
     if whole < _EXACT:
         return whole
@@ -121,8 +126,9 @@ class RateGroup:
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
         """Count one run that was due, began and ended at these times, and stands for `merged` missed ones, too.
 
-        It is an overrun if it ended more than WARNING_PERIODS after it, or the first missed one, was due. Beyond
-        ERROR_PERIODS it is also a stall.
+        Times are ns of one clock that does not fall. A run that ended over WARNING_PERIODS after it was due is an
+        overrun; beyond ERROR_PERIODS it is also a stall. Where some were missed, the first of them counts. Sets
+        `lateness_us`, `exec_us` and `delay_ns`.
         """
         if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
             self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
@@ -144,7 +150,8 @@ class RateGroup:
         """Return counts since the start, and rate, grade and percentiles over one to two horizons.
 
         Percentiles are those of the last `refresh` of the histograms. The grade is `error` after a stall, `warning`
-        after an overrun, else `good`. The worst lateness is since the start, and 0 Hz stands for fewer than two runs.
+        after an overrun, else `good`. The worst lateness is since the start. 0 Hz stands for fewer than two runs;
+        merged ones do not count as runs.
         """
         since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"

@@ -21,8 +21,9 @@ log = logging.getLogger(__name__)
 def prepare(settings: RealTime) -> list[str]:
     """Ask the kernel for these settings, for this thread and process; return and log what it refused, a line each.
 
-    FIFO is set on this thread only and reset on fork, so that child processes and threads stay ordinary. Without FIFO
-    this thread, and those that it begins, get short slices.
+    A setting of 0, False or () asks for nothing; nothing is raised. FIFO is set on this thread only and reset on fork,
+    so that child processes and threads stay ordinary. Without FIFO this thread, and those that it begins, get short
+    slices. `keep_awake` holds until the process ends.
     """
     refused = []
     if settings.cpus:
@@ -52,8 +53,9 @@ def prepare(settings: RealTime) -> list[str]:
 def priority_of_threads() -> int:
     """Return the FIFO priority that threads begun by this one may take: one below its own, or its own if that is 1.
 
-    0, for none, where this thread has no FIFO priority, or where the kernel refuses it; a refusal is logged. ZeroMQ's
-    threads use it: a setpoint passes through one, and would wait there for whatever else the machine runs.
+    0, for none, where this thread has no FIFO priority, or where the kernel refuses it; a refusal is logged. It is
+    tried in a short-lived thread; nothing of this one changes. ZeroMQ's threads use it: a setpoint passes through one,
+    and would wait there for whatever else the machine runs.
     """
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0

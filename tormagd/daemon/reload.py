@@ -23,10 +23,10 @@ class Reread(NamedTuple):
 
 
 def reread(running: Config, read: Config) -> Reread:
-    """Return `running` with what may change while control runs taken from `read`: the keys in LIVE.
+    """Return `running` with the keys in LIVE taken from `read`, which may change while control runs.
 
-    The result also lists the keys that were taken, and those that differ but wait for a restart. Neither argument is
-    changed.
+    The result also lists the keys that were taken, and those that differ but wait for a restart, each as a path.
+    Neither argument is changed.
     """
     differing = tuple(_differing(msgspec.to_builtins(running), msgspec.to_builtins(read), ""))
     config = msgspec.structs.replace(
@@ -39,7 +39,11 @@ def reread(running: Config, read: Config) -> Reread:
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:
-    """Yield the paths of the keys whose values differ between two nested tables, sorted within each table."""
+    """Yield the paths of the keys whose values differ between two nested tables, sorted within each table.
+
+    `path` is put before each, with its own point. A key that only one table has differs. A table beside another kind of
+    value is one key.
+    """
     for name in sorted(before.keys() | after.keys()):
         old, new = before.get(name), after.get(name)
         if isinstance(old, dict) and isinstance(new, dict):

@@ -36,7 +36,7 @@ class Requests:
         "How often the gap has been told to open."
 
     def put(self, waiting: Waiting) -> bool:
-        """Add a request behind its client's others.
+        """Add a request behind its client's others; the client is the first frame of its envelope.
 
         Returns False, with nothing added, where WAITING requests wait, or WAITING_PER_CLIENT of this client.
         """
@@ -48,7 +48,10 @@ class Requests:
         return True
 
     def next(self) -> Waiting | None:
-        """Remove and return the next request; None where none waits. Each client with requests has one turn a round."""
+        """Remove and return the next request; None where none waits.
+
+        Clients take turns: each that has requests has one answered in a round, its oldest.
+        """
         for client, of_client in self._waiting.items():
             taken = of_client.popleft()
             del self._waiting[client]

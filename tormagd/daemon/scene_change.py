@@ -32,7 +32,8 @@ class SceneChange:
     def begin(self, scene: object) -> None:
         """Begin to change to `scene`, a name or a path, in a task of its own; `newest` says how it ends.
 
-        Raises RefusedError for what is no such text, while another change goes on, and where the device is in use.
+        Raises RefusedError for what is no text of 1..LONGEST_NAME characters, while another change goes on, and where
+        the device is in use. Whether there is such a scene shows only in `newest`. Needs a running event loop.
         """
         if not isinstance(scene, str) or not 0 < len(scene) <= LONGEST_NAME:
             raise RefusedError(
@@ -47,9 +48,10 @@ class SceneChange:
         self._changing.add_done_callback(self._finish)
 
     async def _change(self, scene: str) -> None:
-        """Build the core and put it in place, if the device is still not in use; note and log how it ended.
+        """Build the core and put it in place, if the device is still not in use; note in `newest` and log how it ended.
 
-        A refusal leaves the running scene as it is.
+        A refusal leaves the running scene as it is, and is not raised. Any other error is raised, and `newest` then
+        stays as one that is not over.
         """
         error = None
         try:

@@ -47,7 +47,8 @@ class SearchProcess:
     def answer(self) -> Answer | None:
         """Return the answer that has come since the last call; None where none has. Never waits.
 
-        A search that found no field is logged, and gives None, too.
+        A search that found no field is logged, and gives None, too. Either ends the open question, and is recorded in
+        `timing`.
         """
         data = None if self._is_idle else self._beside.receive()
         if data is None:
@@ -63,7 +64,8 @@ class SearchProcess:
     def ask(self, question: Question | None) -> None:
         """Send `question` to the search, unless it is None, another is open, or the next is not due yet. Never waits.
 
-        A search process that has ended is logged once; plans fail once the last answer is too old.
+        One that is not sent is dropped. A search process that has ended is logged once; plans fail once the last answer
+        is too old.
         """
         if self._beside.is_gone and not self._is_told:
             self._is_told = True
@@ -78,7 +80,7 @@ class SearchProcess:
         self._is_idle = not self._beside.send(pickle.dumps(question))
 
     def close(self) -> None:
-        """Close the socket, kill the process and wait for its end."""
+        """Close the socket, kill the process and wait for its end. It may be called twice."""
         self._beside.close()
         self._beside.process.kill()
         self._beside.process.wait()
@@ -87,8 +89,10 @@ class SearchProcess:
 def main() -> None:
     """Answer questions that come in over a socket until its other end is closed.
 
-    The socket's descriptor is the first argument. The first packet holds what the core is built from; `ready` says that
-    it is. An answer is a pickled Answer, or the ValueError of a search that found no field. SIGTERM is ignored.
+    The socket's descriptor is the process's first argument. The first packet is a pickled (config, scene, folder of
+    models), of which the core is built; `ready` says that it is. A question is a pickled Question. Its answer is a
+    pickled Answer, or the ValueError of a search that found no field. SIGTERM is ignored. Raises ConfigError where no
+    core is built.
     """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd signals the whole service, and the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:

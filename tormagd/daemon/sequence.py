@@ -48,9 +48,10 @@ class Sequence:
     def order(self, now_s: float, session: int | None, seq: int, *, is_over: bool) -> Order:
         """Judge one message by its numbers, and follow it unless it is a stray.
 
-        A `seq` above the newest is NEWER, unless it leaps; a `session` above all before is RESTARTED. RUN messages in a
-        row that fit neither are a run of their own: REPLACED. After `is_over`, when the newest message taken is no
-        longer valid, the first that is no repetition is enough. Counts lost messages, restarts and strays.
+        A `seq` above the newest is NEWER, unless it leaps by over LONGEST_JUMP steps; a `session` above all before is
+        RESTARTED. RUN messages in a row that fit neither are a run of their own: REPLACED. After `is_over`, when the
+        newest message taken is no longer valid, the first that is no repetition is enough. All others are STRAY. Counts
+        lost messages, restarts and strays. `now_s` is only for `is_doubled`.
         """
         if session == self.session and seq > self.seq:
             step = seq - self.seq

@@ -34,8 +34,8 @@ class Service:
 
         `planned_s` and `received_s` are the times of the newest plan and state, None before the first; `limit_s` is how
         old they may be. False before the first plan. A device that was identified and has fallen silent while its port
-        is open counts as not fresh. A port that is not open, a device not yet identified, or one whose firmware was
-        refused does not: its time counts from now.
+        is open counts as not fresh. With a port that is not open, a device not yet identified, or a refused firmware,
+        only the plan counts. Call it at each look: it remembers when a device was last heard.
         """
         if planned_s is None or now_s - planned_s > limit_s:
             return False
@@ -48,8 +48,9 @@ class Service:
     def news(self, now_s: float, is_alive: bool, link: LinkState, status: str) -> list[str]:
         """Return the messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives.
 
-        Before READY, a daemon that lives also asks for EXTENSION_S more to start, once in REPEAT_S. Each counts as told
-        with this call: READY and STATUS do not come again where they are not sent.
+        Empty where none is. Before READY, a daemon that lives also asks for EXTENSION_S more to start, once in
+        REPEAT_S. Each counts as told with this call: READY and STATUS do not come again where they are not sent.
+        `status` must be one line, which is not checked.
         """
         messages = []
         if not self.is_ready and link is LinkState.RUNNING:
@@ -69,10 +70,11 @@ class Service:
 def status_line(
     link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
 ) -> str:
-    """Return one line for `systemctl status`: the operating state with its faults, or the scene.
+    """Return one line for `systemctl status`: the operating state with its faults, or else with the scene.
 
     Then comes the next command, if one is needed: `tormagctl status` with faults, `tormagctl arm` where it is not
-    homed. While the link does not run, its state, `cause` and `remedy` stand in place of the next command.
+    homed. While the link does not run, its state, `cause` and `remedy` stand in place of the next command; their line
+    ends become spaces.
     """
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:
@@ -88,7 +90,7 @@ def notify(message: str) -> bool:
     """Send `message`, lines of `NAME=value`, to the service manager, as sd_notify(3) does. Never waits.
 
     Returns False where there is no service manager ($NOTIFY_SOCKET is not set), or where it does not take the message.
-    A name that begins with `@` is an abstract socket.
+    A $NOTIFY_SOCKET that begins with `@` is an abstract socket.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:

@@ -35,7 +35,7 @@ class SocketFile:
     def close(self) -> None:
         """Close the socket, and remove its path and its lock, unless others have been put in their place.
 
-        Call it once.
+        The socket is not closed where it was detached. A path that cannot be removed stays. Call it once.
         """
         self.listener.close()
         if self._identity is not None and _identity(self._path) == self._identity:
@@ -63,8 +63,8 @@ def ipc_path(address: str) -> Path | None:
 def _locked(path: Path) -> int:
     """Lock the file `path`, write our process number into it, and return its descriptor, which holds the lock.
 
-    Makes the file where it is missing. Raises OSError where it cannot be opened, is not a lock's, or is locked by
-    another process.
+    The caller closes it. Makes the file where it is missing, in a folder that must exist. Raises OSError where it
+    cannot be opened, is not a lock's, or is locked by another process. Never waits for the lock.
     """
     while True:
         try:
@@ -85,7 +85,10 @@ def _locked(path: Path) -> int:
 
 
 def _lock(path: Path, descriptor: int) -> None:
-    """Lock an open file without waiting. Raises OSError where it holds anything but a number, or is locked."""
+    """Lock an open file without waiting. `path` is for the messages.
+
+    Raises OSError where it holds anything but a number, or is locked by another. An empty one is fine.
+    """
     content = os.pread(descriptor, 32, 0).decode(errors="replace").strip()
     if content and not content.isdecimal():
         raise OSError(f"{path} is not a lock of this program; it is left alone: name another path")
@@ -100,7 +103,8 @@ def _lock(path: Path, descriptor: int) -> None:
 def _listening(path: Path) -> socket.socket:
     """Return a socket that listens at `path`, in place of one that was left there. Call with the lock held.
 
-    Raises OSError where something else is at `path`, or where it cannot be bound.
+    It does not block, and the caller closes it. Raises OSError where something else is at `path`, which stays, or where
+    it cannot be bound.
     """
     if _identity(path) is not None and not stat.S_ISSOCK(path.lstat().st_mode):
         raise OSError(f"{path} is there and not a socket; it is left alone: name another path")

@@ -79,8 +79,9 @@ class SourceClock:
     def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
         """Take the message that came at `now_s`, and return its delay, s. `lateness_s` is our time less its stamp.
 
-        The delay is not negative, unless the clock is ahead and not settled: it is then `lateness_s`. With
-        `is_continued` False the publisher may be another process, on another machine.
+        The delay is by the corrected clock, and not negative. While a clock is not settled, `lateness_s` itself is
+        returned, which is negative for a stamp ahead of us. With `is_continued` False the publisher may be another
+        process, on another machine. Times must not fall, which is not checked.
         """
         if self._heard_s is None:
             self._begin(now_s, lateness_s)
@@ -95,7 +96,7 @@ class SourceClock:
         return max(lateness_s - self.offset_s, 0.0)
 
     def _begin(self, now_s: float, lateness_s: float) -> None:
-        """Begin with nothing known but this lateness.
+        """Begin with nothing known but this lateness, and a new line; the counts of steps stay.
 
         What a way can take counts as the way at once. More counts as the clock's offset once it has stayed for
         SETTLED_S.
@@ -113,7 +114,7 @@ class SourceClock:
             self.offset_s, self.way_s = 0.0, self.offset_s
 
     def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
-        """Update offset, way and jitter from a message that came `gap_s` after the last.
+        """Update offset, way and jitter from a message that came `gap_s` after the last, both on our clock.
 
         A stamp that runs back shows that the clock was set; else the offset rises by what drift allows. After
         FORGOTTEN_S of silence, or from another process, neither is done. A lateness that does not fit then begins the
@@ -139,10 +140,10 @@ class SourceClock:
             self._fall(now_s, fall_s)
 
     def _fall(self, now_s: float, fall_s: float) -> None:
-        """Lower offset and way by `fall_s`: the message was less late than both of them together.
+        """Lower offset and way by `fall_s`, not negative: the message was less late than both of them together.
 
-        First goes what was granted to drift, then the way. What is left is the clock's: above STEP_S, a settled clock
-        was set forward, unless its offset may be the way, and still may be.
+        First goes what was granted to drift, then the way. What is left is the clock's. Above STEP_S, a settled clock
+        counts as set forward, unless its offset may be the way, and still may be.
         """
         granted_s = min(fall_s, self._leaked_s)
         self.offset_s -= granted_s

@@ -35,7 +35,8 @@ class Needs(NamedTuple):
 def needs_of(scene: Scene) -> Needs:
     """Return what a scene needs of its publisher: setpoints a second, and their greatest delay, s.
 
-    Where the scene states none, setpoints may be as far apart as the slope carries over, and late by MAX_LATE_S.
+    Where the scene states no rate, setpoints may be as far apart as the slope carries over, AHEAD_S. Where it states no
+    delay, they may be late by MAX_LATE_S.
     """
     stated = UNSET if scene.signal is None else scene.signal.setpoint_hz
     delay_ms = scene.budget.delay_ms
@@ -79,8 +80,9 @@ class SourceManner:
     def hear(self, now_s: float, arrival: Arrival, needs: Needs) -> None:
         """Take a message that came at `now_s`, and set `found` anew, by `needs`, when it fills the window.
 
-        Until then `found` stays, also while no message comes. The very first message only begins a window. A message is
-        late by its delay or its playout, whichever is longer: only then is it followed.
+        `found` is emptied where that window is fine. Until then it stays, also while no message comes. The very first
+        message only begins a window. A message is late by its delay or its playout, whichever is longer: only then is
+        it followed.
         """
         if self._began_s is None:
             self._begin(now_s, arrival.lost)
@@ -99,7 +101,11 @@ class SourceManner:
         self._least_s, self._most_s, self._sum_s = MAX_LATE_S, 0.0, 0.0
 
     def _judged(self, past_s: float, last: Arrival, needs: Needs) -> dict[Limit, Explanation]:
-        """Return what is wrong in a window of `past_s` that `last` has ended; empty where nothing is."""
+        """Return what is wrong in a window of `past_s`, s, that `last` has ended, with cause and remedy; empty where
+        nothing is.
+
+        Keys are SOURCE_LOSS, SOURCE_SELDOM, SOURCE_LATE and SOURCE_JITTER. The window has one message at least.
+        """
         lost = last.lost - self._lost
         sent = self._messages + lost
         found = {}
@@ -130,7 +136,11 @@ class SourceManner:
 
 
 def _steadied(most_ms: float) -> str:
-    """Return the remedy for jitter of up to `most_ms` after the stamp: the playout that takes it out, if one does."""
+    """Return the remedy for jitter of up to `most_ms` after the stamp, as a text for people.
+
+    It is the playout that takes the jitter out, rounded up to PLAYOUT_STEP_MS; or a preview where that is over
+    MAX_PLAYOUT_MS.
+    """
     playout_ms = math.ceil(most_ms / PLAYOUT_STEP_MS) * PLAYOUT_STEP_MS
     if playout_ms > MAX_PLAYOUT_MS:
         return "send a preview_N that is longer than that differs, or take a steadier way"

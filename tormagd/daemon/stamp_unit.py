@@ -36,8 +36,8 @@ class StampUnit:
         """Take a message that came at `now_s`; `realtime_ns` is our CLOCK_REALTIME then.
 
         A stamp within FAR_NS of it counts ns, whatever was found before. Stamps further off are judged by how fast they
-        run, after LOOKED_AT messages and MIN_S. `is_known` and `wrong` then say what was found, and stay until the
-        next judgement.
+        run, after LOOKED_AT messages and MIN_S. `is_known` and `wrong` then say what was found, and stay until the next
+        judgement. Of such slow stamps `wrong` is the unit that brings them nearest to our clock.
         """
         if abs(realtime_ns - stamp_ns) < FAR_NS:
             self.is_known, self.wrong, self._from = True, "", None

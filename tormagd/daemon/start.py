@@ -27,9 +27,10 @@ from tormagd_client.printable import printable
 def start(options: argparse.Namespace) -> int:
     """Build the core and run the daemon as the command line and its configuration say; return the exit code.
 
-    0: ended on request; 1: could not run, with the reason on stderr. `--check` prints what would run, as JSON, and runs
-    nothing; 1 then says that it could not be printed. Raises ConfigError where configuration, scene, keys or backend
-    are refused, with the file's line where one is to blame.
+    `options` has `config`, `scene` and `check`, as `main.parser` makes them. 0: ended on request; 1: could not run,
+    with the reason on stderr. `--check` prints what would run, as JSON, and runs nothing; 1 then says that it could not
+    be printed. Raises ConfigError where configuration, scene, keys or backend are refused, with the file's line where
+    one is to blame.
     """
     try:
         config = _configured(options)
@@ -49,10 +50,11 @@ def start(options: argparse.Namespace) -> int:
 
 
 def _configured(options: argparse.Namespace) -> Config:
-    """Return the file's configuration with the command line's scene, and its rates where `rates.of_scene` is set.
+    """Return the file's configuration, or the defaults, with the command line's scene in place of its own, if there is
+    one.
 
-    Reads the configuration's file and the scene's. Raises ConfigError where either is refused, or the scene's rates
-    are.
+    Where `rates.of_scene` is set, the rates are those of the scene. Reads both files. Raises ConfigError where either
+    is refused, or the scene's rates are.
     """
     config = load_config(options.config)
     if options.scene is not None:
@@ -69,7 +71,8 @@ async def _run(
 ) -> None:
     """Start the processes of black box and search, make this thread a real-time one, and run the daemon to its end.
 
-    Raises ConfigError where the search does not start, OSError where an endpoint cannot be bound.
+    The search's process is begun only where the scene's search runs beside the plans. Raises ConfigError where it does
+    not get ready, OSError where it does not start, an endpoint cannot be bound, or there is no timer.
     """
     # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
@@ -82,10 +85,13 @@ async def _run(
 
 
 def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
-    """Return what `--check` prints, as JSON: `config`, `scene`, `derived`, which follows from both, and `backends`.
+    """Return what `--check` prints, a JSON object with `config`, `scene`, `derived`, which follows from both, and
+    `backends`.
 
-    `derived` has the device's forces, margins, search, rates, resolution and what the gap's speed misses, null where
-    the scene has no signal. `backends` has by name `loads`, or why one does not. `options` are the chosen backend's.
+    `config` has `options`, the chosen backend's, with its defaults. Keys of `derived`: `least_N`, `most_N`,
+    `phase_margin_deg`, `gain_margin_dB`, `solver`, `control_hz`, `inference_hz`, `fingerprint`, `terms_out`,
+    `least_resolution_N`, `missed_rms_N`, `missed_share`, `approaches_s`. What the gap's speed misses is null where the
+    scene has no signal. `backends` has by name `loads`, or why one does not.
     """
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {

@@ -116,7 +116,8 @@ class TelemetryLoop:
         """Publish and report on `core` from now on, with its configuration and profiles. Call it between two beats.
 
         The next `status` is made anew, and how well the force is followed counts from now. Ticks that are not published
-        yet, the newest snapshot and the newest mark stay. `config` has the same rates as before.
+        yet, the newest snapshot and the newest mark stay. `config` must have the same rates as before, which is not
+        checked.
         """
         self.config = config
         "Replaced by a reload, which changes only keys that are looked at each time they are used."
@@ -129,7 +130,8 @@ class TelemetryLoop:
     def record(self, _beat: Beat) -> None:
         """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing.
 
-        Also counts the delay of a new setpoint. Where telemetry is slow, MAX_TICKS kept records are published first.
+        Also counts the delay of a new setpoint. Where MAX_TICKS records wait, as telemetry is slow, they are published
+        first.
         """
         control = self._control
         if control.output is None or control.used is None:
@@ -154,8 +156,9 @@ class TelemetryLoop:
     def publish(self, beat: Beat) -> bool:
         """Publish the snapshot and the ticks of a telemetry period; return False where none is due.
 
-        The snapshot is made only where a peer listens or a request waits; the requests that wait now are then answered
-        by `serve`. Profiles look at the connected device.
+        The snapshot is made only where a peer listens or a request waits. The requests that wait now, REQUESTS at most,
+        are then answered by `serve`. Ticks that nobody listens to are dropped. Calibrations and profiles look at the
+        connected device. The newest tick counts for how well the force is followed.
         """
         if self._left > 0 or not self._ticks:
             return False
@@ -178,7 +181,11 @@ class TelemetryLoop:
         return True
 
     def _look_at_device(self) -> None:
-        """Let calibrations and profiles look at the connected device; the profile of one that is awaited waits, too."""
+        """Let calibrations and profiles look at the connected device.
+
+        Calibrations do while it is neither driven nor busy, and no scene is being changed. Profiles see no device while
+        its calibration is awaited.
+        """
         serial_number, is_driven = self._serial_number(), self._control.stepper.safety.is_driven
         change = self._scene_change.newest
         is_idle = not (is_driven or self.is_busy()) and (change is None or change.is_over)
@@ -200,7 +207,7 @@ class TelemetryLoop:
     def tell(self, _beat: Beat) -> bool:
         """Every TELL_S, feed log, systemd and black box, and go on arming; return False where it is not time.
 
-        Also computes the percentiles of REFRESHED histograms and of one source anew.
+        Also computes the percentiles of REFRESHED histograms, the next in turn, and the figures of one source anew.
         """
         now_s = time.monotonic()
         if now_s - self._told_s < TELL_S:
@@ -218,7 +225,10 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answer requests that waited at the last snapshot, for a limited time; return False where none did."""
+        """Answer requests that waited at the last snapshot, for a limited time; return False where none was answered.
+
+        What is left waits for the next call. Later requests wait for the next snapshot.
+        """
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
@@ -226,8 +236,9 @@ class TelemetryLoop:
     def keep(self, reason: str, after_s: float) -> Path:
         """Ask for a black box that also holds the next `after_s`, and return the path it will have.
 
-        `reason` becomes part of its name. It tells firmware, serial number and, where one is used, the profile's
-        digest. Raises RefusedError where none is kept.
+        `reason` becomes part of its name, and is not checked. Its details are `firmware`, `serial_number` in eight
+        hexadecimal digits and `profile_sha256`, each empty where it is not known or not used. Raises RefusedError where
+        none is kept.
         """
         link = self._connection.report()
         details = {
@@ -240,7 +251,7 @@ class TelemetryLoop:
     def conditions(self) -> Conditions:
         """Return the conditions, as they are now, on which a command is taken or refused.
 
-        A device whose calibration is not in force yet is busy.
+        A device whose calibration is not in force yet is busy, although it does not move.
         """
         control, doubted = self._control, self._inference.planner.believe.sensor.is_doubted
         found = conditions(
@@ -264,8 +275,8 @@ class TelemetryLoop:
     def _snapshot(self, now_s: float) -> Telemetry:
         """Return the telemetry message of the newest tick, with states and beliefs as they are at `now_s`.
 
-        A tick must be kept. The message has the setpoint's age (None without one), the handle's motion, the verdict and
-        the newest mark.
+        A tick must be kept: IndexError is raised otherwise. The message has the setpoint's age (None without one), the
+        handle's motion, the verdict and the newest mark. Its number is that of the telemetry periods so far.
         """
         stamp = self._endpoint.inbox.newest
         age_s = None if stamp is None else now_s - stamp.stamp_s
@@ -278,8 +289,8 @@ class TelemetryLoop:
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
         """Tell systemd what is new: readiness, which is logged, the status line, and that the daemon lives.
 
-        It lives while plans and device states are no older than `realtime.watchdog_ms`; else nothing says so, and
-        systemd's watchdog runs out.
+        It lives while plans and, once a device was identified, its states are no older than `realtime.watchdog_ms`.
+        Else nothing says so, and systemd's watchdog runs out. Without systemd the log alone is told.
         """
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
@@ -305,7 +316,7 @@ class TelemetryLoop:
             notify(message)
 
     def _in_turn(self) -> Iterator[Histogram]:
-        """Yield all histograms, again and again.
+        """Yield all histograms of rates, way and phases, again and again, without end.
 
         A beat computes the percentiles of a few: all of them would take too long.
         """
@@ -317,8 +328,8 @@ class TelemetryLoop:
     def _answer(self, request: Request) -> Any:
         """Return the result of a request: for `status` and `describe` a report, for any other what `command` returns.
 
-        A `status` is packed once for all who ask in a telemetry period. Raises RefusedError for a request that is
-        refused.
+        A `status` is packed once, as msgpack, for all who ask in a telemetry period; a snapshot must have been made
+        before. The others are plain data. Raises RefusedError for a request that is refused.
         """
         if request.command == "status":
             # built once for everybody who asks in this period
@@ -330,8 +341,8 @@ class TelemetryLoop:
     def _describe(self) -> Any:
         """Return what does not change from tick to tick, as plain data with the keys of `Description`.
 
-        It has configuration, scene, model, profile and firmware. `portrait` has forces, N, from the open gap to the
-        closed one, and their rates at the gap's speed, N/s, as learned by now. It has every PORTRAIT_STEP-th point.
+        Firmware and serial number are None until a device has said them. `portrait` has forces, N, from the open gap to
+        the closed one, and their rates at the gap's speed, N/s, as learned by now. It has every PORTRAIT_STEP-th point.
         """
         link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
         scaled_mm_s = device.scale * self._core.gap_speed_mm_s
@@ -356,10 +367,12 @@ class TelemetryLoop:
         """Carry out a request that is no question, and return its result as plain data.
 
         `take` gives the brake, `confirm` settles a dispute, and `mark` adds a mark: see `_give`, `_confirm` and
-        `_add_mark`. `blackbox` asks for a black box, and returns the `file` that it will have. `arm` begins an arming,
-        `use-scene` a change of the scene; neither is over then. Any other name goes to the operating state. These
-        return the `operating_state` of now, and whether a device `is_connected`. Raises RefusedError for an unknown
-        name, and where the state or the arguments do not allow it. The next `status` is made anew.
+        `_add_mark`. `blackbox` asks for a black box, and returns the `file` that it will have.
+
+        `arm` begins an arming, `use-scene` a change of the scene; neither is over then. Any other name goes to the
+        operating state. These return the `operating_state` of now, and whether a device `is_connected`. Raises
+        RefusedError for an unknown name, and where the state or the arguments do not allow it. The next `status` is
+        made anew.
         """
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
@@ -398,8 +411,8 @@ class TelemetryLoop:
     def _confirm(self, what: object) -> dict[str, Any]:
         """Take the operator's word on what is wrong, "device" or "sensor"; log it and return `{"confirmed": what}`.
 
-        The planner ends the dispute or stops believing the sensor, and the journal notes it. Raises RefusedError for
-        any other word, and where the readings agree with the device.
+        "device": the device has changed, and the planner ends the dispute. "sensor": it stops believing the sensor. The
+        journal notes it. Raises RefusedError for any other word, and where the readings agree with the device.
         """
         try:
             wrong = msgspec.convert(what, Disputed)
@@ -434,7 +447,10 @@ class TelemetryLoop:
         return {"source": source, "instead_of": before}
 
     def _build_status(self, newest: Telemetry) -> Status:
-        """Return the answer to `status`: the newest snapshot, states as they are now, reports, causes and remedies."""
+        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and remedies.
+
+        Reports on link, peers, sources, rates and black box may be up to TELL_S old: see `_slowly_changing`.
+        """
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device
@@ -487,9 +503,9 @@ class TelemetryLoop:
         )
 
     def _arm_report(self) -> ArmReport | None:
-        """Return the report on the newest arming: commands given, whether it is over, and why it failed, if so.
+        """Return the report on the newest arming: commands given, whether it is over, and why it failed.
 
-        None before the first.
+        `error` is None where it goes on or has ended in ENABLED. None before the first arming.
         """
         arming = self._control.arming
         if arming is None:

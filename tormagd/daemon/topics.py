@@ -35,9 +35,9 @@ class Topics:
         self._passed_over: tuple[str, int] | None = None
 
     def publish(self, beat: Beat) -> bool:
-        """Publish a new verdict and a new motion of the handle; return False where nothing was published.
+        """Publish a verdict where one is new, and the handle's motion where it is due; return False where neither was.
 
-        Topics that nobody subscribes to are skipped.
+        Topics that nobody subscribes to by name are skipped. Never waits.
         """
         listeners = self._endpoint.listeners
         is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
@@ -56,7 +56,8 @@ class Topics:
     def _publish_motion(self, beat: Beat) -> bool:
         """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without a device.
 
-        It is stamped with CLOCK_REALTIME of when it was sensed. Due times that were missed are not made up for.
+        It is stamped with CLOCK_REALTIME of when it was sensed; place and rate are positive pushing on. It is due
+        `motion_hz` times a second; due times that were missed are not made up for.
         """
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
@@ -73,9 +74,10 @@ class Topics:
         return True
 
     def _publish_verdicts(self) -> bool:
-        """Publish the verdict on a new setpoint, and on one refused because another source holds the brake.
+        """Publish the verdict on the setpoint in force, and on one refused because another source holds the brake.
 
-        Each is judged once. Returns False where neither is new.
+        Each is judged once, when it is new; of several that came between two beats, the newest. Returns False where
+        neither is new.
         """
         in_force, is_said = self._endpoint.inbox.playout.in_force, False
         # a setpoint is a new object, even where its source begins its numbers anew
@@ -91,7 +93,10 @@ class Topics:
         return is_said
 
     def _judge(self) -> Judged:
-        """Judge the newest setpoint by the newest plan and the measured gap."""
+        """Return the judgement on the newest setpoint, by the newest plan and the measured gap.
+
+        Without a homed device, out of ENABLED or without a setpoint it is `cannot`.
+        """
         planner, stepper, core = self._inference.planner, self._control.stepper, self.core
         measured, believe, force = stepper.measured, planner.believe, core.scene.force
         return judged(
@@ -105,7 +110,8 @@ class Topics:
 
     @staticmethod
     def _verdict(source: str, seq: int, found: Judged) -> Verdict:
-        """Return a judgement as the message for the setpoint `seq` of `source`."""
+        """Return the judgement `found` as the message for the setpoint `seq` of `source`, stamped with CLOCK_REALTIME
+        now."""
         return Verdict(
             v=VERSION,
             t_ns=time.time_ns(),

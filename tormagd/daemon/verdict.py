@@ -47,12 +47,13 @@ def judged(
     device: DeviceFit,
     motion: GapMotion,
 ) -> Judged:
-    """Judge the setpoint that `plan` was made for: rendered, arrives in some time, or cannot, and why.
+    """Return the judgement on the setpoint that `plan` was made for: rendered, arrives in some time, or cannot, and
+    why.
 
     `gap_mm` is the measured gap, None without a homed device. Rendered means within the scene's tolerance. Cannot: not
     ENABLED, no homed device, no valid setpoint, or a limit that keeps the force away for good. Why is the state, or the
-    limits; it is empty where there is no setpoint at all. The time is that of the gap's way at its speed, or of the
-    ramp, plus the lag.
+    limits; it is empty where there is no setpoint at all. The time, ms, is that of the gap's way at its speed, or of
+    the ramp where that is longer, plus the lag.
     """
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:
@@ -76,8 +77,9 @@ def judged(
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
     """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there.
 
-    The ceiling does where the aim is beyond it, and the model's range where it bounds the field. F_MIN does where the
-    ramp does not lead up from it. The others in HOLDING always do.
+    The ceiling does where the aim is a smaller gap than it allows, and the model's range where it bounds the field.
+    F_MIN does unless a ramp leads up from it to a greater force. The others in HOLDING always do, all else never.
+    Whether `plan` has the limit is not checked.
     """
     if limit is Limit.CEILING:
         return aim_mm < plan.min_gap_mm

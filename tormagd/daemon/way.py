@@ -31,9 +31,11 @@ class Way:
         self._stamp_s = -math.inf
 
     def ticked(self, now_s: float, used: Plan) -> None:
-        """Count the delay of a setpoint at its first control tick, at `now_s`, along the plan `used` for it.
+        """Count in `to_duty` the delay of a setpoint at its first control tick, at `now_s`, along the plan `used` for
+        it.
 
-        Later ticks for the same setpoint count nothing, nor do plans without one.
+        Later ticks for the same setpoint count nothing, nor do plans without one. Two setpoints of one stamp count as
+        one.
         """
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
@@ -44,8 +46,9 @@ class Way:
     def report(self, device_us: float | None, lag_s: float) -> WayReport:
         """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known.
 
-        `device_us` is the link's median round trip, us, None without one; `lag_s` is the carriages' lag. The sum has
-        the 99th percentile of the delay to the duty.
+        `device_us` is the link's median round trip, us, None without one; `lag_s` is the carriages' lag. The sum, ms,
+        has the 99th percentile of the delay to the duty, as of the last refresh of `to_duty`. The budget is the
+        scene's, or else BUDGET_MS.
         """
         to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
