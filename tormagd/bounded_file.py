@@ -13,9 +13,10 @@ from tormagd_client.regular_file import require_regular
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """Return all bytes of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is allowed.
+    """Return all bytes of a regular file of at most `most_bytes`; a link is followed.
 
-    Never waits, and opens nothing that acts on being opened, as a port does.
+    Raises OSError where there is none, it cannot be read, is of another kind, or has more; its `strerror` says what is
+    allowed. Never waits, and opens nothing that acts on being opened, as a port does.
     """
     require_regular(path, most_bytes)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -28,11 +29,12 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 
 @contextlib.contextmanager
 def in_place_of(path: Path) -> Iterator[Path]:
-    """Give a path beside `path` to write to, which replaces `path` at the end.
+    """Give a path beside `path` to write to, which replaces `path` at the end. The folder must exist.
 
     The caller makes that file, `path` with `.part` behind it; a file left there by another may be overwritten. After an
-    error, inside or at the end, that file is removed and `path` stays as it was. Raises IsADirectoryError where `path`
-    is a folder, before anything is written, and OSError where nothing was made or `path` cannot be replaced.
+    error, inside or at the end, that file is removed and `path` stays as it was. The caller sees to it that it is on
+    the disk (fsync). Raises IsADirectoryError where `path` is a folder, before anything is written, and OSError where
+    nothing was made or `path` cannot be replaced.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))

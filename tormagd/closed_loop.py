@@ -91,7 +91,7 @@ class VirtualPort:
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let the device run until `now_s`.
+        """Let the device run until `now_s`, which must not fall.
 
         Its bytes wait for their reader: all new ones, and of those from before the last MAX_UNREAD_BYTES.
         """
@@ -107,8 +107,8 @@ class VirtualPort:
         """Return the valid messages in the bytes that wait, oldest first, and drop these bytes; empty where nothing
         waits.
 
-        A frame that does not decode is left out and counted in `statistics`; an incomplete one is kept for the next
-        call.
+        Does not let the device run: see `advance`. A frame that does not decode is left out and counted in
+        `statistics`; an incomplete one is kept for the next call.
         """
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
@@ -143,9 +143,10 @@ class VirtualBus:
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let bus and device run until `now_s`.
+        """Let bus and device run until `now_s`, which must not fall.
 
-        The device's newest MAX_UNREAD_FRAMES frames wait for their reader; frames of other senders are dropped.
+        The device's newest MAX_UNREAD_FRAMES frames wait for their reader; older ones, and frames of other senders, are
+        dropped.
         """
         self.now_s = now_s
         arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
@@ -160,8 +161,9 @@ class VirtualBus:
         """Return the device's valid messages in the frames that wait, oldest first, and drop these frames; empty where
         none wait.
 
-        A frame that does not decode is left out and counted in `statistics`. `stream.received` is begun anew and holds
-        the frames. Raises SecondHostError as `CanStream.unpack_all`.
+        Does not let the device run: see `advance`. A frame that does not decode is left out and counted in
+        `statistics`. `stream.received` is begun anew and holds the frames. Raises SecondHostError as
+        `CanStream.unpack_all`.
         """
         arrived, self._unread = self._unread, []
         self.stream.received = []
@@ -235,9 +237,10 @@ class ClosedLoop:
     def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
         """Run one control period, and return what happened in it: the device runs on, then read, plan, step and send.
 
-        `setpoint` is the newest; None: no publisher. With a `plan` nothing is planned, and this one is used: a bench
-        sweep asks for gaps, not forces. Raises ValueError without a plan in a loop without a planner, and DomainError
-        where planning fails, as `Planner.plan`.
+        `setpoint` is the newest; None: no publisher. It is planned for where it is new, or the inference period is
+        over. With a `plan` nothing is planned, and this one is used: a bench sweep asks for gaps, not forces. Time has
+        moved on by a period also where it raises. Raises ValueError without a plan in a loop without a planner, and
+        DomainError where planning fails, as `Planner.plan`.
         """
         self._ticks += 1
         now_s = self.now_s
@@ -266,7 +269,10 @@ class ClosedLoop:
         self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
-        """Return the conditions on which commands are taken or refused, as of now."""
+        """Return the conditions on which commands are taken or refused, as of now: after the newest tick.
+
+        Without a planner the force sensor counts as believed.
+        """
         doubted = self.planner is not None and self.planner.believe.sensor.is_doubted
         connection, stepper = self.connection, self.stepper
         return conditions(self.now_s, self._config, connection, stepper, self._output, sensor_doubted=doubted)
@@ -277,18 +283,18 @@ class ClosedLoop:
         """Run the ticks of the next `duration_s` one by one, and yield their samples: `duration_s` over the period,
         rounded.
 
-        A tick runs when its sample is asked for: who stops asking stops the loop. `setpoint` gives the newest setpoint
-        at a time, that of the tick before; None: no publisher. Raises as `tick`.
+        A tick runs when its sample is asked for: who stops asking stops the loop. `setpoint` is called before each tick
+        with the time, s, of the one before, and returns the newest setpoint or None: no publisher. Raises as `tick`.
         """
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
     def arm(self, plan: Plan | None = None) -> None:
-        """Connect, home and enable, as an operator does.
+        """Connect, home and enable, as an operator does; the ticks that this takes run at once.
 
-        `plan` is used in every tick, as in `tick`; None lets the planner plan. Raises RuntimeError where the device
-        does not answer, begin to home, or home within HOMING_S each, or is not enabled. Raises RefusedError for a
-        refused command.
+        `plan` is used in every tick, as in `tick`; None lets the planner plan, without a setpoint. Raises RuntimeError
+        where the device does not answer, begin to home, or home within HOMING_S each, or is not enabled. Raises
+        RefusedError for a refused command.
         """
         self._until(lambda m: True, "answer", plan)
         self.command("home")
@@ -320,7 +326,8 @@ class ClosedLoop:
         """Answer the pending question once SEARCH_S is over, as a search in a process of its own would; else do
         nothing.
 
-        The answer goes to the planner, and no question is pending then. Raises DomainError as `Aim.answer_to`.
+        The answer goes to `planner`, and no question is pending then. Raises DomainError as `Aim.answer_to`, and the
+        question stays.
         """
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
@@ -328,10 +335,10 @@ class ClosedLoop:
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
-        """Run ticks until `reached` is true of a measurement; `plan` is used in each, or the planner's where that is
-        None.
+        """Run ticks without a setpoint until `reached` is true of a measurement, at least one.
 
-        Raises RuntimeError after HOMING_S: the device did not `what`.
+        `plan` is used in each, or the planner's where that is None. Raises RuntimeError after HOMING_S: the device did
+        not `what`, a verb for the message.
         """
         for _ in range(round(HOMING_S / self._period_s)):
             self.tick(plan=plan)
@@ -344,9 +351,9 @@ class ClosedLoop:
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
     """Return a publisher in virtual time: a function from the time, s, to the newest setpoint, None before the first.
 
-    `forces_N` (n) are sent at the rising `times_s` (n), each valid for `valid_for_s`. Without times it always gives
-    None. Nothing is checked: times that do not rise give setpoints in another order, fewer forces than times
-    IndexError.
+    `forces_N` (n) are sent at the rising `times_s` (n), each valid for `valid_for_s`. The last stays the newest for
+    ever. Each call makes a new setpoint, stamped with its time. Without times it always gives None. Nothing is checked:
+    times that do not rise give setpoints in another order, fewer forces than times IndexError.
     """
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()

@@ -44,7 +44,9 @@ def plain(thing: object) -> Any:
     """Return `thing` as plain data: a value, or what changes in place, becomes a map of its fields, a tuple becomes a
     list.
 
-    Raises TypeError for what has no fields, and is neither plain, an enumerator, a tuple, a list nor a deque.
+    The module says which. `thing` stays as it is, and nothing of it is shared but what cannot change. Raises TypeError
+    for what has no fields, and is neither plain, an enumerator, a tuple, a list nor a deque; RecursionError for what
+    contains itself.
     """
     if type(thing) in _AS_THEY_ARE:
         return thing
@@ -63,10 +65,10 @@ def plain(thing: object) -> Any:
 
 
 def _fields(thing: object) -> tuple[str, ...]:
-    """Return the names of the fields of `thing`; empty for an enumerator and for what has none.
+    """Return the names of the fields of `thing`, an object; empty for an enumerator and for what has none.
 
-    They are those of `__match_args__` in that order; or else, in the order of the alphabet, its attributes without a
-    leading underscore.
+    They are those of `__match_args__` in that order. Without it they are, in the order of the alphabet, its attributes
+    without a leading underscore.
     """
     if isinstance(thing, Enum):
         return ()
@@ -83,8 +85,8 @@ def restored(data: Any, known: Kinds) -> Any:
     """Return the value that `data` stand for, of the types in `known`; an array becomes a tuple, `{"list": [...]}` a
     list.
 
-    Raises InexactError for an unknown type, other fields than the type's, or values that it refuses. Raises
-    RecursionError for data nested without end.
+    `data` are as `plain` makes them. Raises InexactError for an unknown type, other fields than the type's, or values
+    that it refuses. Raises RecursionError for data nested without end.
     """
     if type(data) in _AS_THEY_ARE:
         return data
@@ -113,10 +115,10 @@ def restored(data: Any, known: Kinds) -> Any:
 
 
 def restore(thing: Any, data: Any, known: Kinds) -> None:
-    """Give `thing`, which changes in place, the fields that `data` stand for; what changes in place inside it is kept,
-    and filled.
+    """Give `thing`, which changes in place, the fields that `data` stand for, in place.
 
-    Raises InexactError for other fields or values; some may be set by then.
+    What changes in place inside it is kept, and filled; all else is replaced. `data` are as `plain` makes them of a
+    thing of its type. Raises InexactError for another type, other fields or values; some may be set by then.
     """
     name = type(thing).__name__
     fields = data.get(name) if isinstance(data, dict) else None
@@ -149,9 +151,9 @@ def packed(data: Any) -> bytes:
 def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
     """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with the value of each there.
 
-    None where they are the same to the bit. Where the right one has no such place, its value is None. Where one only
-    ends earlier, the place is "length", with both counts of values. So it is, with equal counts, where only names of
-    types or empty parts differ.
+    None where they are the same to the bit. Maps are compared in the order of their keys. Where the right one has no
+    such place, its value is None. Where one only ends earlier, the place is "length", with both counts of values. So it
+    is, with equal counts, where only names of types or empty parts differ. Raises as `packed`.
     """
     if packed(left) == packed(right):
         return None
@@ -162,9 +164,9 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
 
 
 def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
-    """Yield path and value of each plain value in `data`, depth first; a type's name is no part of a path.
+    """Yield path and value of each plain value in `data`, depth first; `path` is that of `data`, empty for the whole.
 
-    An empty map or array yields nothing.
+    Parts of a path are keys, and indices from 0. A type's name is no part. An empty map or array yields nothing.
     """
     if not isinstance(data, dict | list | tuple):
         yield path, data

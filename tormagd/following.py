@@ -29,8 +29,8 @@ NOT_FOLLOWED: Final = frozenset({"RANGE", "STANDBY", "F_MIN", "F_MAX", "TAKEOVER
 class Following:
     """Measures how well the force is followed: RMS error, and the delay that explains most of it.
 
-    Looks every `period_s`. Keeps the forces asked for in the last MAX_DELAY_S, and a sum of squared errors for each
-    delay.
+    Give it the state, limits, forces and handle every `period_s` by `look`. It keeps the forces asked for in the last
+    MAX_DELAY_S, and a sum of squared errors for each delay.
     """
 
     def __init__(self, period_s: float = PERIOD_S, forgets_s: float = math.inf) -> None:
@@ -59,10 +59,10 @@ class Following:
     ) -> None:
         """Look once, and add the error for each delay where it counts.
 
-        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED, after MAX_DELAY_S of
-        setpoints. A state of None counts as ENABLED, a handle without place or rate (None) as sliding. Out of ENABLED
-        or without a setpoint (`asked_N` None), the way begins anew. With a finite `forgets_s` earlier errors fade at
-        each look.
+        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED. It does not before the
+        force has once come within NEAR_N, nor in the MAX_DELAY_S after that. A state of None counts as ENABLED, a
+        handle without place or rate (None) as sliding. Out of ENABLED or without a setpoint (`asked_N` None), the way
+        begins anew. With a finite `forgets_s` earlier errors fade at each look.
         """
         if self._kept < 1.0:
             self._weight *= self._kept
@@ -91,7 +91,8 @@ class Following:
     def _slides(self, rate_mm_s: float | None, place_mm: float | None) -> bool:
         """Tell whether the handle has slid SLID_MM since it last turned or was slower than about SLIDES_MM_S.
 
-        True for a handle whose rate or place is None. Keeps the rate, and where the handle turned, for the next look.
+        True for a handle whose rate or place is None, which is not kept. Keeps the rate, and where the handle turned,
+        for the next look.
         """
         if rate_mm_s is None or place_mm is None:
             return True
@@ -103,7 +104,8 @@ class Following:
     def report(self) -> FollowingReport | None:
         """Return the RMS error, N, the RMS error with the best delay taken out, N, and that delay, ms.
 
-        None where fewer looks count than fill MIN_S: at first, and where they are forgotten.
+        The delay is one of 0..MAX_DELAY_S in steps of `period_s`. None where fewer looks count than fill MIN_S: at
+        first, and where they are forgotten.
         """
         if self.counted_s < MIN_S:
             return None

@@ -38,9 +38,9 @@ def read_forces(path: Path) -> dict[str, "array[float]"]:
 
 
 def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"]:
-    """Read `t_s` and one other column, and return both (n each); pass over the rest.
+    """Read `t_s` and one `column` more, and return both as arrays (n each); pass over the rest.
 
-    The column's numbers have no unit, and may be any from -1e9 to 1e9. Raises as `read_table`.
+    The column's numbers have no unit, and may be any from -1e9 to 1e9. Raises ForceFileError as `read_table`.
     """
     table = read_table(path, {"t_s": TIME, column: (-1e9, 1e9, "")}, has_others=True)
     return table["t_s"], table[column]
@@ -51,10 +51,12 @@ def read_table(
 ) -> dict[str, "array[float]"]:
     """Read a CSV file's columns into arrays of equal length, by name; a million rows fit.
 
-    `allowed` names the columns with their least, most and unit. `t_s` is one of them, and rises from row to row. A file
-    may lack the `optional` ones, which the result then lacks, too. Where it `has_others`, these are passed over, and so
-    are empty lines. Raises ForceFileError for a header or row that is not so, and a cell that is no finite number
-    within its bounds. It is raised, too, for an unreadable file, over MAX_FILE_BYTES, or under MIN_ROWS.
+    `allowed` names the columns with their least, most and unit. `t_s` must be one of them, and rises from row to row.
+    Its zero is the file's own. A file may lack the `optional` ones, which the result then lacks, too. Where it
+    `has_others`, these are passed over. Empty lines are always.
+
+    Raises ForceFileError for a header or row that is not so, and a cell that is no finite number within its bounds. It
+    is raised, too, for a file that cannot be read, over MAX_FILE_BYTES, not UTF-8, or under MIN_ROWS.
     """
     try:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
@@ -105,9 +107,9 @@ def _check_row(
     """Return the numbers of the row `cells` in the order of `columns`; columns that `allowed` does not name are left
     out.
 
-    `line` is the row's number in the file, `allowed` bounds each column. `before_s` holds the time of the row before;
-    it is empty in the first row. Raises ForceFileError, naming `path` and `line`, for another number of cells, a cell
-    out of bounds, and a time that does not rise.
+    `line` is the row's last line in the file, from 1; `allowed` bounds each column. `before_s` holds the time of the
+    row before; it is empty in the first row. Raises ForceFileError, naming `path` and `line`, for another number of
+    cells, a cell out of bounds, and a time that does not rise.
     """
     if len(cells) != len(columns):
         raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
@@ -122,7 +124,7 @@ def _check_row(
 
 
 def _number(path: Path, line: int, name: str, text: str, least: float, most: float, unit: str) -> float:
-    """Return `text` as a finite number from `least` to `most`.
+    """Return `text` as a finite number from `least` to `most`, both allowed.
 
     Raises ForceFileError for any other text, also for digits with underscores. Its message names the file at `path`,
     the row `line` and the column `name`. For a number out of range it has also what is allowed, in `unit`.

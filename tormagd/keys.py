@@ -42,7 +42,8 @@ class KeyRing:
     def load_allowed(self) -> Allowed:
         """Read the key folders of all roles again and return the accepted keys; `allowed` stays as it is.
 
-        A key in several folders has all their roles, and the name of the last. Raises ConfigError as `load_folder`.
+        A key in several folders has all their roles, and the name of the last, of publish, operate and observe. Raises
+        ConfigError as `load_folder`.
         """
         found: dict[str, Listed] = {}
         for role, folder in self._folders.items():
@@ -55,9 +56,9 @@ class KeyRing:
 def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
     """Yield name and public key of every `NAME.key` in `folder`, sorted by name; nothing for a folder without any.
 
-    Nothing is read or refused before the first is asked for, and a bad key shows at its turn. Raises ConfigError for an
-    unreadable folder, more than MAX_KEYS keys, and a damaged key. It is raised, too, for a folder or key that others
-    can write: they could let themselves in.
+    The name is NAME, the key 40 characters (Z85). Nothing is read or refused before the first is asked for, and a bad
+    key shows at its turn. Raises ConfigError for an unreadable folder, more than MAX_KEYS keys, and a damaged key. It
+    is raised, too, for a folder or key that others can write: they could let themselves in.
     """
     try:
         information = folder.stat()
@@ -75,7 +76,7 @@ def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
 
 
 def _refuse_writable(path: Path, mode: int) -> None:
-    """Raise ConfigError if `mode` lets the group or others write to `path`."""
+    """Raise ConfigError, naming `path` and the remedy, if `mode` lets the group or others write to it."""
     if mode & 0o022:
         raise ConfigError(
             f"{path} can be written by others (mode {stat.S_IMODE(mode):04o}): they could let themselves in; "

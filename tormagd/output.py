@@ -21,7 +21,11 @@ _ALIKE = {"±": "+-", "·": "-", "…": "~"} | dict(zip("▁▂▃▄▅▆▇�
 
 
 def _alike(error: UnicodeError) -> tuple[str, int]:
-    """Return what a stream writes for characters that its encoding lacks: what is alike, or JSON's escapes."""
+    """Return what a stream writes for characters that its encoding lacks, and where it goes on: an error handler of
+    codecs.
+
+    It is what is alike, or JSON's escapes. Raises `error` itself where it is none of encoding.
+    """
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
@@ -32,10 +36,10 @@ codecs.register_error("alike", _alike)
 
 
 def write_in_any_encoding() -> None:
-    """Make stdout and stderr take any text from here on: what their encoding lacks becomes what is alike, or JSON's
-    escapes.
+    """Make stdout and stderr take any text from here on, for the whole process.
 
-    A stream that is None, or no text wrapper, stays as it is.
+    What their encoding lacks becomes what is alike, or JSON's escapes. A stream that is None, or no text wrapper, stays
+    as it is.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -45,9 +49,10 @@ def write_in_any_encoding() -> None:
 def write_line(text: str, stream: TextIO | None) -> OSError | None:
     """Write `text`, escaped, and a line end at once; return the error that kept this from being done, or None.
 
-    Nothing is written to a `stream` of None, which Python has for a descriptor closed at its start. A stream that
-    failed is redirected to /dev/null: it takes everything from then on and drops it. Raises UnicodeEncodeError for what
-    its encoding lacks, unless `write_in_any_encoding` was called, and ValueError for a closed stream.
+    Nothing is written to a `stream` of None, which Python has for a descriptor closed at its start; None is returned.
+    After an error the stream is redirected to /dev/null: it takes everything from then on and drops it. Raises
+    UnicodeEncodeError for what its encoding lacks, unless `write_in_any_encoding` was called, and ValueError for a
+    closed stream.
     """
     if stream is None:
         return None

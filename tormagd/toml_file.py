@@ -44,9 +44,10 @@ class TomlError(ValueError):
 
 
 def toml_text(path: Path) -> str:
-    """Read a text file of at most MAX_BYTES, in UTF-8, and return its text.
+    """Read a text file of at most MAX_BYTES, in UTF-8, and return its text, without a byte order mark.
 
-    Raises OSError, whose `strerror` says why it cannot be read, and TomlError for bytes that are not UTF-8.
+    Whether it is TOML is not looked at. Raises OSError, whose `strerror` says why it cannot be read, and TomlError for
+    bytes that are not UTF-8.
     """
     try:
         return read_bounded(path, MAX_BYTES).decode("utf-8-sig")  # editors on Windows put a byte order mark first
@@ -58,7 +59,7 @@ def toml_tables(text: str) -> dict[str, Any]:
     """Parse `text` as TOML and return its tables. Raises TomlError where it is not TOML.
 
     Also refused are lines beyond LONGEST_LINE, too deep nesting, numbers that are not finite, and integers beyond 64
-    bits.
+    bits. What the tables hold is not checked.
     """
     import tomllib  # not above: most commands of tormagctl read no file, and need not wait for it
 
@@ -90,9 +91,10 @@ def convert(path: Path, kind: type[T]) -> T:
 
 
 def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
-    """Read a TOML file as the kind that `kind_of` returns for its tables. Raises ConfigError, as `convert` does.
+    """Read a TOML file as the kind that `kind_of` returns for its tables, which have been parsed, but not checked.
 
-    Where `kind_of` raises ConfigError, the file's name is put before it, and the line after it.
+    Raises ConfigError, as `convert` does. Where `kind_of` raises ConfigError, the file's name is put before it, and the
+    line after it.
     """
     try:
         text = toml_text(path)
@@ -111,16 +113,17 @@ def placed(path: Path | None, message: str) -> str:
     """Return `message`, a refusal of what the file at `path` says, with the file's name before it and the line after.
 
     Only where it names a key that is in the file; otherwise, and where `path` is None, `message` itself. Reads the file
-    again, and raises as `toml_text` does.
+    again, and raises OSError and TomlError as `toml_text` does.
     """
     where = "" if path is None else _line(toml_text(path), message)
     return f"{path}: {message}{where}" if where else message
 
 
 def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
-    """Convert tables to a `kind`. Raises ConfigError naming key, value and what is allowed.
+    """Convert tables to a `kind`, a msgspec struct, and return it. Raises ConfigError naming key, value and what is
+    allowed.
 
-    `where` is the path of these tables in the whole, as `$.a.b`, for the message.
+    `where` is the path of these tables in the whole, as `$.a.b`, for the message. The message has no file and no line.
     """
     try:
         return msgspec.convert(tables, kind)
@@ -133,7 +136,10 @@ def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
 
 
 def table_in(kind: Any) -> type[msgspec.Struct] | None:
-    """Return the struct, optional or not, that a field of type `kind` holds; None where it holds a plain value."""
+    """Return the struct, optional or not, that a field of type `kind` holds; None where it holds a plain value.
+
+    Of a union the first struct counts.
+    """
     structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
     return next(structs, None)
 
@@ -141,7 +147,8 @@ def table_in(kind: Any) -> type[msgspec.Struct] | None:
 def _known_key(kind: Any, message: str) -> str:
     """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key in GONE.
 
-    Empty where the message names no unknown key, or where no key of `kind` at that place is near.
+    `kind` is what the whole was read as. Empty where the message names no unknown key, or where no key of `kind` at
+    that place is near.
     """
     if (unknown := _UNKNOWN.search(message)) is None or unknown[1] in GONE:
         return GONE[unknown[1]] if unknown else ""
@@ -192,10 +199,10 @@ def _at(table: Any, key: Sequence[str]) -> Any:
 
 
 def line_of(text: str, key: Sequence[str]) -> int | None:
-    """Return the number of the line of `text`, which is TOML, that gives `key`, a path through its tables.
+    """Return the number, from 1, of the line of `text`, which is TOML, that gives `key`, a path through its tables.
 
-    None where no line does, or where none of the first MAX_GUESSES lines that contain its name does. The parser keeps
-    no lines. So the text up to each of those lines is parsed, until the key is known.
+    None where no line does, for an empty key, or where none of the first MAX_GUESSES lines that contain its name does.
+    The parser keeps no lines. So the text up to each of those lines is parsed, until the key is known.
     """
     lines = text.splitlines()
     guesses = (number for number, line in enumerate(lines, start=1) if key and key[-1] in line)
@@ -203,7 +210,11 @@ def line_of(text: str, key: Sequence[str]) -> int | None:
 
 
 def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
-    """Tell whether `key` is known after this line, or after up to MAX_LINES more that its value may go on in."""
+    """Tell whether `key` is known after line `number`, from 1, or after up to MAX_LINES more that its value may go on
+    in.
+
+    False also where the text up to none of these is TOML.
+    """
     import tomllib
 
     for end in range(number, min(number + MAX_LINES, len(lines)) + 1):  # a value may go on in the lines below
@@ -217,7 +228,7 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
 def _require_numbers(value: Any, key: str) -> None:
     """Raise TomlError for a number in `value`, however deep, that is not finite or not of 64 bits, with its key.
 
-    `key` is the path of `value` in the whole.
+    `key` is the path of `value` in the whole, empty for the whole. Raises RecursionError for too deep a `value`.
     """
     if isinstance(value, float) and not math.isfinite(value):
         raise TomlError(f"{key} = {value}: allowed is a finite number")
