@@ -1,4 +1,4 @@
-"""What is told: snapshots, where what is not known is null; codes; the way of a setpoint."""
+"""What is told: snapshots, where what is not known is null; the way of a setpoint."""
 
 import math
 import time
@@ -12,15 +12,14 @@ from tormagd.config import Config
 from tormagd.control.core import Stepper
 from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, Outside, Plan
-from tormagd.daemon.causes import explanations
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
 from tormagd.scenes.scene import Budget, load_scene
-from tormagd_client.messages import BeliefReport, Explained, Telemetry, decode, encode, encode_ticks
+from tormagd_client.messages import BeliefReport, Telemetry, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
 BELIEF = {"scale": BeliefReport(value=1.02, sd=0.04, unit="", acts=True)}
@@ -218,18 +217,6 @@ def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(presen
     assert bool(limits_held(SafetyState(present), OUTPUT, PLAN)) == is_driven
     assert (published.governed_cf, published.setpoint_cf) == (1.4 if is_driven else None, 1.5)
     assert (published.field_mT is None) == (not is_driven)
-
-
-# -- codes, each with what a person needs to know about it -------------------------------------------------------------
-
-
-def test_codes_are_explained_by_their_table() -> None:
-    fault, limit = FAULTS[Fault.SKEW], LIMITS[Limit.SKEW]
-    assert explanations(("SKEW",), FAULTS) == (Explained("SKEW", fault.cause, fault.remedy),)
-    assert explanations(("SKEW",), LIMITS) == (Explained("SKEW", limit.cause, limit.remedy),)
-    found = explanations(("HOST_STALL",), LIMITS, {"HOST_STALL": "it stood still for 9 ms", "SKEW": "no"})
-    assert found == (Explained("HOST_STALL", "it stood still for 9 ms", LIMITS[Limit.HOST_STALL].remedy),)
-    assert explanations((), FAULTS) == ()
 
 
 # -- the way of a setpoint, part by part; what comes of it in a closed loop: tests/closed_loop/test_sources.py ---------

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import Any
 
 from tormagd.config import Device
@@ -64,7 +63,7 @@ class Causes:
         A cause has the figures of when the fault was given to `tell`, where there are any. Raises KeyError for a code
         that FAULTS does not have.
         """
-        return explanations(faults, FAULTS, self._told)
+        return _explained(faults, FAULTS, self._told)
 
     def of_limits(
         self,
@@ -84,7 +83,7 @@ class Causes:
         if measurement is not None:
             told[Limit.LINK_DEGRADED] = f"{LIMITS[Limit.LINK_DEGRADED].cause}: {measurement.link}"
             told[Limit.CLOCK] = f"{LIMITS[Limit.CLOCK].cause}: {measurement.link.clock_drift:+.1%}"
-        return explanations(limits, {**LIMITS, **of_sources}, told)
+        return _explained(limits, {**LIMITS, **of_sources}, told)
 
     def _stood_still(self) -> str:
         stall = self.stall
@@ -111,8 +110,8 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
     }
 
 
-def explanations(
-    codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str] = MappingProxyType({})
+def _explained(
+    codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str]
 ) -> tuple[Explained, ...]:
     """Return each code with its cause and remedy from `table`, in the order of `codes`; empty for none.
 
