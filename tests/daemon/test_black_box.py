@@ -173,10 +173,19 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     assert state_folder("/elsewhere", "blackbox") == Path("/elsewhere")
 
 
-def test_a_process_that_does_not_start_is_no_reason_not_to_run() -> None:
-    with patch("tormagd.daemon.beside.start_beside", side_effect=OSError(11, "Resource temporarily unavailable")):
-        box = BlackBox(Path("/boxes"), {}, 1_000)
-    assert "did not start" in box.report().refusal
+@pytest.mark.parametrize(
+    ("name", "fails", "says"),
+    [
+        ("tormagd.daemon.beside.start_beside", Mock(side_effect=OSError(11, "Try again")), "did not start: Try again"),
+        ("importlib.util.find_spec", lambda _name: None, "mcap is not installed: pip install 'tormagd[record]'"),
+    ],
+)
+def test_what_is_not_there_is_named_and_no_reason_not_to_run(
+    monkeypatch: pytest.MonkeyPatch, name: str, fails: object, says: str
+) -> None:
+    monkeypatch.setattr(name, fails)
+    box = BlackBox(Path("/boxes"), {}, 1_000)
+    assert (says in box.report().refusal, box.journal.is_kept) == (True, False)
     box.close()
 
 
@@ -186,13 +195,3 @@ def test_a_journal_that_nobody_takes_is_bounded_and_says_so() -> None:
         journal.stepped()
     entries = journal.take()
     assert (entries[0], len(entries) < MAX_ENTRIES) == (("missing",), True)
-
-
-def test_without_what_writes_the_files_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    monkeypatch.setattr("tormagd.daemon.beside.start_beside", lambda *_: pytest.fail("a process for nothing"))
-    box = BlackBox(Path("/boxes"), {}, 1_000)
-    assert (box.report().refusal, box.journal.is_kept) == (
-        "mcap is not installed: pip install 'tormagd[record]'",
-        False,
-    )

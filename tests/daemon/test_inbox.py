@@ -75,6 +75,11 @@ class Publishing:
     def age_s(self) -> float:
         return self.now_s - self.newest.stamp_s
 
+    def passed_over(self) -> tuple[tuple[str, int], tuple[str, int] | None]:
+        """Who is followed, and who was passed over, each with its number."""
+        followed = self.inbox.playout.in_force
+        return (followed.source, followed.seq), self.inbox.passed_over()
+
     def of(self, source: str) -> SourceReport:
         """What is reported of it."""
         self.inbox.refresh(self.now_s)
@@ -123,16 +128,6 @@ def test_a_contact_out_of_range_is_refused_by_name(
     assert not publishing.send(1, contact={"handle_mm": 1.0, "stiffness_N_mm": 0.5} | {name: value})
     assert f"contact.{name} = {value!r}: allowed is {allowed}" in str(publishing.inbox.last_refusal)
     assert publishing.inbox.newest is None
-
-
-def test_who_is_followed_and_who_was_passed_over_is_told_with_its_number(publishing: Publishing) -> None:
-    assert publishing.inbox.passed_over() is None
-    publishing.send(4)
-    publishing.send(7, 1.0, "b")
-    publishing.send(5)
-    assert (publishing.inbox.playout.in_force[1:], publishing.inbox.passed_over()) == (("a", 5), ("b", 7))
-    publishing.inbox.give("b", publishing.now_s)
-    assert (publishing.inbox.playout.in_force[1:], publishing.inbox.passed_over()) == (("b", 7), None)
 
 
 def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over(publishing: Publishing) -> None:
@@ -203,12 +198,15 @@ def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None
     with pytest.raises(RefusedError, match="no source 'b' has sent setpoints"):
         publishing.inbox.give("b", 0.0)
     publishing.send(1, 1.0, "a")
-    publishing.send(1, 2.0, "b")
+    assert publishing.passed_over() == (("a", 1), None)
+    publishing.send(7, 2.0, "b")
+    assert publishing.passed_over() == (("a", 1), ("b", 7))
     publishing.inbox.give("b", publishing.now_s)
+    assert publishing.passed_over() == (("b", 7), None)
     newest = publishing.newest
     assert (newest.force_N, newest.holder, newest.limits) == (2.0, 1, ())
     assert not publishing.send(2, 1.0, "a")
-    assert publishing.send(2, 2.1, "b")
+    assert publishing.send(8, 2.1, "b")
     publishing.now_s = 0.2
     with pytest.raises(RefusedError, match="source 'a' has sent nothing that is still valid"):
         publishing.inbox.give("a", publishing.now_s)
