@@ -68,6 +68,7 @@ def test_it_arrives_when_the_gap_has_gone_there_and_the_carriages_have_come(core
         (3.0, (Limit.RANGE,), ("RANGE",)),
         (3.0, (Limit.RANGE, Limit.F_MAX, Limit.RATE), ("RANGE", "F_MAX")),
         (3.0, (Limit.STANDBY, Limit.OTHER_SOURCE), ("STANDBY",)),
+        (0.1, (Limit.F_MIN,), ("F_MIN",)),
         # one that is too old
         (None, (Limit.STALE, Limit.SENSOR), ("STALE",)),
         (None, (Limit.STALE, Limit.OTHER_SOURCE), ("STALE", "OTHER_SOURCE")),
