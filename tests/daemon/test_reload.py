@@ -10,8 +10,8 @@ def test_what_only_a_loop_looks_at_is_taken_over():
     read = checked({"sources": {"priority": ["robot"], "playout_ms": 60.0}, "realtime": {"watchdog_ms": 800.0}}, Config)
     again = reread(RUNNING, read)
     assert set(again.taken) == set(LIVE), "a key in the list that is not carried over would be told as in force"
-    assert again == (read, ("realtime.watchdog_ms", "sources.playout_ms", "sources.priority"), ())
     assert reread(again.config, read) == (read, (), ())
+    assert again == (read, ("realtime.watchdog_ms", "sources.playout_ms", "sources.priority"), ())
 
 
 def test_what_something_was_built_from_is_named_and_stays():
