@@ -17,8 +17,6 @@ from tormagd_client.printable import require
 MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 MAX_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
-CALIBRATED = ("motor", "position", "trim")
-"Tables of which a device's calibration may state keys."
 MAX_PLAYOUT_MS = 200.0
 "Half of what the whole way from sensor to force may take."
 
@@ -309,7 +307,7 @@ def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
             found.serial_number == serial_number, "serial_number", found.serial_number, f"{serial_number}, the device's"
         )
         own = msgspec.to_builtins(config)
-        return checked({key: {**own[key], **stated[key]} if key in CALIBRATED else own[key] for key in own}, Config)
+        return checked(own | {key: own[key] | stated[key] for key in stated if key in own}, Config)
     except ValueError as error:
         raise ConfigError(placed(path, str(error))) from error
 
