@@ -109,20 +109,18 @@ def test_whatever_filled_most_of_the_delay_is_named(
     assert rig.phases.blamed == {delay.culprit: 1}
 
 
-def test_where_nothing_of_ours_ran_it_was_the_kernel(rig: Rig) -> None:
+def test_where_the_thread_was_stopped_it_was_the_kernel_also_in_the_midst_of_a_phase(rig: Rig) -> None:
     rig.beat(0)
     rig.now_ns = rig.stopped_ns = 15 * MS
     rig.beat(10)
-    assert rig.delays == [Delay(5 * MS, KERNEL, 5 * MS)]
-
-
-def test_a_phase_in_whose_midst_the_thread_was_stopped_is_not_to_blame(rig: Rig) -> None:
-    rig.beat(0)
-    rig.stopped_ns = 37 * MS
-    rig.beat(10, read=40)
-    assert rig.delays == [Delay(40 * MS, KERNEL, 27 * MS)]
-    rig.beat(51, drive=10)
-    assert rig.delays[1:] == [Delay(10 * MS, "drive", 10 * MS)]
+    rig.stopped_ns += 32 * MS  # 5 of them before the beat is due
+    rig.beat(20, read=40)
+    rig.beat(61, drive=10)
+    assert rig.delays == [
+        Delay(5 * MS, KERNEL, 5 * MS),
+        Delay(40 * MS, KERNEL, 27 * MS),
+        Delay(10 * MS, "drive", 10 * MS),
+    ]
 
 
 def test_one_log_line_in_a_while_with_the_worst_of_all(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
