@@ -251,9 +251,9 @@ class Daemon:
     def _run_core(self, config: Config, core: Core) -> None:
         """Replace the running core by `core`, made of `config`, between two beats.
 
-        Operating state, latched faults and the device's own homing stay. What was learned of the device is forgotten,
-        and its profile is read again. So is the newest setpoint. Telemetry reports on the new core, and the black box
-        begins anew. Rates have to be the same, which is not checked.
+        Operating state, latched faults and the device's own homing stay. The newest setpoint is forgotten, and what was
+        learned of the device, whose profile is read again. Telemetry reports on the new core, and the black box begins
+        anew. Rates have to be the same, which is not checked.
         """
         control, inference, now_s = self._control, self._inference, time.monotonic()
         safety, stepper, planner = control.stepper.safety, core.stepper(now_s), core.planner(now_s)
