@@ -501,14 +501,6 @@ def test_a_subscriber_that_says_too_much_is_cut_off_and_named_and_may_come_back(
 # -- opening and closing -------------------------------------------------------------------------------------------
 
 
-def test_closing_takes_the_socket_files_away_and_the_next_can_open(tmp_path: Path) -> None:
-    for _ in range(2):
-        made = Rig(tmp_path / "deep" / "folder")
-        assert (tmp_path / "deep" / "folder" / "control").exists()
-        made.close()
-        assert list((tmp_path / "deep" / "folder").iterdir()) == []
-
-
 def test_an_address_that_cannot_be_bound_is_named(tmp_path: Path) -> None:
     taken = zmq.Context()
     holder = taken.socket(zmq.PUB)
@@ -545,15 +537,17 @@ def test_one_that_shares_a_single_address_is_refused_and_leaves_none_of_its_own(
     assert (tmp_path / "control").is_socket()
 
 
-def test_what_a_killed_daemon_left_behind_is_replaced(tmp_path: Path) -> None:
-    left = socket.socket(socket.AF_UNIX)
-    left.bind(str(tmp_path / "control"))
-    left.close()
-    (tmp_path / "control.lock").write_text("4194304999\n")
-    made = Rig(tmp_path)
+def test_closing_leaves_nothing_and_what_a_killed_daemon_left_is_replaced(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "folder"
+    Rig(folder).close()
+    assert list(folder.iterdir()) == []
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(folder / "control"))
+    (folder / "control.lock").write_text("4194304999\n")
+    made = Rig(folder)
     assert made.is_answered()
     made.close()
-    assert list(tmp_path.iterdir()) == []
+    assert list(folder.iterdir()) == []
 
 
 def test_sockets_that_somebody_has_put_in_their_place_are_left_to_him(tmp_path: Path) -> None:
