@@ -51,9 +51,9 @@ def read_table(
 ) -> dict[str, "array[float]"]:
     """Read a CSV file's columns into arrays of equal length, by name; a million rows fit.
 
-    `allowed` names the columns with their least, most and unit. `t_s` must be one of them, and rises from row to row.
-    Its zero is the file's own. A file may lack the `optional` ones, which the result then lacks, too. Where it
-    `has_others`, these are passed over. Empty lines are always.
+    `allowed` names the columns with their least, most and unit; they may come in any order. `t_s` must be one of them,
+    and rises from row to row, from any zero. A file may lack the `optional` ones, which the result then lacks, too.
+    Other columns are passed over where it `has_others`, and refused otherwise. Empty lines are passed over.
 
     Raises ForceFileError for a header or row that is not so, and a cell that is no finite number within its bounds. It
     is raised, too, for a file that cannot be read, over MAX_FILE_BYTES, not UTF-8, or under MIN_ROWS.
