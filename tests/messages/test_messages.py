@@ -106,7 +106,7 @@ TELEMETRY = Telemetry(
 
 @given(setpoints, requests)
 def test_messages_come_back_as_they_went(setpoint: Setpoint, request_: Request) -> None:
-    sent = [setpoint, request_, REFUSED, DONE, TELEMETRY]
+    sent: list[Any] = [setpoint, request_, REFUSED, DONE, TELEMETRY]
     assert [decode(encode(message), type(message)) for message in sent] == sent
 
 
