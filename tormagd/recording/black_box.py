@@ -6,7 +6,6 @@ for viewers and `tormagctl plot`. `/frames` is what passed between daemon and de
 the file's header. `tormagctl replay` runs such a file.
 """
 
-import json
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -64,9 +63,11 @@ class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def frames_in(entry: Any) -> list[Frame]:
-    """Return the frames in one entry of a black box, their bytes as they were; empty for an entry of another kind.
+    """Return the frames in one entry of a black box, in their order; empty for an entry of another kind.
 
-    Raises ValueError or TypeError for an entry of READ or WROTE that is malformed.
+    An entry of READ or WROTE is a list: name, time in s on the monotonic clock, and what passed; more is ignored. What
+    passed is bytes, or a list of bytes or of pairs, identifier and bytes. Time and identifier are not checked. Raises
+    ValueError or TypeError for an entry of READ or WROTE of another form.
     """
     if not isinstance(entry, list) or not entry or entry[0] not in (READ, WROTE):
         return []
@@ -88,23 +89,25 @@ class Shown(NamedTuple):
 
 
 class Derived:
-    """Derives the messages of `/ticks` and `/frames` from the parts of `/core`; `columns` name the values of a tick.
+    """Derives the messages of `/ticks` and `/frames` from the parts of `/core`.
 
-    Goes on from part to part: `ticks` counts ticks so far, frames are numbered, and one offset times all frames.
+    Goes on from part to part: ticks and frames are numbered, and one offset times all frames.
     """
 
-    def __init__(self, columns: tuple[str, ...]) -> None:
-        self._columns = columns
+    def __init__(self, columns: str) -> None:
+        """Begin; `columns` names the values of a tick, a list in JSON. Raises msgspec.MsgspecError for anything
+        else."""
+        self._columns = msgspec.json.decode(columns, type=tuple[str, ...])
         self._ticks = self._frames = 0
         self._offset_ns: int | None = None
         "From the monotonic clock to ns since 1970; None while unknown."
 
     def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
-        """Yield the messages derived from one part's entries.
+        """Yield the messages derived from one part's entries, in their order: one a tick, one a frame.
 
         `offset_ns` takes the monotonic clock to ns since 1970. The first one given times all frames, so that they stay
-        in order; while it is None, frames count from 0 of the monotonic clock. Raises ValueError or TypeError for odd
-        entries.
+        in order; while it is None, frames count from 0 of the monotonic clock. Raises ValueError where a tick and the
+        columns differ in length. Raises that, TypeError or OverflowError for a malformed READ or WROTE.
         """
         if self._offset_ns is None:
             self._offset_ns = offset_ns
@@ -122,12 +125,14 @@ class Derived:
 def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> None:
     """Write a new black box of these parts, whole or not at all.
 
-    `header` needs `columns`: the names of a tick's values, a list in JSON. `key` seals the file; an empty one seals it
-    without a key. Raises FileExistsError where `path` exists, OSError, and ValueError or TypeError for odd entries.
+    `header` needs `columns`: the names of a tick's values, a list in JSON; nothing else in it is checked. `key` seals
+    the file; an empty one seals it without a key. The folder has to exist. Raises FileExistsError where `path` exists,
+    and OSError. Raises KeyError without `columns`, msgspec.MsgspecError for what does not decode, and what
+    `Derived.of` raises for odd entries.
     """
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
-    derived = Derived(tuple(json.loads(header["columns"])))
+    derived = Derived(header["columns"])
     with in_place_of(path) as beside, beside.open("wb") as file:
         sealing, mcap = sealed_mcap(file, key, {}, {"version": __version__, "kind": HEADER})
         mcap.add_metadata(HEADER, header)
@@ -151,9 +156,9 @@ def is_tick(entry: Any) -> bool:
 def read_black_box(path: Path) -> BlackBoxFile:
     """Read the black box in `path`; one that was cut short is returned as far as it reads, with `is_complete` False.
 
-    The first message of `/ticks` or `/frames` that differs from `/core` is named in `odd`, and raises nothing. The seal
-    is not checked. Raises RecordingError where the file is not readable, not MCAP, damaged, beyond a bound, or no black
-    box.
+    The first message of `/ticks` or `/frames` that differs from `/core` is named in `odd`, and raises nothing. Neither
+    the seal nor what the entries and the header say is checked. Raises RecordingError where the file is not readable,
+    not MCAP, damaged, beyond a bound, or no black box.
     """
     found = _Reading(path)
     with opened(path) as file:
@@ -188,9 +193,10 @@ class _Reading:
         self._size = self._parts = 0
 
     def take(self, record: Record) -> None:
-        """Take a record that is no message: note a channel's topic, add to the header; others pass.
+        """Take a record that is no message: note a channel's topic, add to the header; others are passed over.
 
-        Raises ValueError where `/core` is not msgpack, and as `Record.read` for damage.
+        A channel keeps the first topic told of it, a name in the header its last value. Raises ValueError where `/core`
+        is not msgpack, and as `Record.read` for damage.
         """
         if record.opcode == Opcode.CHANNEL:
             channel = record.read(Channel)
@@ -203,10 +209,10 @@ class _Reading:
                 self.header.update(known.metadata)
 
     def message(self, sent: Sent) -> None:
-        """Take a message of `/core`, or compare one of `/ticks` or `/frames` with it; messages of other topics pass.
+        """Keep a message of `/core`, or compare one of `/ticks` or `/frames` with it; others are passed over.
 
-        Once `odd` is set, nothing more is compared. Raises RecordingError where no header came before, and UNREADABLE
-        (ValueError among them) for a damaged part.
+        The first that differs is noted in `odd`, after which nothing more is compared. Raises RecordingError where no
+        header came before, and UNREADABLE (ValueError among them) for a damaged part.
         """
         if not self.header:
             raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read
@@ -217,9 +223,10 @@ class _Reading:
             self._compare(topic, sent)
 
     def _part(self, sent: Sent) -> None:
-        """Keep a part's entries, and derive the messages that must follow; note in `odd` an entry that derives none.
+        """Add a part's entries to `entries`, and expect the messages derived from them in the file.
 
-        Raises ValueError beyond a bound, or msgspec.MsgspecError for a part that does not decode.
+        An entry from which none can be derived is noted in `odd`, and raises nothing. Raises ValueError beyond a bound
+        on bytes, parts or entries, and msgspec.MsgspecError for a part, or the header's columns, that do not decode.
         """
         self._size, self._parts = self._size + len(sent.data), self._parts + 1
         if self._size > MAX_BYTES or self._parts > MAX_PARTS:
@@ -229,7 +236,7 @@ class _Reading:
         if len(self.entries) > MAX_ENTRIES:
             raise ValueError(f"over {MAX_ENTRIES} entries")
         if self._derived is None:
-            self._derived = Derived(tuple(json.loads(self.header.get("columns", "[]"))))
+            self._derived = Derived(self.header.get("columns", "[]"))
         try:
             for shown in self._derived.of(entries, None):
                 self._expected[shown.topic].append(shown)
@@ -237,9 +244,10 @@ class _Reading:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
 
     def _compare(self, topic: str, sent: Sent) -> None:
-        """Take the next derived message, and note in `odd` where the file's message differs.
+        """Compare the file's next message of `topic` with the next derived one, and note in `odd` where they differ.
 
-        Frames may differ in time by a constant, within MAX_TIME_DIFFERENCE_NS.
+        Number and bytes have to be the same, a tick's time too. Frames' times may differ by what the first frame's do,
+        within MAX_TIME_DIFFERENCE_NS. A message for which none is derived differs.
         """
         expected = self._expected[topic].popleft() if self._expected[topic] else None
         if expected is None or (sent.sequence, sent.data) != (expected.sequence, expected.data):

@@ -48,23 +48,27 @@ class Segment(NamedTuple):
 
 
 def segment_of(path: Path) -> Segment | None:
-    """Describe the recording in `path` by its name and size; None where the file does not exist."""
+    """Describe the recording in `path` by its name and size; None where its size cannot be asked, as of no file.
+
+    Nothing of the file is read; a link counts with its own size. `began_s` is None, and the segment not marked, where
+    the name is not that of a segment.
+    """
     named = _NAME.fullmatch(path.name)
     began_s = None
-    with contextlib.suppress(ValueError):
+    with contextlib.suppress(ValueError):  # such as the 13th month
         if named is not None:
-            began_s = datetime.strptime(named[1], _FORM).replace(tzinfo=UTC).timestamp() + float(
-                (named[2] or "0")[:4] or 0
-            )
+            began = datetime.strptime(named[1], _FORM).replace(tzinfo=UTC)
+            began_s = began.timestamp() + float((named[2] or "0")[:4])
     with contextlib.suppress(OSError):
         return Segment(path, began_s, path.lstat().st_size, named is not None and named[3] is not None)
     return None
 
 
 def mark(path: Path) -> Path:
-    """Rename a segment so that pruning keeps it, and return its path; one that is marked already stays as it is.
+    """Rename a segment so that pruning keeps it, and return its new path; one that is marked already stays as it is.
 
-    Raises ValueError where the file is not named as a segment, and OSError where it cannot be renamed.
+    One that somebody else has just marked counts as renamed. Raises ValueError where the file is not named as a
+    segment, and OSError where it is not there or cannot be renamed.
     """
     named = _NAME.fullmatch(path.name)
     require(named is not None, "the name", path.name, "that of a segment, as tormagctl record DIR gives it")
@@ -81,8 +85,10 @@ def mark(path: Path) -> Path:
 
 
 class RecordingFolder:
-    """Recordings in the folder `path` within `budget`; `clock` is in seconds since 1970. Every method may raise
-    OSError."""
+    """Recordings in the folder `path` within `budget`; `clock` is in seconds since 1970.
+
+    Every method may raise OSError, also where there is no folder. None makes it.
+    """
 
     def __init__(self, path: Path, budget: Budget, clock: Callable[[], float] = time.time) -> None:
         self.path, self.budget, self._clock = path, budget, clock
@@ -90,7 +96,7 @@ class RecordingFolder:
     def segments(self) -> list[Segment]:
         """List the folder's recordings by age, the oldest first; those whose name says no time come before all.
 
-        Every `*.mcap` in it counts, black boxes too. Empty where there is no folder.
+        Every `*.mcap` in it counts, black boxes too, those in its folders do not. Empty where there is no folder.
         """
         found = [each for path in self.path.glob("*.mcap") if (each := segment_of(path)) is not None]
         return sorted(found, key=lambda each: (each.began_s or 0.0, each.path.name))
@@ -98,7 +104,8 @@ class RecordingFolder:
     def new(self) -> Path:
         """Prune until a whole segment has room, and return the path for a new one, named by the present time.
 
-        Creates no file. Raises OSError with ENOSPC where even pruning leaves no room.
+        Creates no file, and does not ask whether there is one of that name. Raises OSError with ENOSPC where even
+        pruning leaves no room.
         """
         reason = self.make_room(self.budget.segment_bytes + END_BYTES)
         if reason:
@@ -113,7 +120,8 @@ class RecordingFolder:
     def room(self, needed_bytes: int) -> str:
         """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty where there is.
 
-        A recorder asks this while it writes.
+        Short means: of `needed_bytes` and the budget's `free_bytes`. The budget's own size counts only then. A recorder
+        asks this while it writes.
         """
         if shutil.disk_usage(self.path).free >= self.budget.free_bytes + needed_bytes:
             return ""
@@ -126,10 +134,10 @@ class RecordingFolder:
         return f"No space left on device: {over}, and nothing unmarked is left to take away" if over else ""
 
     def prune(self, coming_bytes: int = 0) -> list[Segment]:
-        """Delete segments too old, and the oldest until `coming_bytes` more fit the budget; return those deleted.
+        """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return those deleted.
 
-        Keeps what is marked, is being written, has no time in its name, or is a link. A segment that somebody else
-        deleted meanwhile counts as deleted.
+        Keeps what is marked, is being written, has no time in its name, or is a link, even where that leaves no room. A
+        segment that somebody else deleted meanwhile counts as deleted.
         """
         left, gone = self.segments(), []
         for segment in list(left):
@@ -140,9 +148,10 @@ class RecordingFolder:
         return gone
 
     def mark_around(self, segment: Path) -> Path:
-        """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return the new path.
+        """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return its new path.
 
-        Raises ValueError where `segment` is not named as one. A failure to mark the one before is passed over.
+        Raises ValueError where `segment` is not named as one or not in this folder, and OSError where it cannot be
+        renamed. A failure to mark the one before is passed over.
         """
         marked = mark(segment)
         known = self.segments()
@@ -165,8 +174,11 @@ class RecordingFolder:
         return ""
 
     def _delete(self, segment: Segment) -> bool:
-        """Delete a segment and return True; False where it is marked, has no time in its name, is a link, or is being
-        written."""
+        """Delete a segment and return True, also where it is gone already.
+
+        False where it is marked, has no time in its name, is a link, or is being written. Raises OSError where it
+        cannot be opened or deleted.
+        """
         if segment.is_marked or segment.began_s is None or segment.path.is_symlink():
             return False
         with contextlib.suppress(FileNotFoundError), segment.path.open("rb") as file:

@@ -48,7 +48,7 @@ class Ring:
         self.bytes = 0
 
     def put(self, part: Part) -> None:
-        """Add a part, and drop the oldest while they are too old or too large."""
+        """Add a part, which comes later than those before, and drop the oldest while they are too old or too large."""
         self._parts.append(part)
         self.bytes += len(part.entries)
         parts = self._parts
@@ -63,8 +63,8 @@ class Ring:
 class Keeper:
     """Keeps the black box of the daemon at the other end of the socket `its`, and writes it to files.
 
-    Holds a ring of the newest parts, the folder and header that the daemon began with, files due, and the thread that
-    writes one.
+    Messages are those of `tormagd.keeping`, one a packet. Holds a ring of the newest parts and the daemon's last Begin:
+    folder, header, key. A file is due from its Write until it is written. At most one thread writes.
     """
 
     def __init__(self, its: socket.socket) -> None:
@@ -75,11 +75,11 @@ class Keeper:
         self._writing: threading.Thread | None = None
 
     def run(self) -> None:
-        """Keep and write black boxes until the daemon ends, then write all that is still due.
+        """Keep and write black boxes until the daemon ends, then write all that is still due, and return.
 
-        Files are written one at a time, in a thread of their own. Those still due when the daemon begins anew or ends
-        are written at once, in this thread. A daemon that goes without End leaves a file named DAEMON-DIED, where parts
-        are kept. Raises msgspec.MsgspecError for a packet that does not decode.
+        Files are written one at a time, in a thread of their own, and answered by a Written each. Those still due when
+        the daemon begins anew or ends are written at once, in this thread. A daemon that goes without End leaves a file
+        named DAEMON-DIED, where parts are kept. Raises msgspec.MsgspecError for a packet that does not decode.
         """
         while self._hear():
             if self._writing is not None and self._writing.is_alive():
@@ -93,7 +93,10 @@ class Keeper:
         self._write_due()
 
     def _write_due(self) -> None:
-        """Write all black boxes that are still due, without waiting for what should have come into them."""
+        """Write all black boxes that are still due, without waiting for what should have come into them.
+
+        Waits for the one that is being written. Failures are logged and answered; afterwards none is due.
+        """
         if self._writing is not None:
             self._writing.join()
         for _, write in self._due:
@@ -101,10 +104,11 @@ class Keeper:
         self._due.clear()
 
     def _hear(self) -> bool:
-        """Wait for one packet from the daemon and take it; False once the daemon has ended.
+        """Wait for one packet from the daemon and take it; return whether the daemon goes on.
 
-        While files are due it waits LOOK_S at most, and returns True. Where the socket closes without End, and parts
-        are kept, a file named DAEMON-DIED becomes due. Raises msgspec.MsgspecError for a packet that does not decode.
+        While files are due it waits LOOK_S at most; where nothing came, that is True. False after End, and where the
+        socket was closed or failed. Without End, and where parts are kept, a file named DAEMON-DIED becomes due then.
+        Raises msgspec.MsgspecError for a packet that does not decode.
         """
         ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
         if not ready:
@@ -123,9 +127,10 @@ class Keeper:
         return not isinstance(said, End)
 
     def _take(self, said: Said) -> None:
-        """Take what the daemon said: add a part, begin anew once all that is due is written, or queue a file.
+        """Take what the daemon said: keep a Part, begin anew for a Begin, or make the file of a Write due.
 
-        A file over MAX_DUE is refused by an answer. End changes nothing.
+        Begin first writes all that is due, then forgets every part. A Write is refused, by a Written that says so,
+        while MAX_DUE files are due. End changes nothing.
         """
         match said:
             case Part():
@@ -139,10 +144,10 @@ class Keeper:
                 self._answer(Written(said.name, f"{said.name}: {MAX_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
-        """Write one black box, delete files beyond MAX_FILES, and answer the daemon.
+        """Write one black box of `parts`, delete the oldest files beyond MAX_FILES, and answer the daemon.
 
-        Every failure is logged and answered, also that of deleting an old file once the new one is written. Makes the
-        folder where there is none, and makes this thread nicer. Without parts it fails.
+        Makes the folder where there is none. A failure raises nothing, and goes to stderr and into the answer. It may
+        be: no parts, a file that exists, a full disk, an old file that stays. Lowers this thread's priority for good.
         """
         from tormagd.recording.black_box import write_black_box
 
@@ -157,7 +162,7 @@ class Keeper:
             write_black_box(folder / write.name, details, parts, _key(begun.key))
             for old in sorted(folder.glob("*Z-*.mcap"))[:-MAX_FILES]:
                 old.unlink()
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, msgspec.MsgspecError) as error:
             refusal = f"{folder / write.name}: {getattr(error, 'strerror', None) or error!r}"
             write_line(f"tormagd: no black box: {refusal}", sys.stderr)
         self._answer(Written(write.name, refusal))
@@ -169,9 +174,10 @@ class Keeper:
 
 
 def _key(file: str) -> bytes:
-    """Read the seals' key from `file`, without surrounding white space; empty, without a warning, for an empty name.
+    """Read the seals' key from `file`, without surrounding white space; empty for an empty name.
 
-    Where it cannot be read, or is no key, it is empty, and a warning goes to stderr. A box is worth more than its seal.
+    A file that cannot be read, or is no key, also gives an empty key, with a warning on stderr. It raises nothing: a
+    black box is worth more than its seal.
     """
     from tormagd.recording.seal import read_key
 

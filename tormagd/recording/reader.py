@@ -63,7 +63,10 @@ def opened(path: Path) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def readable(name: str) -> Iterator[None]:
-    """Turn any of UNREADABLE raised within this context into a RecordingError that calls the file `name`."""
+    """Turn any of UNREADABLE raised within this context into a RecordingError that calls the file `name`.
+
+    A RecordingError stays as it is; OSError and all others pass through.
+    """
     try:
         yield
     except RecordingError:
@@ -76,8 +79,9 @@ def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Cal
     """Read an MCAP file from its beginning: each message goes to `message`, any other record, also a chunk, to `take`.
 
     `file` has to stand at byte 0, and is left where reading ended. Returns whether the file ends as it should; False
-    for one cut short. `take` gets END last, which is no MCAP record, where it does. Raises RecordingError, naming the
-    file `name`: not MCAP, empty, damaged, or refused by a callback that raises UNREADABLE (ValueError among them).
+    for one cut short. `take` gets END last, which is no MCAP record, where it does. Raises OSError, and RecordingError,
+    naming the file `name`: not MCAP, empty, damaged, or refused by a callback that raises UNREADABLE (ValueError among
+    them).
     """
     last = -1
     with readable(name):
@@ -98,8 +102,10 @@ class Place(NamedTuple):
 
 
 class Contents:
-    """Collects what a file's records tell: topics, metadata, and places of chunks. `take` raises UNREADABLE for
-    damage."""
+    """Collects what a file's records tell: topics, metadata, and places of chunks, in the file's order.
+
+    `metadata` are tormagd's own, texts by name. `take` raises UNREADABLE for damage.
+    """
 
     def __init__(self) -> None:
         self._topics: dict[int, str] = {}
@@ -111,8 +117,11 @@ class Contents:
         "False where the recorder was killed or the disk was full: messages up to then are there."
 
     def take(self, record: Record) -> None:
-        """Take a record that is no message: a channel's topic, tormagd's metadata, or a chunk's place. Others are
-        passed over."""
+        """Note what a record that is no message tells: a channel's topic, tormagd's metadata, or a chunk's place.
+
+        Of metadata the last value of a name counts, of a channel its last topic. Chunks beyond MAX_INDEX and all other
+        records are passed over.
+        """
         if record.opcode == Opcode.CHANNEL:
             channel = record.read(Channel)
             self._topics[channel.id] = channel.topic
@@ -126,9 +135,11 @@ class Contents:
             self.places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
 
     def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Sent], None]:
-        """Return what hands each tick and snapshot to `each`, decoded as the type `wanted`, which may leave fields out.
+        """Return a function of one Sent, which hands each tick and snapshot to `each`, decoded as the type `wanted`.
 
-        Messages of other topics are passed over. What it returns raises UNREADABLE for damage.
+        `wanted` is any type that msgspec decodes from JSON; fields that it leaves out are ignored. Messages of topics
+        that `take` was not told of before are passed over. The function raises UNREADABLE for damage, and what `each`
+        raises.
         """
         decoder = msgspec.json.Decoder(wanted)
 
@@ -147,10 +158,10 @@ class Contents:
             )
 
     def described(self, name: str, kind: Any) -> Any:
-        """Return the metadata value `name`, which is JSON, decoded as the type `kind`.
+        """Return the metadata value `name`, which is JSON, decoded as the type `kind` by msgspec.
 
-        None where it is absent or of another type. A plain text, as a string of the description is written, gives None
-        too: take it from `metadata`.
+        None where it is absent, no JSON, or of another type. A text that the recorder wrote as it is, without quotes,
+        gives None too: take it from `metadata`.
         """
         try:
             return msgspec.json.decode(self.metadata[name], type=kind)
@@ -159,10 +170,12 @@ class Contents:
 
 
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Read the recording in an open `file`, which errors call `name`: each tick and snapshot goes to `each`.
+    """Read the recording in an open `file` at byte 0, which errors call `name`: each tick and snapshot goes to `each`.
 
-    Returns metadata, chunk places and completeness; `wanted` is the type to decode messages as. Raises RecordingError:
-    not MCAP, damaged, or not written by tormagd; and OSError.
+    `wanted` is the type to decode messages as. Returns metadata, chunk places, and whether it is complete; one cut
+    short is read as far as it goes. The file stays open, and its seals are not checked. Raises RecordingError: not
+    MCAP, damaged, or without ticks and snapshots; and OSError. Ticks and snapshots before the damage have then gone to
+    `each`.
     """
     found = Contents()
     is_whole = scan(file, name, found.take, found.reading(wanted, each))
@@ -174,8 +187,7 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
 def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
     """Read the recording in `path`: each tick and snapshot, decoded as the type `wanted`, goes to `each`.
 
-    Returns metadata, chunk places and completeness. Raises RecordingError: not readable, not MCAP, damaged, or not
-    ours.
+    Returns and raises as `read_open`, but a file that cannot be opened or read is a RecordingError, too.
     """
     with opened(path) as file:
         return read_open(file, str(path), wanted, each)
@@ -211,8 +223,9 @@ class RecordingFile:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, both included, in the file's order, decoded as
         `wanted`.
 
-        Times are ns since 1970. Raises RecordingError where the file is damaged, or has over MAX_SEEN messages in this
-        time.
+        Times are ns since 1970; empty where nothing is in between. Only chunks are read: messages outside of one are
+        not found. Raises RecordingError where the file can no longer be read, is damaged there, or has over MAX_SEEN
+        messages in this time.
         """
         found: list[Seen] = []
 
@@ -232,9 +245,10 @@ class RecordingFile:
 
 
 def summary_of(path: Path) -> tuple[Contents, Overview] | None:
-    """Read contents and overview from the end of the file in `path`, without checking its seals.
+    """Read contents and overview from the end of the file in `path`, without its messages.
 
-    None for a cut file, or one without an overview. Raises RecordingError: not readable, damaged, or not ours.
+    Its seals are not checked. None for a cut file, or one without an overview. Raises RecordingError: not readable,
+    damaged, or without ticks and snapshots.
     """
     with opened(path) as file, readable(str(path)):
         found = _from_summary(file)
@@ -246,8 +260,8 @@ def summary_of(path: Path) -> tuple[Contents, Overview] | None:
 def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
     """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview.
 
-    Messages are not read. Raises any of the exceptions in UNREADABLE for damage; `readable` makes them a
-    RecordingError.
+    Messages are not read, and nothing says whose they are: `Contents.require` does. Raises OSError, and any of
+    UNREADABLE for damage, which `readable` makes a RecordingError.
     """
     at = file.seek(0, 2) - TAIL_BYTES
     file.seek(max(0, at))
@@ -279,7 +293,10 @@ def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
 
 
 def _at(file: BinaryIO, at: int, opcode: Opcode) -> Record:
-    """Read the record at byte `at`. Raises ValueError where it is cut or of another kind."""
+    """Read the record at byte `at`, and leave `file` behind it.
+
+    Raises ValueError where it is cut, too long, or of another kind than `opcode`.
+    """
     file.seek(at)
     record = record_at(file, at)
     if record is None or record.opcode != opcode:

@@ -33,10 +33,10 @@ _BODY = struct.Struct(f"<B{DIGEST_BYTES}s")
 
 
 def read_key(file: str) -> bytes:
-    """Read the sealing key from a file, without surrounding white space; empty where `file` is an empty name.
+    """Read the sealing key from the file named `file`, without surrounding white space; empty for an empty name.
 
-    Raises OSError, also for a file far longer than a key, and ValueError where the key is not of MIN_KEY..MAX_KEY
-    bytes.
+    Raises OSError where it cannot be read, is no regular file, or has over 2 * MAX_KEY bytes. Raises ValueError where
+    the key is not of MIN_KEY..MAX_KEY bytes, as of an empty file.
     """
     if not file:
         return b""
@@ -65,8 +65,10 @@ class SealingFile:
         "Digest of the newest seal, hexadecimal; empty before the first."
 
     def write(self, data: bytes) -> None:
-        """Append bytes and digest them; while `finish` holds the file's end back, they are kept for it. Raises
-        OSError."""
+        """Write `data` behind what was written, and digest it; while `finish` holds the file's end back, keep it.
+
+        Raises OSError.
+        """
         if self._held is None:
             self._file.write(data)
             self._hash.update(data)
@@ -82,8 +84,10 @@ class SealingFile:
         self._file.flush()
 
     def seal(self, *, is_last: bool = False) -> bytes:
-        """Write a seal of all bytes before it, keep its digest in `digest`, and return the seal's bytes. Raises
-        OSError."""
+        """Write a seal of all bytes before it, keep its digest in `digest`, and return the whole record's bytes.
+
+        `is_last` says that it is the file's last; what follows is not refused. Raises OSError.
+        """
         digest = _digest(self._hash, is_last)
         body = _BODY.pack(is_last, digest)
         record = Record(SEAL, 0, body).head + body
@@ -92,9 +96,10 @@ class SealingFile:
         return record
 
     def finish(self, mcap: Writer) -> None:
-        """Finish the file that `mcap` writes here: last seal, then a footer whose CRC covers it. Raises OSError.
+        """Finish the file that `mcap` writes here: summary, last seal, then a footer whose CRC covers both.
 
-        The file stays open.
+        `mcap` has to write to this object, once; it writes nothing afterwards. The file is flushed and stays open.
+        Raises OSError.
         """
         mcap.flush()  # type: ignore[no-untyped-call]
         self._held = bytearray()
@@ -141,11 +146,12 @@ class Verdict(NamedTuple):
 
 
 def verified(path: Path, key: bytes = b"") -> Verdict:
-    """Check the seals of the file in `path` and return the verdict; damage is a verdict, too. Raises OSError.
+    """Check the seals of the file in `path`, all of which is read, and return the verdict.
 
-    Keyed seals need their `key`; with a wrong one the state is ALTERED. With an empty one it is OTHER_KEY as long as
-    every record can be read, even where bytes were altered. With a `key`, a file without seals is NO_KEY, and so is an
-    intact one whose seals have no key.
+    Damage is a verdict, too: ALTERED, also for what is no MCAP. A file cut short is UNFINISHED. Keyed seals need their
+    `key`; with a wrong one the state is ALTERED. With an empty one it is OTHER_KEY as long as every record can be read,
+    even where bytes were altered. With a `key`, a file without seals is NO_KEY, and so is an intact one whose seals
+    have no key. Raises OSError.
     """
     with path.open("rb") as file:
         found = _Check(key)
@@ -178,10 +184,10 @@ class _Check:
         "The first thing that is not as it was sealed."
 
     def take(self, record: Record) -> None:
-        """Check the next record in the file's order, and note the first thing that is not as it was sealed.
+        """Check the next record in the file's order, and note what is not as it was sealed.
 
-        Give it every record of `records`, END too. What is wrong with a seal is noted, not raised. Raises McapError,
-        ValueError or struct.error for metadata or a footer that cannot be parsed.
+        Give it every record of `records`, END too. What is wrong with a seal, a footer, or behind the last seal is
+        noted, not raised. Raises McapError, ValueError or struct.error for metadata or a footer that cannot be parsed.
         """
         if record.opcode == END:
             self._is_over = True
@@ -196,7 +202,8 @@ class _Check:
     def _digest(self, record: Record) -> None:
         """Add a record to the hash, or while there is none, to the bytes that the hash will begin with.
 
-        Also adds a record of the summary to its CRC, and notes where the summary begins.
+        Those are given up once a record is neither header nor metadata: such a file is not sealed. A record of the
+        summary is added to its CRC, too, and its place is kept. Raises as `Record.read` for metadata.
         """
         if self._hash is not None:
             self._hash.update(record.head)  # apart: a chunk is a megabyte, and joining would copy it
@@ -217,7 +224,8 @@ class _Check:
     def _begin(self, record: Record) -> None:
         """Begin the hash with all bytes so far, where this metadata record says that the file is sealed.
 
-        Keeps by what, and what it follows; a kind of seal that tormagd does not write is noted.
+        Nothing happens for other metadata. Keeps by what it is sealed, and what it follows; a kind of seal that tormagd
+        does not write is noted. Raises as `Record.read`.
         """
         known = record.read(Metadata)
         if known.name == SEALED:
@@ -243,7 +251,10 @@ class _Check:
         self._sealed_to = record.at + HEAD.size + len(record.body)
 
     def _end(self, record: Record) -> None:
-        """Note a footer whose offsets or CRC do not fit the file."""
+        """Compare a footer with the summary before it, and note one whose offsets, CRC or size do not fit.
+
+        Raises McapError or struct.error for one that is too short.
+        """
         footer = Footer.read(ReadDataStream(BytesIO(record.body)))
         own = zlib.crc32((record.head + record.body)[: _FOOTER_BYTES - 4], self._crc)
         told = (footer.summary_start, footer.summary_offset_start, footer.summary_crc)
@@ -261,10 +272,10 @@ class _Check:
     def verdict(self, size: int, *, ends: bool) -> Verdict:
         """Return the verdict on a file of `size` bytes; `ends` says whether its last bytes are MCAP's closing magic.
 
-        The first that holds: UNSEALED for a file without a word of seals, but NO_KEY where a key is configured.
-        OTHER_KEY for keyed seals without the key.
-        ALTERED for an oddity, or an end that the seals do not explain. NO_KEY for plain seals where a key is
-        configured; UNFINISHED for a file cut short; else WHOLE.
+        Call it once, after the last record. The first that holds: UNSEALED for a file without a word of seals, but
+        NO_KEY where a key is configured. OTHER_KEY for keyed seals without the key. ALTERED for an oddity, or an end
+        that the seals do not explain. NO_KEY for plain seals where a key is configured; UNFINISHED for a file cut
+        short; else WHOLE.
         """
         if not self._by and not self._seals and (self._is_over or not self._head):
             why = "nothing says whether it was changed: an older tormagd, or another program, wrote it"

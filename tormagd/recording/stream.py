@@ -62,8 +62,9 @@ class Sent(NamedTuple):
 def contents(file: BinaryIO, message: Callable[[Sent], None]) -> Iterator[Record]:
     """Read an MCAP file: call `message` with each message, and yield every other record in order, also those in chunks.
 
-    A chunk itself is yielded before its records. END comes last, unless the file is cut short. Raises ValueError,
-    McapError, ZstdError, struct.error where the file is damaged or beyond the bounds.
+    A chunk itself is yielded before its records. END comes last, unless the file is cut short. `file` stands at byte 0.
+    Raises OSError, and ValueError, McapError, ZstdError, struct.error where the file is damaged or beyond the bounds.
+    What `message` raises passes through.
     """
     unpacker = Unpacker()
     for record in records(file):
@@ -79,7 +80,8 @@ def contents(file: BinaryIO, message: Callable[[Sent], None]) -> Iterator[Record
 def records(file: BinaryIO) -> Iterator[Record]:
     """Yield the records of an MCAP file from its beginning; the last is END, which a file cut short does not have.
 
-    Chunks are not unpacked. Raises ValueError where the file is no MCAP, or beyond the bounds.
+    Chunks are not unpacked, and an empty file, or one cut within its first eight bytes, has none. `file` stands at byte
+    0. Raises OSError, and ValueError where the file is no MCAP, or beyond the bounds.
     """
     head = file.read(len(MAGIC))
     if not MAGIC.startswith(head):
@@ -89,9 +91,10 @@ def records(file: BinaryIO) -> Iterator[Record]:
 
 
 def following(file: BinaryIO, at: int) -> Iterator[Record]:
-    """Yield the records from byte `at` on, where `file` already stands; END after the closing magic.
+    """Yield the records from byte `at` on, where `file` already stands, up to the footer; then END.
 
-    Raises ValueError: an unknown kind, a size or a count beyond the bounds, or a wrong end.
+    `at` is not checked. A file cut short gives no END, and raises nothing. Raises OSError, and ValueError: an unknown
+    kind, a size or a count beyond the bounds, or anything but the closing magic behind the footer.
     """
     texts = 0
     while (record := record_at(file, at)) is not None:
@@ -110,9 +113,10 @@ def following(file: BinaryIO, at: int) -> Iterator[Record]:
 
 
 def record_at(file: BinaryIO, at: int) -> Record | None:
-    """Read the record at the file's present place, which is byte `at`; None where the file ends within it.
+    """Read the record at the file's present place, which is byte `at`; None where the file ends there or within it.
 
-    Raises ValueError for an unknown kind, or a length beyond the bound.
+    Leaves `file` behind the record. Its body is not parsed. Raises OSError, and ValueError for an unknown kind, or a
+    length beyond the bound.
     """
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:
@@ -137,10 +141,10 @@ class Unpacker:
         self._packed = self._unpacked = self._texts = 0
 
     def records(self, chunk: Record, message: Callable[[Sent], None]) -> Iterator[Record]:
-        """Unpack a chunk: call `message` with each message, and yield its schemas, channels and metadata.
+        """Unpack a chunk, a record as it was read: call `message` with each message, yield the others in order.
 
-        Other kinds are passed over. Raises ValueError, McapError, ZstdError, struct.error for damage or beyond the
-        bounds.
+        Those are schemas, channels and metadata; their `at` is the chunk's. Other kinds are passed over. Raises
+        ValueError, McapError, ZstdError, struct.error for damage or beyond the bounds.
         """
         known: Chunk = chunk.read(Chunk)
         self._packed += len(chunk.body)
@@ -170,7 +174,11 @@ def _sent(data: bytes, at: int, length: int) -> Sent:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Unpack a chunk's data. Raises ValueError: too large, a compression other than zstd, a wrong size or checksum."""
+    """Unpack a chunk's data, with zstd or not at all, and return them.
+
+    A checksum of 0 is not compared. Raises ValueError: too large, another compression, a wrong size or checksum. Raises
+    ZstdError for damage.
+    """
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes: allowed is {MAX_CHUNK_BYTES}")

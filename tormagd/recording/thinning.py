@@ -32,11 +32,12 @@ class Thinning:
         self._full_to_ns = max(self._full_to_ns, t_ns + AROUND_NS)
 
     def take(self, tick: Tick) -> list[Tick]:
-        """Add a tick, later than those before, and return the ticks to be written now, in their order.
+        """Add a tick, and return the ticks to be written now, in their order; often none.
 
-        The others wait for AROUND_S; after the last tick `rest` gives them. A new set of `faults` in the message, or a
-        mark noted by `happened`, keeps all ticks around it. All that wait are then returned. A message without `faults`
-        has none.
+        A tick waits for AROUND_S. Then one of `every` is returned, and the others are dropped. After the last tick
+        `rest` gives those that still wait. A new set of `faults` in the message, or a mark noted by `happened`, keeps
+        all around it: all that wait are then returned. A message without `faults` has none. That times rise is not
+        checked.
         """
         if self.every == 1:
             return [tick]
@@ -56,7 +57,8 @@ class Thinning:
     def rest(self, every: int) -> list[Tick]:
         """Return one of `every` of the ticks that wait, in their order, and forget them all; 1 returns all.
 
-        Which of them are kept goes on from the ticks before.
+        Counting goes on from the ticks before: the first that is returned need not be the first that waits. Call it
+        once more after the last tick.
         """
         given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
         self._waiting.clear()

@@ -48,10 +48,11 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
 def listening(
     context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
 ) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket to `address`, for telemetry or ticks under `topic`, and return it.
+    """Connect a new SUB socket to `address`, for telemetry or ticks whose messages begin with `topic`, and return it.
 
-    An empty topic takes all. `keys` None means an open endpoint. Raises SettingError for an address that ZeroMQ cannot
-    use.
+    An empty topic takes all. QUEUE messages may wait; later ones are dropped, and one over MAX_BATCH_BYTES ends the
+    connection. `keys` None means an open endpoint. It waits for nobody: an endpoint may come later. The caller closes
+    the socket. Raises SettingError for an address that ZeroMQ cannot use.
     """
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
@@ -65,8 +66,11 @@ _DECODER = msgspec.msgpack.Decoder(TickBatch)
 
 
 def decode_ticks(data: bytes) -> TickBatch:
-    """Decode a batch of ticks. Raises MessageError for anything but a valid map of columns and rows, or over the size
-    bound."""
+    """Decode a batch of ticks from msgpack, and check it as TickBatch does.
+
+    Values are not checked against their columns, but for the time. Raises MessageError for anything else, and over
+    MAX_BATCH_BYTES.
+    """
     if len(data) > MAX_BATCH_BYTES:
         raise MessageError(f"tick batch of {len(data)} bytes: allowed is {MAX_BATCH_BYTES}")
     try:

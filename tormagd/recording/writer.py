@@ -49,9 +49,9 @@ INDEX_SHARE = 64
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
-    """Say why the disk of `path` has no room for so many bytes more, and a reserve; empty where it has.
+    """Say in a sentence why the disk of `path` has no room for `needed_bytes` and MIN_FREE_BYTES; empty where it has.
 
-    The file need not exist, its folder must. Raises OSError.
+    Writes nothing. The file need not exist, its folder must. Raises OSError.
     """
     free, least = shutil.disk_usage(path.parent).free, MIN_FREE_BYTES + needed_bytes
     if free >= least:
@@ -92,10 +92,10 @@ class RecordingWriter:
         self._begin(place.new() if isinstance(place, RecordingFolder) else place, "")
 
     def _begin(self, path: Path, follows: str) -> None:
-        """Open a new file, lock it against pruning, and write its head; `follows` is the digest that ends the segment
-        before.
+        """Open a new file in `path`, lock it against pruning, and write its head and metadata.
 
-        Raises FileExistsError, OSError.
+        `follows` is the digest that ends the segment before, hexadecimal; empty for the first. The file before stays
+        open if it was. Raises FileExistsError, OSError.
         """
         self.path = path
         self._file = path.open("xb")
@@ -110,10 +110,11 @@ class RecordingWriter:
         "When the first message of this file was, and that of its present chunk, ns since 1970; 0 before the first."
 
     def _rotate(self, folder: RecordingFolder) -> None:
-        """End the file and go on in a new one where one is due, chained by its last seal.
+        """End the file and go on in a new one, which names the old one's last seal, where size or length are over the
+        budget.
 
         Ticks that wait go into the new one. Where there is no room for it, the file ends in order, and says why. Raises
-        OSError then, and FileExistsError.
+        OSError then, and FileExistsError. Where no file is due nothing happens.
         """
         if not folder.is_due(self._sealing.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
             return
@@ -137,9 +138,10 @@ class RecordingWriter:
         self._mcap.add_metadata(ABOUT, metadata)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Write one snapshot, and count missing `seq`; a `seq` that starts over (a restarted daemon) is not a loss.
+        """Write one snapshot, without values that are not known, and count missing `seq`.
 
-        A new mark keeps all ticks around it, and its segment. Raises OSError.
+        A `seq` that starts over (a restarted daemon) is not a loss. A new mark keeps all ticks around it. In a folder
+        it also renames its segment, unless it is older than the segment; `path` is then the new name. Raises OSError.
         """
         if self._last_seq is not None and message.seq > self._last_seq + 1:
             self.telemetry_lost += message.seq - self._last_seq - 1
@@ -156,9 +158,10 @@ class RecordingWriter:
             self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message, thinned, and count missing numbers; numbers may start over.
+        """Write each row as one message, thinned, and count missing numbers in NUMBER_COLUMN, which may be absent.
 
-        Then goes on in a new file where one is due. Raises OSError, FileExistsError among it.
+        A number that starts over (a restarted daemon) is not a loss. Ticks may wait to be thinned until later calls.
+        Then it goes on in a new file where one is due. Raises OSError, FileExistsError among it.
         """
         number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
         for row in batch.rows:
@@ -176,10 +179,10 @@ class RecordingWriter:
             self._rotate(self._folder)
 
     def close(self) -> None:
-        """Write waiting ticks, overview, index and last seal, and close the file; nothing on a closed one.
+        """Write waiting ticks, overview, index and last seal, and close the file; do nothing where it is closed.
 
         Without this call the file reads up to its last whole chunk. Raises OSError where something could not be
-        written.
+        written; the file may then be cut short.
         """
         if not self._file.closed:
             self._write(self._thinning.rest(self._thinning.every))
@@ -216,9 +219,11 @@ class RecordingWriter:
         return self._tick_channels[fits]
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
-        """Write a message. At a new chunk, first flush, seal the chunk before, and end the file where there is no room.
+        """Write a message of JSON in `data`; first begin a new chunk where `t_ns` is over CHUNK_NS from its chunk's
+        first.
 
-        Raises OSError, also where the file was ended.
+        Then the chunk before is written, sealed and flushed. Where there is no room for the index, the file is ended in
+        order instead, and the message is not in it. Raises OSError, also where the file was ended.
         """
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
@@ -236,9 +241,11 @@ class RecordingWriter:
 def sealed_mcap(
     file: BinaryIO, key: bytes, sealed: Mapping[str, str], about: dict[str, str]
 ) -> tuple[SealingFile, Writer]:
-    """Begin an MCAP file that says it is sealed, with a non-empty `key` by it, and what `about` tells of it.
+    """Begin an MCAP file that is to be sealed, with `key` unless it is empty, and write its first metadata.
 
-    `sealed` goes into the record that says so. Returns what seals the file, and what writes to it. Raises OSError.
+    `sealed` are values of the record that says so, `about` those of the record of what is recorded. Returns what seals
+    the file and the writer of its messages; end it by `SealingFile.finish`. Raises OSError, and ValueError for a key of
+    over 64 bytes.
     """
     sealing = SealingFile(file, key)
     mcap = Writer(sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
@@ -249,9 +256,10 @@ def sealed_mcap(
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
-    """Register `schema` and a channel of JSON messages in the file that `mcap` writes; return the channel's id.
+    """Register `schema` and a channel of JSON messages under `topic` in the file that `mcap` writes.
 
-    The schema needs a `title`, which is its name in the file.
+    Returns the channel's id. Each call makes another schema and channel, also for the same topic. The schema needs a
+    `title`, which is its name in the file: else KeyError is raised.
     """
     schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=msgspec.json.encode(schema))
     return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
@@ -260,14 +268,18 @@ def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
     """Return the JSON schema of a message type without `$ref`, `anyOf` and tuples, which viewers do not read.
 
-    A value that may be null has the schema of its other type; a tuple is an array of its first type.
+    A value that may be null has the schema of its other type; a tuple is an array of its first type. Bounds, defaults
+    and what is required are left out. The `title` is the type's name behind "tormagd.".
     """
     (schema,), definitions = msgspec.json.schema_components([message], ref_template="{name}")
     return {"title": f"tormagd.{message.__name__}", **_plain(schema, definitions)}
 
 
 def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
-    """Return a schema without references and alternatives: the first option that is not null, a tuple's first type."""
+    """Return a schema without references and alternatives: the first option that is not null, a tuple's first type.
+
+    `definitions` are the schemas that references name. Raises KeyError for a schema without a type, as of any value.
+    """
     if "$ref" in schema:
         return _plain(definitions[schema["$ref"]], definitions)
     if "anyOf" in schema:
@@ -284,9 +296,9 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
 
 
 def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Value]:
-    """Return a tick's row as a message: by column, without values that are None, NaN or infinite.
+    """Return a tick's row as a message: its values by column, without those that are None, NaN or infinite.
 
-    Raises ValueError where row and columns differ in length.
+    Values within a tuple are not looked at. Raises ValueError where row and columns differ in length.
     """
     # as _known, without a call for each of some sixty values, a thousand times a second
     return {
@@ -297,7 +309,10 @@ def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Valu
 
 
 def _tick_schema() -> dict[str, Any]:
-    """Return the JSON schema of a tick message with the columns of this version's daemon; integers are numbers."""
+    """Return the JSON schema of a tick message, an object with the columns of this version's daemon.
+
+    An integer is a number: viewers make no difference. No column is required, and others are allowed.
+    """
     (schema,), definitions = msgspec.json.schema_components([TickRecord], ref_template="{name}")
     items = map(_plain, definitions[schema["$ref"]]["prefixItems"], repeat(definitions))
     columns = dict(zip(TickRecord.__struct_fields__, items, strict=True))
@@ -313,7 +328,11 @@ OTHER_SCHEMA = {"title": "tormagd.OtherTick", "type": "object"}
 
 
 def _known(value: Any) -> Any:
-    """Return `value` without its unknown parts; None for NaN, infinity, or a list with one of them or None in it."""
+    """Return plain data without what is not known; None where `value` itself is not.
+
+    Not known are None, NaN, infinity, and a list or tuple with one of these in it. A dict loses such entries, at any
+    depth, and may be left empty.
+    """
     if isinstance(value, dict):
         return {name: known for name, inner in value.items() if (known := _known(inner)) is not None}
     if isinstance(value, list | tuple):

@@ -25,9 +25,10 @@ from tormagd_client.endpoints import ConfigError
 def main(arguments: list[str] | None = None) -> int:
     """Replay the file that the arguments name, print one JSON object, and return the exit code.
 
-    None takes the arguments of the process. 0 is done, 1 is a stdout that cannot be written. 2 is a file or a setting
-    that cannot be used: one line on stderr says why. Wrong usage raises SystemExit(2). With `--set` or `--fault` the
-    simulated device takes the real one's place.
+    None takes the arguments of the process. 0 is done, also where the replay differs: the object's `rerun` says where.
+    1 is a stdout that cannot be written. 2 is a file or a setting that cannot be used: one line on stderr says why.
+    Wrong usage raises SystemExit(2). With `--set` or `--fault` the simulated device takes the real one's place, and the
+    object has what `_rehearsed` returns in place of `rerun`.
     """
     parser = argparse.ArgumentParser(prog="python -m tormagd.replay", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("file", type=Path)
@@ -79,9 +80,10 @@ def _key(configured: Config | None) -> bytes:
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
     """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it.
 
-    Returns `plant`, `faults` and `settings`, and what happened: `recorded`, `simulated`, and `instead`, None without
-    settings. Each of the three is a dict with the fields of `Happened`. Raises ReplayError for a setting, plant or
-    fault that cannot be used, and as `script` and `rehearse`.
+    `options` are those of `main`. Returns its `plant`, `faults` and `settings`, and what happened. That is `recorded`,
+    what the file has, and `simulated` and `instead`, what the two runs met, both with the faults. Each is a dict with
+    the fields of `Happened`; `instead` is None without settings. Raises ReplayError for a setting, plant or fault that
+    cannot be used, and as `script`, `rebuilt` and `rehearse`.
     """
     todo = script(known.columns, box.entries)
     config = changed(known.config, options.settings)

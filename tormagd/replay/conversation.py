@@ -40,19 +40,20 @@ class Found(NamedTuple):
 
 
 def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
-    """Return the first difference between two plain values, its field under `where`; None where they agree to the bit.
+    """Return the first difference between two plain values, its field behind `where` and a point; None where they agree
+    to the bit.
 
-    `frame` is handed on. Raises as `exact.packed`.
+    `frame` is the frame of what is returned. Plain is what `exact.plain` gives: anything else raises TypeError.
     """
     found = first_difference(recorded, replayed)
     return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
 
 
 class Conversation:
-    """The replayed connection between two entries of a black box, and its backend: reads what the file holds.
+    """The recorded conversation with the device run again: a `Connection`, and the backend that gives it what was read.
 
-    What the connection writes is kept for comparison. Without a snapshot, or while no port was open, there is no
-    connection: reading and comparing then do nothing.
+    What the connection writes is kept for comparison, and goes nowhere. Without a snapshot, or while no port was open,
+    there is no connection: reading and comparing then do nothing.
     """
 
     def __init__(self, frame: int) -> None:
@@ -66,10 +67,10 @@ class Conversation:
         self.frames = 0
 
     def begin(self, memory: Any) -> None:
-        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; None means no open port.
+        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; by none for None.
 
-        Raises InexactError, TypeError or LookupError for a memory that no connection writes: then there is no
-        connection.
+        Its stream is a serial port's or a CAN node's, as `memory` says. Raises InexactError, EncodeError, TypeError or
+        LookupError for a memory that no connection writes: then there is no connection.
         """
         self._connection = None
         if memory is not None:
@@ -82,27 +83,29 @@ class Conversation:
             self._connection = connection
 
     def compare_memory(self, recorded: Any) -> Found | None:
-        """Return where the connection's memory differs from the recorded one.
+        """Return where the connection's memory differs from the `recorded` one, with the newest frame's number.
 
-        None where it does not differ, or no port was open.
+        None where it does not differ, or no port was open. Changes nothing.
         """
         own = self._connection
         return None if own is None else differing("state.connection", recorded, own.memory(), self.frame)
 
     def compare(self, recorded: Measurement | None) -> Found | None:
-        """Return where the connection's measurement differs from the one that the recorded step was given.
+        """Return where the connection's newest measurement differs from the one that the recorded step was given.
 
-        None where it does not differ, or no port was open.
+        `recorded` None is a step without a measurement. The result has the newest frame's number. None where nothing
+        differs, or no port was open. Changes nothing.
         """
         own = self._connection
         return None if own is None else differing("measurement", plain(recorded), plain(own.measurement), self.frame)
 
     def read(self, entry: Any) -> None:
-        """Feed the connection a READ entry, and count its frames.
+        """Feed the connection a READ entry, and add its frames to `frames`.
 
-        `entry` is the name, the time, s, and what was read: bytes, or a list of a bus's frames. Without a connection
-        nothing happens, and the entry is not looked at. Raises ValueError, TypeError or msgspec.ValidationError for a
-        malformed entry.
+        `entry` is the name, the time, s on the monotonic clock, and what was read. That is bytes, which count as one
+        frame, or a list of a bus's frames. Without a connection nothing happens, and the entry is not looked at. Where
+        another host drives the node, the connection is lost, as it was then. Raises ValueError, TypeError or
+        msgspec.ValidationError for a malformed entry.
         """
         if self._connection is not None:
             _, now_s, raw = entry
@@ -111,11 +114,12 @@ class Conversation:
             self.frames += len(pieces)
 
     def wrote(self, entry: Any, output: Duty) -> Found | None:
-        """Send a step's `output` again, and return the first frame that differs from the WROTE entry.
+        """Send a step's `output` again, and return the first frame that differs from those of the WROTE entry.
 
-        `entry` is the name, the time, s, the list of frames, and the messages not taken so far. None where none
-        differs, which adds to the count of frames, or where no port was open. Raises ValueError or TypeError for an
-        entry of another form, EncodeError for an output that does not fit the wire.
+        `entry` is the name, the time, s, the list of frames, and how many messages the wire had not taken so far.
+        `frame` has to be the number of the last of these frames. None where none differs, which adds them to `frames`,
+        or where no port was open. A frame that only one side has is "nothing" on the other. Raises ValueError or
+        TypeError for an entry of another form, EncodeError for an output that does not fit the wire.
         """
         if self._connection is None:
             return None
@@ -136,21 +140,16 @@ class Conversation:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Decode what is to be read next, and return the messages; empty where all was read.
+        """Decode what `read` was given last, and return the messages; empty where that was done before.
 
         Raises BackendError where another host drives the CAN node, and msgspec.ValidationError or TypeError for what is
         no frame.
         """
         pieces, self._unread = self._unread, ()
-        return [message for piece in pieces for message in self._unpack(piece)]
-
-    def _unpack(self, piece: Any) -> list[Message]:
-        """Decode one piece: bytes of a serial port, or a frame of a bus. Raises BackendError where another host drives
-        the node."""
         if isinstance(self.stream, FrameStream):
-            return self.stream.unpack(piece)
+            return [message for piece in pieces for message in self.stream.unpack(piece)]
         try:
-            return self.stream.unpack_all([msgspec.convert(piece, tuple[int, bytes])])
+            return self.stream.unpack_all(msgspec.convert(pieces, list[tuple[int, bytes]]))
         except SecondHostError as error:
             raise BackendError("another host drives the node") from error
 
@@ -163,7 +162,10 @@ class Conversation:
 
 
 def _shown(frame: Any) -> str:
-    """Show a frame in hexadecimal, with its identifier on a bus; "nothing" for None."""
+    """Return a frame as text: bytes in hexadecimal, behind the identifier and "#" on a bus; "nothing" for None.
+
+    Raises TypeError or ValueError for what is neither bytes nor identifier and bytes.
+    """
     if frame is None:
         return "nothing"
     if isinstance(frame, bytes):

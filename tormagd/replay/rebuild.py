@@ -1,7 +1,6 @@
 """Rebuilds a black box's core from the file, and lists what differs between its origin and here."""
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,8 +41,8 @@ class Recorded(NamedTuple):
 def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
     """Check a black box's header and return its contents; its model will be looked for where it was, then in `beside`.
 
-    Raises ReplayError: a value is missing, of another format, damaged (by its hash), or a refused configuration or
-    scene.
+    No file is opened, and the entries are not looked at. Raises ReplayError: a value is missing, of another format,
+    damaged (by the hash beside it), or a refused configuration or scene.
     """
     header = box.header
     missing = [name for name in NEEDED if name not in header]
@@ -54,9 +53,7 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
             f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed is {FORMAT}, "
             f"which tormagd {__version__} writes; replay it with the version that wrote it"
         )
-    columns = _json(header, "columns")
-    if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
-        raise ReplayError("columns: allowed is a list of names")
+    columns = _json(header, "columns", tuple[str, ...])
     lacking = [name for name in TickRecord.__struct_fields__ if name not in columns]
     if lacking:
         raise ReplayError(f"its ticks have no column {lacking[0]!r}: tormagd {header['version'][:20]!r} wrote it")
@@ -66,7 +63,7 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
             checked(_intact(header, "scene"), Scene),
             header["model_sha256"],
             (Path(header["scene_folder"]), beside),
-            tuple(columns),
+            columns,
             header,
         )
     except (ConfigError, RecursionError) as error:
@@ -76,7 +73,9 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
 def rebuilt(known: Recorded, config: Config | None = None) -> Core:
     """Build the recorded core, with `config` in place of the recorded configuration unless that is None.
 
-    Raises ReplayError where no model with the recorded hash is found, or the core cannot be built.
+    Its stages are as at a daemon's start: `rerun` gives them the recorded state. The scene is the recorded one, not the
+    file that `config` names. Raises ReplayError where no model with the recorded hash is found in `model_folders`, or
+    the core cannot be built.
     """
     found = ""
     for folder in known.model_folders:
@@ -92,10 +91,12 @@ def rebuilt(known: Recorded, config: Config | None = None) -> Core:
 
 
 def differences(known: Recorded, configured: Config | None) -> list[str]:
-    """List in plain words what differs from when the file was written: sources, platform, scene, configuration.
+    """List what differs from when the file was written, a line each, in this order: build, platform, scene,
+    configuration.
 
-    Empty where nothing does. `configured` is this machine's configuration. With None it is not compared, and the
-    recorded one names the scene. The scene is read again; one that cannot be is told as a difference.
+    Each line begins with one of these words and a colon; empty where nothing differs. `configured` is this machine's
+    configuration. With None it is not compared, and the recorded one names the scene. The scene's file is read again;
+    one that cannot be read is told as a difference. Raises nothing for it.
     """
     found = []
     here, there = sources_hash(), known.header["sources_sha256"]
@@ -125,19 +126,21 @@ def _compare(found: list[str], what: str, there: str, data: bytes) -> None:
 
 
 def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
-    """Return a header's JSON object. Raises ReplayError where it is none, or does not match the hash beside it."""
+    """Return the header's value `name`, a JSON object, once its hash is compared with the value `NAME_sha256`.
+
+    What the object says is not checked. Raises ReplayError where the hash differs, or it is no object; KeyError where
+    one of the two is missing.
+    """
     told = hashlib.sha256(header[name].encode()).hexdigest()
     if told != header[f"{name}_sha256"]:
         raise ReplayError(f"{name}: its hash is {told[:SHOWN]}, beside it stands {header[f'{name}_sha256'][:SHOWN]!r}")
-    tables = _json(header, name)
-    if not isinstance(tables, dict):
-        raise ReplayError(f"{name}: allowed is an object")
+    tables: dict[str, Any] = _json(header, name, dict[str, Any])
     return tables
 
 
-def _json(header: dict[str, str], name: str) -> Any:
-    """Parse a header's JSON value. Raises ReplayError where it is none."""
+def _json(header: dict[str, str], name: str, kind: Any) -> Any:
+    """Decode a header's JSON value as `kind`. Raises ReplayError where it is none."""
     try:
-        return json.loads(header[name])
-    except (ValueError, RecursionError) as error:
+        return msgspec.json.decode(header[name], type=kind)
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise ReplayError(f"{name}: {str(error)[:100]}") from error

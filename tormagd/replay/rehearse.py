@@ -48,7 +48,8 @@ class Happened(msgspec.Struct, frozen=True):
     def note(self, at_s: float, faults: Iterable[str], held: Iterable[str], for_s: float) -> None:
         """Add one tick at `at_s`: its faults, and the limits in `held` for another `for_s` seconds.
 
-        Changes the two dicts in place. A fault keeps its first time; a limit that stands twice in `held` counts once.
+        Changes the two dicts in place: faults in s to a millisecond, limits to a microsecond. A fault keeps its first
+        time; a limit that stands twice in `held` counts once.
         """
         for fault in faults:
             self.faults.setdefault(str(fault), round(at_s, 3))
@@ -78,10 +79,11 @@ class Script(NamedTuple):
 
 
 def changed(config: Config, settings: Sequence[str]) -> Config:
-    """Return the configuration with `KEY=VALUE` settings, as in limits.skew_fault_mm=2; a value is TOML, or else text.
+    """Return a copy of the configuration with `KEY=VALUE` settings, as in limits.skew_fault_mm=2.
 
-    Of two settings of one key the later counts; without settings it is checked all the same. Raises ReplayError for an
-    unknown key, or a value that the configuration refuses or that is no TOML which can be read.
+    A value is TOML; one that is no TOML is taken as text. Of two settings of one key the later counts; without settings
+    the configuration is checked all the same. Raises ReplayError for an unknown key, a setting without "=", a value
+    that the configuration refuses, and TOML beyond what can be read.
     """
     tables: dict[str, Any] = msgspec.to_builtins(config)
     for setting in settings:
@@ -109,7 +111,9 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
 def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
     """Return what is to be done again: the setpoints, taken commands and handle positions of a black box's entries.
 
-    Times are s from the first tick. Raises ReplayError where an entry is malformed, or no tick is there.
+    `columns` names the values of a tick. Times are s from the first tick, also those of a setpoint. Commands that the
+    core refused, and all other entries, are left out. Raises ReplayError where one of these entries is malformed, or no
+    tick is there. Raises ValueError where `columns` lacks a field of TickRecord.
     """
     records = ticks_of(columns, entries)
     ticks = list(records.values())
@@ -143,9 +147,10 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
 def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Sequence[str]) -> Happened:
     """Run the script in the closed loop against the simulated device, and return what it met.
 
-    That is faults, limits and refused commands. `core` is of `config`, and gives a new stepper and planner. `plant`
-    names the simulated device. `faults` are its faults, as in encoder_jump@12.5, s from the file's first tick; empty
-    for none. Raises ReplayError: an unknown plant or fault, or a device that cannot be armed, or not in time.
+    That is faults, limits and refused commands. `core` has to be built of `config`, and gives a new stepper and
+    planner. `plant` names the simulated device. `faults` are its faults, as in encoder_jump@12.5, s from the file's
+    first tick; empty for none. A device that was homed is homed first, one that was driven is armed, at its first
+    setpoint. Raises ReplayError: an unknown plant or fault, or a device that cannot be armed, or not in time.
     """
     try:
         delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in map(parse_fault, faults)]
@@ -171,10 +176,11 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
 
 
 def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
-    """Give the script's commands and setpoints at their times, and return what was met.
+    """Run `loop`, which stands at the script's begin, to the script's end, and return what was met.
 
-    A refused command is given again for PATIENCE_S, and those behind it wait; then it is noted in `refused`. Limits
-    count while ENABLED or PAUSED, by `period_s` a tick.
+    Commands and setpoints are given at their times. A refused command is given again for PATIENCE_S, and those behind
+    it wait; then it is noted in `refused`. Faults count in s from the begin; limits only while ENABLED or PAUSED, by
+    `period_s` a tick.
     """
     happened = Happened({}, {}, [])
     setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))
@@ -200,7 +206,11 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
 
 
 def _recorded(ticks: list[TickRecord]) -> Happened:
-    """Return the faults and limits that the recorded ticks show; a tick's limits held since the tick before."""
+    """Return the faults and limits that the recorded ticks show; `refused` is empty.
+
+    Times count from the first tick, of which there has to be one. A tick's limits held since the tick before, in every
+    operating state.
+    """
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
     before_s = first_s
     for tick in ticks:
@@ -214,9 +224,10 @@ def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:
 
 
 def _hand(ticks: list[TickRecord]) -> RecordedHand:
-    """Return the handle's positions, mm, as its encoder measured them, in s from the first tick.
+    """Return the handle's positions, mm, as its encoder measured them, at the times of the Sense, s from the first
+    tick.
 
-    Without one the handle stays at 0 mm.
+    Of positions with one time the first counts. Where no tick has one, the handle stays at 0 mm.
     """
     places: dict[float, float] = {}
     for tick in ticks:

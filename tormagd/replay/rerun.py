@@ -61,8 +61,8 @@ QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s"
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
     """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a plan without one.
 
-    `entry` is the name, the time, and the setpoint's fields or None. Raises InexactError or msgspec.ValidationError for
-    a malformed entry.
+    `entry` is the name, the time, and None or a setpoint's fields in the order of TimedSetpoint, whose ranges are not
+    checked. Raises InexactError or msgspec.ValidationError for an entry of another form.
     """
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
     return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
@@ -100,11 +100,11 @@ class Rerun(msgspec.Struct, frozen=True):
 
 
 def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
-    """Return the tick records of a black box by the index of their entry, in the file's order; other entries are passed
-    over.
+    """Return the tick records of a black box by the index of their entry, from 0, in the file's order.
 
-    Raises ReplayError where a tick does not fit `columns` or its types, or no tick is there. Raises ValueError where
-    `columns` lacks a field of TickRecord, which `rebuild.recorded` refuses before.
+    Other entries are passed over, and so are columns that TickRecord lacks. Raises ReplayError where a tick does not
+    fit `columns` or its types, or no tick is there. Raises ValueError where `columns` lacks a field of TickRecord,
+    which `rebuild.recorded` refuses before.
     """
     own = TickRecord.__struct_fields__
     order = None if columns == own else [columns.index(name) for name in own]
@@ -124,10 +124,11 @@ def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickReco
 
 
 def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: float = 0.0) -> Rerun:
-    """Run `core` over the entries, up to the first difference, and return what came of it.
+    """Run `core` over the entries, up to the first difference or the last tick, and return what came of it.
 
-    Begins at the newest snapshot not after `from_s`, else at the first. Raises ReplayError: `from_s` outside the file,
-    a malformed tick, no snapshot with a tick after it, or values that the core does not take.
+    `from_s` counts from the first tick. Begins at the newest snapshot (the whole state, one of two a second) not after
+    it, else at the first. A difference is returned, not raised. Raises ReplayError: `from_s` outside the file, a
+    malformed tick, no snapshot with a tick after it, or values that the core does not take.
     """
     records = ticks_of(columns, entries)
     places = list(records)
@@ -165,9 +166,10 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
 
 
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
-    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first.
+    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first with a tick.
 
-    `records` are the ticks by their index in `entries`. Raises ReplayError where no snapshot has a tick after it.
+    `until_s` is on the monotonic clock. `records` are the ticks by their index in `entries`. Raises ReplayError where
+    no snapshot has a tick after it.
     """
     found: int | None = None
     waiting: int | None = None
@@ -186,8 +188,8 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 class _Running:
     """Core and conversation while they are replayed, entry by entry.
 
-    Holds the newest step's measurement and output, a plan's failure, whether the states are known, and counts of
-    snapshots and gaps.
+    The states are step, plan and connection: known from a snapshot on, until something is missing in the file. Holds
+    the newest step's measurement and output, a plan's failure, and counts of snapshots that were compared and of gaps.
     """
 
     def __init__(self, core: Core, frame: int) -> None:
@@ -205,10 +207,11 @@ class _Running:
         self.snapshots = self.gaps = 0
 
     def take(self, entry: Any, record: TickRecord) -> Found | None:
-        """Take one entry that is no tick, and return what differs; None where nothing does.
+        """Take one entry that is no tick, and return the first thing that differs; None where nothing does.
 
-        `record` is the next tick's, which holds the inputs of a step. After a MISSING entry, steps and plans are passed
-        over until the next snapshot. Raises UNTAKEN.
+        `record` is the next tick's, which holds the inputs of a step. Until the first snapshot, and after a MISSING
+        entry until the next, all but frames is passed over. Raises any of UNTAKEN for an entry of another form, or
+        values that the core refuses; the states are then not to be used.
         """
         name = name_of(entry)
         self.conversation.frame += len(frames_in(entry))
@@ -227,12 +230,11 @@ class _Running:
         return None
 
     def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
-        """Do what one entry tells: step, plan, learning, command or fault; return how a command's outcome differs, else
-        None.
+        """Do what one entry tells: step, plan, learning, command or fault; return a difference only for a command.
 
-        `record` holds a step's inputs. A difference in measurement or frames is kept for `compare`. Of a plan that
-        fails, the error is kept; it is a difference unless an AFRESH entry follows. Raises ValueError for an unknown
-        entry, and UNTAKEN.
+        That is a command which was taken and is refused here, or the other way round. `record` holds a step's inputs. A
+        difference in measurement or frames is kept for `compare`. So is the error of a plan that fails, unless an
+        AFRESH entry follows. Raises ValueError for an unknown entry, and any other of UNTAKEN.
         """
         match name:
             case journal.STEP:
@@ -284,8 +286,9 @@ class _Running:
     def compare(self, record: TickRecord) -> Found | None:
         """Return the first column that differs from the recorded tick, or else what its frames show.
 
-        None where nothing differs, or the states are not known. A failed plan that the record does not have counts as a
-        difference. Raises ValueError for a tick before any step.
+        The clock's column, `t_ns`, is not compared; the loop's timing is taken from the record. None where nothing
+        differs, or the states are not known. A failed plan that the record does not have counts first. Raises
+        ValueError for a tick before any step.
         """
         if not self.is_known:
             return None
@@ -305,9 +308,9 @@ class _Running:
         """Compare the states with a snapshot where they are known, then take the snapshot's; return the first
         difference.
 
-        Step and plan are compared, then the connection; only such a snapshot is counted. Afterwards the states are
-        known, and a failed plan is forgotten. Raises InexactError, TypeError or LookupError for a snapshot that does
-        not fit.
+        `entry` is the name, step, plan and connection, which are compared in this order; None where none differs. A
+        snapshot that is only taken is not counted. Afterwards the states are known, and a failed plan is forgotten.
+        Raises InexactError, TypeError or LookupError for a snapshot that does not fit.
         """
         differs, connection = None, entry[3]
         if self.is_known:
@@ -323,10 +326,10 @@ class _Running:
 
 
 def measurement_of(record: TickRecord) -> Measurement | None:
-    """Return the measurement that a tick's step was given; None where the record has no number of one.
+    """Return the measurement that a tick's step was given; None where the record's `measurement`, its number, is None.
 
-    Raises ValueError where there is a number and another part is missing, KeyError for an unknown mode, switch or
-    device fault.
+    Ranges are not checked. Raises ValueError where there is a number and another part is missing, KeyError for an
+    unknown mode, switch or device fault.
     """
     if record.measurement is None:
         return None
@@ -345,7 +348,10 @@ def measurement_of(record: TickRecord) -> Measurement | None:
 
 
 def name_of(entry: Any) -> str:
-    """Return a black box entry's name; empty for a tick, and for anything else that begins with no text."""
+    """Return a black box entry's name, a word by itself or at the head of a list; empty for a tick and anything else.
+
+    Whether there is an entry of that name is not checked.
+    """
     if isinstance(entry, str):
         return entry
     if isinstance(entry, list) and entry and isinstance(entry[0], str):
