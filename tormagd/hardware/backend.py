@@ -112,25 +112,25 @@ def installed() -> dict[str, str]:
     """Load every installed backend plugin; return by its name, sorted, why it does not load, "" where it does.
 
     A plugin that does not load is logged as a warning: a third party's package stops nobody else. Their modules stay
-    imported. No device is opened.
+    imported. No device is opened, and no setting is looked at. Raises what a module raises besides PLUGIN_ERRORS, such
+    as SystemExit.
     """
     found = {}
     for entry in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
+        found[entry.name] = ""
         try:
             _load(entry)
         except PLUGIN_ERRORS as error:
-            log.warning("backend %s does not load, install it again: %s: %s", entry.name, type(error).__name__, error)
             found[entry.name] = f"{type(error).__name__}: {error}"
-        else:
-            found[entry.name] = ""
+            log.warning("backend %s does not load, install it again: %s", entry.name, found[entry.name])
     return found
 
 
 def choose(device: Device, rates: Rates) -> Chosen:
     """Import the backend plugin that `device.backend` names, check the settings, and return it ready to be opened.
 
-    Raises ConfigError where no such plugin is installed, where it does not load, and where it refuses
-    `device.options` or `rates`. No other plugin is imported, and nothing is opened.
+    No other plugin is imported, and nothing is opened: `Chosen.open` does that, each time anew. Raises ConfigError
+    where no such plugin is installed, where it does not load, and where it refuses `device.options` or `rates`.
     """
     found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if device.backend not in found:

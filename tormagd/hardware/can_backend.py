@@ -80,10 +80,11 @@ class CanBackend:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the node's messages among the frames that have arrived, from FRAMES_AT_ONCE frames at most.
+        """Return the node's messages among the frames that have arrived, in their order; none where none has.
 
-        Frames that cannot be read are counted as corrupt. `stream.received` is begun anew and holds the node's frames.
-        Raises BackendError when the bus is off or gone, or when another host drives the node.
+        Takes FRAMES_AT_ONCE frames at most; the others wait. Frames that cannot be read are counted as corrupt.
+        `stream.received` is begun anew and holds the node's frames. Raises BackendError when the bus is off or gone, or
+        when another host drives the node: then the messages before are lost.
         """
         self.stream.received = []
         messages: list[Message] = []
@@ -110,7 +111,7 @@ class CanBackend:
     def send(self, message: Message) -> None:
         """Hand one frame to the bus, and keep it in `stream.sent`, also where the bus does not take it.
 
-        A frame that the bus does not take at once is dropped, and counted as unsent. The next tick has a newer one.
+        A frame that the bus does not take at once is dropped, and counted as unsent: the next tick has a newer one.
         Raises BackendError when the bus is off or gone, and for each untaken frame after UNSENT_FRAMES in a row. Raises
         EncodeError for a value that does not fit the wire.
         """
@@ -133,7 +134,10 @@ class CanBackend:
             )
 
     def close(self) -> None:
-        """Shut the bus down and drop the adapter's lock. Errors of a bus that is gone are ignored."""
+        """Shut the bus down and drop the adapter's lock; it may be called again.
+
+        Errors of a bus that is gone are ignored. Afterwards neither `receive` nor `send` works.
+        """
         with contextlib.suppress(can.CanError, OSError):
             self._bus.shutdown()
         if isinstance(self._bus, slcanBus):  # its shutdown talks to the adapter first, and if that fails keeps the port
@@ -153,7 +157,8 @@ class CanBackend:
     def _unpack(self, frame: can.Message) -> Message | None:
         """Return the message in a frame; None for one that is foreign, damaged or not from the device.
 
-        An error frame is counted as corrupt. Raises BackendError on bus-off, and when another host drives the node.
+        What is damaged, and an error frame, counts as corrupt; extended, remote and FD frames are nobody's and not
+        counted. Raises BackendError on bus-off, and when another host drives the node.
         """
         if frame.is_error_frame:
             if frame.arbitration_id & BUS_OFF or self._bus.state is can.BusState.ERROR:
@@ -184,7 +189,8 @@ class CanBackend:
 def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
     """Refuse an interface that is not installed, fails to load or has no descriptor, and a bit rate that is too low.
 
-    The bit rate has to carry `rates.control_hz` exchanges a second at MAX_LOAD. Raises ConfigError. Opens nothing.
+    The bit rate has to carry `rates.control_hz` exchanges a second at MAX_LOAD. Imports the interface's driver, and
+    opens nothing; `device` is not looked at. Raises ConfigError.
     """
     interface = options.interface
     if interface not in BACKENDS:
@@ -215,7 +221,9 @@ def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
 def open_can(device: Device, options: CanOptions) -> CanBackend:
     """Open `device.port` through `options.interface`; a slcan adapter is locked first, so that one program holds it.
 
-    Raises BackendError saying why not, and what to do where that is known.
+    Files of python-can's own configuration are not read. Raises BackendError saying why not, and what to do where that
+    is known; nothing stays open then. Call `check_can` before: what a driver raises that does not load is not caught
+    here.
     """
     name = f"{options.interface} {device.port}"
     held = None
@@ -248,10 +256,11 @@ DRIVER = Driver(CanOptions, open_can, check_can)
 
 
 def _of_the_interface(options: CanOptions) -> dict[str, Any]:
-    """Return the arguments that `can.Bus` takes for this interface alone; none for one that is not named here.
+    """Return the arguments by name that `can.Bus` takes for `options.interface` alone; none for one not named here.
 
     With them `recv(0)` does not block; an interface that is not named here must not block by itself. On socketcan only
-    frames of `options.node` are then received; udp_multicast does not leave this machine.
+    frames of `options.node` are then received. slcan opens its port at `options.baud`. udp_multicast does not leave
+    this machine.
     """
     fitting: dict[str, dict[str, Any]] = {
         # other nodes' frames need not wake the daemon
@@ -271,7 +280,8 @@ def _bring_up(port: str, options: CanOptions) -> str:
 def _hold(path: str) -> int:
     """Open `path` and return a descriptor that holds the lock of pyserial's exclusive ports; python-can takes none.
 
-    Raises OSError, a BlockingIOError where another program has the lock.
+    The lock lasts until the caller closes the descriptor. Never waits. Raises OSError, a BlockingIOError where another
+    program has the lock; nothing stays open then.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:

@@ -53,9 +53,10 @@ class CanStream:
         """The newest outgoing frame."""
 
     def pack(self, message: Message) -> tuple[int, bytes]:
-        """Return a message's CAN identifier and data, and keep both in `sent`; a Drive's data also, to know its echo.
+        """Return a message's CAN identifier and data, and keep both in `sent` until the next call.
 
-        Raises EncodeError for a value that does not fit the wire.
+        A Drive's data are also kept among the last ECHOES, to know its echo by. Raises EncodeError for a value that
+        does not fit the wire; `sent` is then as before.
         """
         data = encode(message)
         if isinstance(message, Drive):
@@ -64,9 +65,11 @@ class CanStream:
         return self.sent
 
     def unpack_all(self, frames: Iterable[tuple[int, bytes]]) -> list[Message]:
-        """Return the messages in frames (identifier, data); UNREADABLE counts as corrupt. Raises SecondHostError.
+        """Return the messages in frames (identifier, data), in their order, as `unpack` of each; UNREADABLE counts as
+        corrupt.
 
-        The same as `unpack` of each, for frames that were recorded.
+        For frames that were recorded in `received`. Raises SecondHostError as `unpack`; the frames behind are then not
+        read.
         """
         messages: list[Message] = []
         for identifier, data in frames:

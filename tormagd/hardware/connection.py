@@ -7,7 +7,7 @@ CLOSED --> IDENTIFYING <--> UNANSWERED             the port is opened: --> IDENT
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Message
@@ -53,7 +53,8 @@ class Connection:
     """The connection to one device, over as many openings of its port as it takes.
 
     Its state changes only in calls, `receive` and `exchange` once a control period each; it has no clock and no timers.
-    Whenever a running device is lost, it counts the loss, logs a warning and calls `on_loss`; `close` does not.
+    Times `now_s` are s of one clock that only rises. Whenever a running device is lost, it counts the loss, logs a
+    warning and calls `on_loss`; `close` does not.
     """
 
     def __init__(self, device: Device, open_backend: Callable[[], Backend], on_loss: Callable[[], None]) -> None:
@@ -84,7 +85,8 @@ class Connection:
     def cause(self) -> str:
         """Why the device does not run, or what a measurement still lacks; empty when it runs and is measured.
 
-        For a device that sends no Identity, also whether it is silent or sends something else.
+        Without an open port it says why the port is not open. For a device that sends no Identity it also says whether
+        it is silent or sends something else, and which messages were refused.
         """
         link, backend = self._link, self._backend
         if link is None or backend is None:
@@ -94,7 +96,8 @@ class Connection:
             return link.missing(heard.refused)
         if link.state is not LinkState.UNANSWERED:
             return link.cause
-        refused = f" ({_refusals(heard.refused)})" if heard.refused else ""
+        refusals = ", ".join([f"{name}: {why}" for name, why in sorted(heard.refused.items())])
+        refused = f" ({refusals})" if refusals else ""
         if heard.frames:
             return f"{link.cause}, though it sends messages{refused}"
         return f"{link.cause}; " + (f"what it sends is not this protocol{refused}" if heard.corrupt else "it is silent")
@@ -122,18 +125,19 @@ class Connection:
         return self._unfinished if self._link is None else self._link.pending
 
     def open(self, now_s: float) -> None:
-        """Open the port, where it is closed. Where that fails, `exchange` tries again later, and `cause` says why.
+        """Open the port, and keep it wanted: where that fails, `exchange` tries again later, and `cause` says why.
 
-        Call `close` before another `open`: a port that is open is not closed by it. Raises what a plugin's backend
-        raises besides BackendError.
+        Call `close` before another `open`: a port that is open is not closed by it. `traffic` is told of a port that
+        opens. Raises what a plugin's backend raises besides BackendError.
         """
         self._is_wanted = True
         self._open(now_s)
 
     def receive(self, now_s: float) -> None:
-        """Read what has come from the device, and hand it to `traffic` and the conversation.
+        """Read what has come from the device, and hand it to `traffic` and the conversation; never wait.
 
-        Nothing happens while the port is closed. A port that fails is closed; a later `exchange` opens it again.
+        What came shows in `state` and `measurement`. Nothing happens while the port is closed. A port that fails is
+        closed, as a loss; a later `exchange` opens it again. BackendError is not raised.
         """
         backend, link = self._backend, self._link
         if backend is None or link is None:
@@ -155,10 +159,11 @@ class Connection:
     ) -> None:
         """Send this period's Drive to a running device, then the Hello or command that is due; tell `traffic`.
 
-        Opens the port first when it is time to, and closes a port that fails or whose device is lost. A `request` is
-        taken once, when `number` changes; unless it is RETRACT, it is dropped where the device does not run. Duties are
-        -1..1, positive opens. The link's quality is renewed when that is due. Call it after `receive`, so that what has
-        come by then does not count as silence. Raises EncodeError for a value that does not fit the wire.
+        Opens the port first when it is wanted and time to, and closes a port that fails or whose device is lost. A
+        `request` is taken once for each new `number`, as soon as the port is open. Unless it is RETRACT, it is dropped
+        where the device does not run then. Duties are -1..1, positive opens. The link's quality is renewed when that is
+        due. Call it after `receive`, so that what has come by then does not count as silence. Raises EncodeError for a
+        value that does not fit the wire; BackendError is not raised.
         """
         if self._link is None and self._is_wanted and now_s >= self._reopen_s:
             self._open(now_s)
@@ -191,8 +196,9 @@ class Connection:
     def close(self) -> None:
         """Close the port; it stays closed until `open`.
 
-        `traffic` is told, if a port was open. What this conversation has pending is dropped, RETRACT too. A running
-        device hears no more Drives, and does what its own command timeout says.
+        `traffic` is told, if a port was open; `on_loss` is not called. What this conversation has pending is dropped,
+        RETRACT too. A running device hears no more Drives, and opens its gap by its own command timeout. It may be
+        called again.
         """
         self._is_wanted = False
         self._release()
@@ -202,7 +208,8 @@ class Connection:
     def memory(self) -> Any:
         """Return the conversation's state as plain data, from which `remember` continues it elsewhere.
 
-        None while the port is closed, and for a backend without a stream.
+        That is `requested`, the newest request's number, and `link` and `stream` as `exact.plain` gives them. What the
+        wire holds is not in it. None while the port is closed, and for a backend without a stream.
         """
         if self._link is None or self._stream is None:
             return None
@@ -211,9 +218,9 @@ class Connection:
     def remember(self, memory: Any, known: Kinds) -> None:
         """Continue a conversation from `memory`, which `memory()` returned, on this connection's open port.
 
-        `known` are the types that `memory` may contain. Raises InexactError for data that fit no known type, and
-        LookupError or TypeError for `memory` of another form, such as None. The state is then set in part: drop the
-        connection.
+        `known` are the types that `memory` may contain. A change of state that it brings is no loss and not logged.
+        Raises InexactError for data that fit no known type, and LookupError or TypeError for `memory` of another form,
+        such as None. The state is then set in part: drop the connection.
         """
         self._requested = memory["requested"]
         restore(self._link, memory["link"], known)
@@ -223,10 +230,10 @@ class Connection:
     def report(self) -> LinkReport:
         """Return the link's report for `status`; None in it for what is not known yet or needs an open port.
 
-        Without an open port `refused` is empty. Counters are those since the port was last opened, but for `losses` and
-        `last_loss`. `unanswered_share` and `damaged_share` are of the link's newest judgement. `repeated` has the
-        States that the link dropped, too. Half of the shortest round trip, a State's way, is taken off the clock's
-        offset.
+        Without an open port `refused` is empty. Counters are those since the port was last opened; `losses` and
+        `last_loss`, the cause of the newest, are of all openings. `unanswered_share` and `damaged_share` are of the
+        link's newest judgement. `repeated` has the States that the link dropped, too. Half of the shortest round trip,
+        a State's way, is taken off the clock's offset. Changes nothing.
         """
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
@@ -261,7 +268,7 @@ class Connection:
         """Open the port, begin a conversation, in which an unfinished RETRACT is sent again, and tell `traffic` so.
 
         Where the port does not open, log why and wait in BACK_OFF; the same reason as before is logged for debugging
-        only.
+        only. Raises what opening raises besides BackendError.
         """
         try:
             self._backend = self._open_backend()
@@ -304,8 +311,10 @@ class Connection:
         self._wait(now_s, LinkState.LOST, cause, remedy)
 
     def _release(self) -> None:
-        """Close the backend, if one is open, and tell `traffic`; forget link and stream, with what the link has
-        pending."""
+        """Close the backend and tell `traffic`; forget link and stream, with what the link has pending.
+
+        Without an open one nothing happens. `state` is then what `_wait` or `close` sets.
+        """
         if self._backend is not None:
             self._backend.close()
             if self.traffic is not None:
@@ -321,8 +330,9 @@ class Connection:
     def _notice(self) -> None:
         """Act on a change of state since the last call, if there was one.
 
-        When RUNNING begins, the back-off begins anew. When RUNNING has ended, the loss is counted and `on_loss` called.
-        Both are logged, and so are REFUSED and UNANSWERED.
+        When RUNNING begins, the back-off begins anew. When RUNNING has ended, the loss is counted, its cause kept, and
+        `on_loss` called. Both are logged, and so are REFUSED and UNANSWERED. Call it after each change: two at once
+        count as the second alone.
         """
         before, state = self._seen, self.state
         if state is before:
@@ -340,14 +350,10 @@ class Connection:
             log.warning("%s: %s; next: %s", self._device.port, self.cause, self.remedy)
 
 
-def _refusals(refused: Mapping[str, str]) -> str:
-    return ", ".join([f"{name}: {why}" for name, why in sorted(refused.items())])
-
-
 def clock_report(fit: ClockFit | None, way_s: float = 0.0) -> ClockReport | None:
-    """Return a clock's fit, rounded for `status`; None without one.
+    """Return a clock's fit, rounded for `status`; None for None.
 
-    `way_s` is how long the clock's messages were on their way; it is taken off the offset.
+    `way_s` is how long the clock's messages were on their way, s; it is taken off the offset.
     """
     if fit is None:
         return None

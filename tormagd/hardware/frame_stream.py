@@ -26,7 +26,7 @@ class FrameStream:
         return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
-        """Return a message's frame, with the next sequence number, and keep it in `sent` until the next call.
+        """Return a message's frame, with the next sequence number, 0..255, and keep it in `sent` until the next call.
 
         Raises EncodeError for a value that does not fit the wire; number and `sent` are then as before.
         """
@@ -36,10 +36,11 @@ class FrameStream:
         return frame
 
     def unpack(self, data: bytes) -> list[Message]:
-        """Return the valid messages that `data` completes, and keep `data` in `received` until the next call.
+        """Return the valid messages that `data` completes, in their order, and keep `data` in `received`.
 
         An incomplete frame waits for the next bytes. A frame that does not decode is counted as corrupt;
-        `statistics.refused` says why.
+        `statistics.refused` says why. A frame that repeats the last byte for byte gives no message. Raises nothing for
+        any bytes.
         """
         self.received = data
         messages: list[Message] = []

@@ -92,7 +92,8 @@ class DeviceLink:
     """One conversation with a device, from the opening of the port to its loss. A new opening needs a new link.
 
     It keeps `state` and its `cause`, the device's `identity`, the pending request, and the newest messages, of which it
-    makes a measurement. `round_trip`, `clock` and `quality` tell how the wire carries. No I/O and no clock.
+    makes a measurement. `round_trip`, `clock` and `quality` tell how the wire carries. No I/O and no clock: times
+    `now_s` are s of one clock of the host, which only rises.
     """
 
     __match_args__: ClassVar = (
@@ -113,10 +114,11 @@ class DeviceLink:
         self._begin(now_s, "waiting for the device to say who it is")
 
     def _begin(self, now_s: float, cause: str) -> None:
-        """Begin to identify the device, for `cause`, and forget all that was known of it.
+        """Begin to identify the device, at first and after a reset or a replacement, and forget all that was known of
+        it.
 
-        Also after a reset or a replacement. A pending RETRACT stays; any other request is dropped. A Hello is due at
-        once. The Drives' counter and `repeated` go on.
+        `cause` becomes the link's. A pending RETRACT stays; any other request is dropped. A Hello is due at
+        once. The Drives' counter, the counts of Drives and States, and `repeated` go on.
         """
         self.state = _IDENTIFYING
         self.cause = cause
@@ -154,7 +156,8 @@ class DeviceLink:
     def measurement(self) -> Measurement | None:
         """The newest State, with the newest Sense and Status; None until a State follows the first of both.
 
-        A Status that first says HOMED counts from the next State on, whose positions have the new origin.
+        A Status that first says HOMED counts from the next State on, whose positions have the new origin. It stays
+        while the device is silent, and after `lose`: `received_s` says how old it is.
         """
         if self._measurement is None and self._is_measured:
             self._measurement = self._measured()
@@ -170,9 +173,10 @@ class DeviceLink:
         return self.state is _RUNNING and now_s - self._heard_s > SILENT_S
 
     def receive(self, now_s: float, message: Message) -> None:
-        """Take one message that came from the device at `now_s`: State, Sense, Status or Identity; others are ignored.
+        """Take one message that came from the device at `now_s`: State, Sense, Status or Identity.
 
-        Any message ends silence, and UNANSWERED, so that the next `due` has a Hello.
+        Any message ends silence, and UNANSWERED, so that the next `due` has a Hello; others do no more. An Identity
+        leads to RUNNING or REFUSED. A reset or a replacement changes `state` only at the next `due`.
         """
         self._heard_s = now_s
         if self.state is _UNANSWERED:
@@ -191,9 +195,9 @@ class DeviceLink:
         """Return the Hello or the command to send at `now_s`, after the period's Drive; often none.
 
         A command is repeated every REPEAT_S until it is acknowledged. A Hello is repeated as often until the device is
-        known, then every HELLO_S, but not beside a command. Before that, `state` changes on silence, a reset, a
-        replacement or a missing Identity, and a Home or Clear is given up after GIVE_UP_S. The newest Drive is noted as
-        sent at `now_s`.
+        known, then every HELLO_S, but not beside a command. First, `state` changes on silence, a reset, a replacement
+        or a missing Identity, and a Home or Clear is given up after GIVE_UP_S. The newest Drive is noted as sent at
+        `now_s`. What is returned counts as sent.
         """
         self.round_trip.drive(self._counter, now_s)
         self._change_state(now_s)
@@ -214,9 +218,10 @@ class DeviceLink:
         return messages
 
     def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
-        """Return the next Drive, with its counter. Duties are -1..1 of the supply voltage; positive opens.
+        """Return the next Drive, with the next counter, 0..255; it counts as sent.
 
-        Duties are not checked here, but where the Drive is encoded. Call `due` after it, which notes when it was sent.
+        Duties are -1..1 of the supply voltage; positive opens. They are checked where the Drive is encoded, and that
+        the device runs is not checked at all. Call `due` after it, which notes when it was sent.
         """
         self._counter = (self._counter + 1) % 256
         self._drives += 1
@@ -226,8 +231,8 @@ class DeviceLink:
         """Ask the device for a routine: `due` repeats the command until a Status acknowledges it.
 
         The command waits until the device runs and has sent a Status. Replaces an unacknowledged request; NONE only
-        ends it. HOME and CLEAR are given up after GIVE_UP_S, and when the device is reset or replaced. RETRACT is given
-        up when the device has latched a fault.
+        ends it. HOME and CLEAR are given up GIVE_UP_S after `now_s`, and when the device is reset or replaced. RETRACT
+        is given up when the device has latched a fault. `pending` says whether it still waits.
         """
         self._nonce = _next_nonce(self._nonce)
         self._request = request
@@ -236,8 +241,8 @@ class DeviceLink:
     def missing(self, refused: Mapping[str, str]) -> str:
         """Return what a measurement of a running device still lacks, as in "no Sense yet, State refused: CRC-8".
 
-        `refused` says by a message's name why the newest was refused. Empty where there is a measurement, and where
-        the device does not run.
+        `refused` says by a message's name why the newest was refused, as the backend's statistics have it. Empty where
+        there is a measurement, and where the device does not run.
         """
         if self.state is not _RUNNING or self._is_measured:
             return ""
@@ -248,9 +253,10 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Renew `quality`, which the next measurement carries, from the backend's counters; call it when `is_judging`.
+        """Renew `quality`, which the measurement carries from now on, from the backend's counters.
 
-        The counters, of frames received and damaged and of messages not taken at once, only grow.
+        These count frames received and damaged, and messages not taken at once, since the port was opened; they only
+        grow. Call it when `is_judging`: earlier calls shorten the second that `quality` spans.
         """
         counts = Counts(self._drives, self._states, frames, damaged, unsent)
         self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
@@ -271,7 +277,8 @@ class DeviceLink:
     def _change_state(self, now_s: float) -> None:
         """Identify a device anew that was reset or replaced; else enter LOST or UNANSWERED, and say why in `cause`.
 
-        LOST is for a running device that is silent, UNANSWERED for no Identity within UNANSWERED_S of asking.
+        LOST is for a running device that is silent, UNANSWERED for no Identity within UNANSWERED_S of asking. Where
+        none of these is, nothing changes.
         """
         # the break was heard a tick ago: so the core has seen the measurement that shows it, and names it better
         if self._broken:
@@ -284,9 +291,10 @@ class DeviceLink:
             self.cause = f"the device has not said who it is for {UNANSWERED_S:g} s"
 
     def _take_identity(self, identity: Identity) -> None:
-        """Keep an Identity: enter RUNNING, or REFUSED for another protocol schema, and match the round trips' counters.
+        """Keep an Identity: enter RUNNING, or REFUSED for another protocol schema, from any state.
 
-        Another serial number than before is noted as a replacement of the device.
+        It also matches the round trips' counters. Another serial number than before is noted as a replacement of the
+        device, which the next `due` acts on.
         """
         self.round_trip.identity()
         known, self.identity = self.identity, identity
@@ -305,8 +313,9 @@ class DeviceLink:
     def _take_status(self, now_s: float, status: Status) -> None:
         """Keep a Status: end an acknowledged request, and note a reset or how late the device obeys.
 
-        That is the age of the first Drive that the device does not obey yet, 0 unless it is in RUN. The first one says
-        from where nonces count on. A RETRACT also ends when the device has latched.
+        How late is the age of the first Drive that the device does not obey yet, 0 unless it is in RUN. Of this Status
+        and the last the lesser age is measured. The first Status says from where nonces count on. A RETRACT also ends
+        when the device has latched. A reset, nonce 0 after another, is acted on by the next `due`.
         """
         if self._status is None:
             # an earlier host has counted this far; its last number again would be taken for a repetition
@@ -336,7 +345,10 @@ class DeviceLink:
             self._measurement = None
 
     def _take_sense(self, now_s: float, sense: Sense) -> None:
-        """Keep a Sense and the time at which it came; once there are measurements, add the handle's travel to them."""
+        """Keep a Sense and the time at which it came; once there are measurements, add the handle's travel to them.
+
+        The handle is taken to have gone the shortest way, under half of HANDLE_SPAN_MM.
+        """
         # Sense follows the State of the same instant; the measurement takes the newest of both
         self._sensed_s = now_s
         previous = self._sense
@@ -348,8 +360,9 @@ class DeviceLink:
     def _take_state(self, now_s: float, state: State) -> None:
         """Take a State into the measurement, its positions and time unwrapped, and feed round trips and clock.
 
-        A State that repeats an earlier one or was overtaken is only counted. The first State after a Status and a Sense
-        begins the measurements; States before that one give no positions.
+        A State that repeats an earlier one or was overtaken is only counted in `repeated`. The first State after a
+        Status and a Sense begins the measurements; States before that one give no positions. Between two States the
+        time went on by under DEVICE_TIME_SPAN_S, positions by under half of POSITION_SPAN_MM.
         """
         previous = self._state
         if previous is not None and (previous.counter - state.counter) % 256 < OVERTAKEN:
@@ -372,9 +385,9 @@ class DeviceLink:
         self.clock.add(now_s, self._device_time_s)
 
     def _begin_measuring(self, now_s: float, state: State) -> None:
-        """Begin measurements with this State, as number 0 and with its places and time as they are.
+        """Begin measurements with this State, as number 0 and with its positions and time as they are.
 
-        Nothing happens while a Status or a Sense is still missing.
+        The handle begins at 0 mm. Nothing happens while a Status or a Sense is still missing.
         """
         if self._status is None or self._sense is None:
             return
@@ -386,7 +399,10 @@ class DeviceLink:
         self._right_mm = state.right_position_mm
 
     def _measured(self) -> Measurement:
-        """Return a Measurement of the newest State and Sense, and of the newest Status that counts for this State."""
+        """Return a Measurement of the newest State and Sense, and of the newest Status that counts for this State.
+
+        Only once measurements have begun: until then Sense or Status may be missing, which fails an assertion.
+        """
         sense, status = self._sense, self._told
         assert sense is not None, "measuring begins with a Sense"
         assert status is not None, "measuring begins with a Status"

@@ -92,10 +92,11 @@ class LinkWatch:
         return now_s >= self._due_s
 
     def look(self, now_s: float, counts: Counts, round_trip_s: float, clock_drift: float) -> LinkQuality:
-        """Return the quality over the last LOOKS looks, from the counters now; the next look is due after LOOKED_S.
+        """Return the quality over the last LOOKS looks, or all so far; the next look is due LOOKED_S after `now_s`.
 
-        `round_trip_s` is the usual one now; the quality has the lesser of this and the last look's, 0 at the first.
-        Shares are 0 at the first look, and where nothing was sent or received. `clock_drift` is handed on.
+        `counts` are the counters now, since the conversation began. `round_trip_s` is the usual one now; the quality
+        has the lesser of this and the last look's, 0 at the first. Shares are 0..1, and 0 at the first look and where
+        nothing was sent or received. `clock_drift` is handed on. Whether a look is due is not checked.
         """
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)

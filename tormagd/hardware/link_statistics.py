@@ -87,17 +87,19 @@ class RoundTrip:
     def identity(self) -> None:
         """Note that the Identity for the newest Hello came: it fixes how far Drive and State counters are apart.
 
-        Without a Hello or a State before, nothing is fixed. A second Identity for the same Hello does nothing.
+        Without a Hello or a State before, nothing is fixed. A second Identity for the same Hello does nothing. Round
+        trips that are known stay.
         """
         if self._before_hello is not None and self._state is not None:
             self._lead = self._before_hello - self._state
         self._before_hello = None
 
     def state(self, counter: int, now_s: float) -> None:
-        """Note that the State with this counter came at `now_s`; its round trip counts once a Status confirms it.
+        """Note that the State with this counter, 0..255, came at `now_s`; its round trip counts once a Status confirms
+        it.
 
         A State that would answer a Drive which is not sent yet shows that the counters do not match. Then no round trip
-        is taken until a Status or an Identity matches them again.
+        is taken until a Status or an Identity matches them again. A repeated State is not known as one: leave it out.
         """
         self._state, self._newest_s = counter, now_s
         lead = self._lead
@@ -112,8 +114,8 @@ class RoundTrip:
     def status(self, drive_counter: int) -> None:
         """Take the counter of the last Drive that the device accepted: count the round trips since the last Status.
 
-        Where the counter contradicts them, or is the first, drop all round trips and count this Drive's alone.
-        Before the first State nothing happens.
+        Where the counter, 0..255, contradicts them, or is the first, drop all round trips and count this Drive's alone,
+        up to the newest State. Before the first State nothing happens.
         """
         state, lead = self._state, self._lead
         if state is None:
@@ -137,7 +139,7 @@ class RoundTrip:
 
     @property
     def usual_s(self) -> float:
-        """The median of the newest USUAL_OF round trips, s; 0 while none is known.
+        """The median of the newest USUAL_OF round trips, or of fewer while there are fewer, s; 0 while none is known.
 
         A device that stood still once answers all waiting Drives late, which a mean would call a slow line.
         """
@@ -150,9 +152,9 @@ class RoundTrip:
         return min(self._recent, default=0.0)
 
     def report(self) -> dict[str, float] | None:
-        """Return `least`, `p50` (median) and `p99` of the recent round trips, us; None while none is known.
+        """Return `least`, `p50` (median) and `p99` of the recent round trips, us to 0.1; None while none is known.
 
-        At most ROUND_TRIPS count.
+        The newest ROUND_TRIPS count, however long ago they were.
         """
         ordered_s = sorted(self._recent)
         if not ordered_s:
@@ -200,9 +202,10 @@ class DeviceClock:
         """By which share the clock runs fast, over DRIFT_WINDOWS; 0 while unknown, -1 for a clock that stands."""
 
     def add(self, host_s: float, device_s: float) -> None:
-        """Take a State that was latched at `device_s` on the device's clock, unwrapped, and read at `host_s`.
+        """Take a State that was latched at `device_s` on the device's clock, unwrapped, and read at `host_s`, s.
 
-        Renews `drift` when a window ends, and sets it to -1 after more than STANDING States with one time.
+        Renews `drift` when a window of WINDOW_S ends, and sets it to -1 after more than STANDING repetitions of one
+        time. `host_s` has to rise, which is not checked.
         """
         if device_s != self._newest_s:
             self._newest_s, self._standing = device_s, 0
@@ -219,7 +222,8 @@ class DeviceClock:
     def fit(self) -> ClockFit | None:
         """Return the line through the last half minute, or since the clock was set; None where no line fits yet.
 
-        A line takes MIN_WINDOWS windows, three seconds.
+        A line takes MIN_WINDOWS windows, three seconds; the window that is not over yet does not count. It is computed
+        once a window.
         """
         if not self._is_fitted:
             self._fit = _newest_line(list(self._windows))
@@ -227,9 +231,9 @@ class DeviceClock:
         return self._fit
 
     def _turn(self, host_s: float) -> None:
-        """End the window and begin the next: keep the least delayed State, if one came, and renew `drift` with it.
+        """End the window and begin the next at `host_s`: keep the least delayed State, if one came, and renew `drift`.
 
-        The drift of a clock that stands stays at -1.
+        `drift` is 0 where no line fits the last DRIFT_WINDOWS. That of a clock that stands stays at -1.
         """
         if self._least[0] < math.inf:
             self._windows.append(self._least)
@@ -245,7 +249,7 @@ def _newest_line(windows: Windows) -> ClockFit | None:
     """Return the line through the newest of `windows`, which are in the order of time; None where no line fits.
 
     The line is tried through all windows, then without the older half, and so on while MIN_WINDOWS are left. It fits
-    with a residual under MAX_RESIDUAL_US and one of the NEWEST_WINDOWS on it.
+    with a residual under MAX_RESIDUAL_US and one of the NEWEST_WINDOWS on it. None also for fewer than MIN_WINDOWS.
     """
     # no line fits across a clock that was set, or stood still for a while: the older half is dropped until one does
     while len(windows) >= MIN_WINDOWS:
@@ -259,7 +263,8 @@ def _newest_line(windows: Windows) -> ClockFit | None:
 def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
     """Return the line through the windows, in the order of time, and whether all of the NEWEST_WINDOWS lie off it.
 
-    Windows further than OUTLIER deviations from a line of median slope and level are left out. At least two windows.
+    Windows further than OUTLIER deviations from a line of median slope and level are left out. Raises
+    ZeroDivisionError, IndexError or ValueError for fewer than two windows, or two at one time.
     """
     newest_s = windows[-1][1]
     half = len(windows) // 2

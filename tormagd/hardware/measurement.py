@@ -79,7 +79,8 @@ class Measurement(Value):
         """Tell whether the numbers are finite and small enough to compute with: the root of their squares' sum is at
         most 1e10.
 
-        The codec gives no others; the backend of a plugin may. The three shares of `link` are not looked at.
+        False for NaN. The codec gives no others; the backend of a plugin may. The three shares of `link` are not looked
+        at.
         """
         link = self.link
         # one comparison, as it stands in every tick: a sum of squares with NaN is not less, and nothing cancels

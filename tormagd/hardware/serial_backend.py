@@ -32,10 +32,10 @@ class SerialOptions(Strict, frozen=True):
 
 
 def open_serial(device: Device, options: SerialOptions) -> SerialPort:
-    """Open `device.port` exclusively, with its driver's latency timer at 1 ms where that can be set.
+    """Open `device.port` exclusively at `options.baud`, with its driver's latency timer at 1 ms where that can be set.
 
-    What had come before is discarded. Raises BackendError saying why the port does not open, and what to do where that
-    is known.
+    A timer that stays longer is logged. What had come before is discarded. Raises BackendError saying why the port does
+    not open, and what to do where that is known.
     """
     try:
         port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)

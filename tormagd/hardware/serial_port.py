@@ -35,8 +35,9 @@ class SerialPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the valid messages in the next READ_BYTES bytes that have arrived.
+        """Return the valid messages in the next READ_BYTES bytes that have arrived; none where none has.
 
+        Further bytes, and an incomplete frame, wait for the next call. What is damaged is counted in `statistics`.
         Raises BackendError when the device was unplugged or the port cannot be read.
         """
         try:
@@ -52,8 +53,8 @@ class SerialPort:
     def send(self, message: Message) -> None:
         """Write one frame behind what the driver had not taken yet; bytes that it does not take now are kept.
 
-        Such a message counts in `statistics.unsent`. Raises BackendError when the port is gone or more than
-        UNSENT_BYTES wait, and EncodeError for a value that does not fit the wire.
+        A call after which bytes are left counts in `statistics.unsent`; the next call sends them. Raises BackendError
+        when the port is gone or more than UNSENT_BYTES wait, and EncodeError for a value that does not fit the wire.
         """
         data = self._unsent + self.stream.pack(message)
         try:
@@ -69,7 +70,10 @@ class SerialPort:
             raise BackendError(f"{self._port.port}: nobody reads at the other end")
 
     def close(self) -> None:
-        """Close the port and drop its lock; unsent bytes are discarded. Errors of a device that is gone are ignored."""
+        """Close the port and drop its lock; unsent bytes are discarded. Never waits, and may be called again.
+
+        Errors of a device that is gone are ignored.
+        """
         # closing would wait for unsent bytes, up to half a minute
         with contextlib.suppress(OSError, termios.error):
             self._port.reset_output_buffer()

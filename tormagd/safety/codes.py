@@ -593,9 +593,7 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
     """Return the faults for the firmware's fault bits, in the order of the bits; empty for none.
 
-    With `is_host_stall` the device's command timeout is the fault HOST_STALL: the daemon itself had sent no Drive.
+    `is_host_stall` says that the daemon itself had sent no Drive: then the device's command timeout becomes HOST_STALL.
     """
-    found = tuple(fault for bit, fault in _BY_DEVICE_FAULT.items() if bit in bits)
-    if not is_host_stall:
-        return found
-    return tuple(Fault.HOST_STALL if fault is Fault.DEVICE_COMMAND_TIMEOUT else fault for fault in found)
+    names = _BY_DEVICE_FAULT | ({DeviceFault.COMMAND_TIMEOUT: Fault.HOST_STALL} if is_host_stall else {})
+    return tuple(fault for bit, fault in names.items() if bit in bits)

@@ -221,7 +221,10 @@ def _apart(state: SafetyState, present: Conditions) -> str:
 
 
 def _slow(state: SafetyState, present: Conditions) -> str:
-    """Return what is wrong with the round trip to the device; empty where the position loop bears it."""
+    """Return what is wrong with the round trip to the device, in ms; empty where it is at most `most_round_trip_s`.
+
+    A NaN is wrong. `state` is not looked at.
+    """
     if present.round_trip_s <= present.most_round_trip_s:
         return ""
     return (
@@ -340,8 +343,8 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
     """Return `state` in FAULT with `faults` latched and the device asked to open; `state` itself where none is new.
 
     New faults stand behind those latched before, and among themselves in the order of `Fault`: causes before their
-    consequences. A new fault in FAULT asks the device again, under a new number. Faults of LOST_POSITION set
-    `needs_homing`.
+    consequences. `faults` may be in any order, and empty, but name none twice: that is not checked. A new fault in
+    FAULT asks the device again, under a new number. Faults of LOST_POSITION set `needs_homing`.
     """
     if not faults:  # as nearly always, a thousand times a second
         return state
@@ -361,8 +364,8 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
     """Return `state` after the device said whether it is homed: a device that is not homed ends `needs_homing`.
 
-    Such a device has begun to home or was reset, so that its next HOMED is of a new origin. In any other case it is
-    `state` itself. Give it the device's own word, not that of a record marked as not homed.
+    Such a device has begun to home or was reset, so that its next HOMED is of a new origin. Nothing else changes: in
+    any other case it is `state` itself. `is_homed` has to be what the device itself says.
     """
     return state if is_homed or not state.needs_homing else state.replaced(needs_homing=False)
 
@@ -376,7 +379,8 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 
     Raises RefusedError for an unknown command, for one that the table refuses in this state, and for the first guard
     that does not hold. Where the table refuses, a device that is not connected is told instead of the table's reason.
-    `use-scene` in DISABLED is taken without a device.
+    `use-scene` in DISABLED is taken without a device; the caller changes the scene. `clear-fault` in ENABLED and PAUSED
+    changes nothing.
     """
     if name not in COMMANDS:
         raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
@@ -405,8 +409,8 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
     """Raise RefusedError where `guard` does not hold in `state` under `conditions`; else do nothing.
 
-    The error has the guard's `code`, what is wrong with its figures, and the guard's remedy as hint. For a device that
-    is not connected, the remedy of `conditions`, if any, replaces the guard's.
+    The error has the guard's `code`, what is wrong with its figures as message, and the guard's remedy as hint. With
+    CONNECTED, the remedy of `conditions`, unless empty, replaces the guard's.
     """
     message = guard.refuses(state, conditions)
     if message:
@@ -418,28 +422,22 @@ def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
     """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED, `resume` in PAUSED.
 
     Elsewhere `enable` is the last, and `clear-fault` the first in FAULT. `home` is among them where the device is not
-    `is_homed`, or a latched fault took the positions away. The commands are taken only once the causes of the faults
-    have gone.
+    `is_homed`, or a fault took the positions away. Guards are not asked: the commands are taken only once the causes of
+    the faults have gone.
     """
     if state.operating_state is ENABLED:
         return ()
     if state.operating_state is PAUSED:
         return (Event.RESUME,)
-    commands: list[Event] = []
-    needs_homing = state.needs_homing or not is_homed
-    if state.operating_state is FAULTED:
-        commands.append(Event.CLEAR_FAULT)
-        for fault in state.faults:
-            if FAULTS[fault].position is not Position.KEPT:
-                needs_homing = True
-    if needs_homing:
+    has_lost = any(FAULTS[fault].position is not Position.KEPT for fault in state.faults)
+    commands = [Event.CLEAR_FAULT] if state.operating_state is FAULTED else []
+    if has_lost or state.needs_homing or not is_homed:
         commands.append(Event.HOME)
-    commands.append(Event.ENABLE)
-    return tuple(commands)
+    return (*commands, Event.ENABLE)
 
 
 def reason(name: str, source: OperatingState) -> str:
-    """Return the log's line for a command that was taken in the state `source`: where it led, and why.
+    """Return the log's line for a command that was taken in the state `source`, as in "FAULT to DISABLED: why".
 
     `name` is the value of an `Event`, as in "clear-fault". Empty where the table refuses the command there; whether
     guards held is not asked. Raises ValueError for an unknown command.
@@ -451,7 +449,8 @@ def reason(name: str, source: OperatingState) -> str:
 def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -> SafetyState:
     """Return `state` in the operating state `target`, with a new `request` to the device unless `request` is NONE.
 
-    Every change of the operating state is made here; guards are the caller's to ask. With NONE the last request stays.
+    Every change of the operating state is made here. Neither the table nor a guard is asked: the caller does. With NONE
+    the last request and its number stay.
     """
     after = state.replaced(operating_state=target)
     return after if request is DeviceRequest.NONE else after.ask(request)
