@@ -344,7 +344,7 @@ def test_what_is_not_known_is_reported_as_such(bench: Bench) -> None:
         assert msgspec.msgpack.decode(msgspec.msgpack.encode(report), type=LinkReport) == report, "it travels"
     assert (after.firmware, after.serial_number, after.daemon_schema) == ("1.0", 7, f"{SCHEMA_HASH:08x}")
     assert after.round_trip_us.p50 == pytest.approx(1_000.0)
-    assert abs(after.clock.drift_ppm) < 1.0
+    assert (after.clock.offset_s, after.clock.drift_ppm) == pytest.approx((1_000.0005, 0.0), abs=1e-4)
 
 
 IDENTITIES = st.builds(

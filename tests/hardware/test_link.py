@@ -1,5 +1,6 @@
 """The conversation with the firmware: who it is, what it was asked, and positions without wrap-around."""
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -37,6 +38,7 @@ from tormagd.hardware.link import (
     DeviceLink,
     LinkState,
 )
+from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 
@@ -323,6 +325,27 @@ def test_a_status_updates_what_it_knows_and_leaves_the_number(link: DeviceLink) 
         False,
     )
     assert (after.number, after.received_s) == (before.number, before.received_s)
+
+
+NUMBERS = [
+    *("received_s", "device_time_s", "left_mm", "right_mm", "left_current_A", "right_current_A", "force_N"),
+    *("handle_mm", "temperature_C", "supply_V", "sensed_s", "reported_s", "delay_s", "round_trip_s", "clock_drift"),
+]
+
+
+def with_numbers(measurement: Measurement, numbers: dict[str, float]) -> Measurement:
+    """With other numbers, those of its link among them."""
+    of_link = {name: number for name, number in numbers.items() if name in LinkQuality.__match_args__}
+    own = {name: number for name, number in numbers.items() if name not in of_link}
+    return measurement.replaced(**own, link=measurement.link.replaced(**of_link))
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_each_number_has_to_be_one_that_can_be_computed_with(name: str, link: DeviceLink) -> None:
+    """The root of the squares' sum counts: a negative number as a positive one, and none makes up for another."""
+    zero, sound = (with_numbers(link.measurement, dict.fromkeys(NUMBERS, number)) for number in (0.0, -2e9))
+    assert (sound.is_finite, with_numbers(zero, {name: 1e10}).is_finite) == (True, True)
+    assert not any(with_numbers(sound, {name: odd}).is_finite for odd in (1.1e10, -1.1e10, math.inf, math.nan))
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,7 @@ def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:
         ((99, 0, b"\x01"), (6, 1, b"\x01\x02"), (2, 2, b"\x00\x00\x00\x00\x01\x05\x00")), 1
     ):
         assert (stream.unpack(encode_frame(*frame)), stream.statistics.corrupt) == ([], corrupt)
+    assert stream.statistics.refused.keys() == {"function 99", "Home", "Drive"}
     assert stream.unpack(encode_frame(6, 3, b"\x05")) == [Home(5)]
 
 
@@ -129,10 +130,10 @@ def test_what_is_damaged_is_counted_and_the_next_good_one_found_again(stream: Ca
     identifier, data = frame_of(state(7))
     damaged = [(identifier, spoilt) for spoilt in (data[:-1], data[:-1] + bytes((data[-1] ^ 1,)), b"")]
     assert [stream.unpack(*frame) for frame in (*damaged, (0x7F1, b""))] == [None] * 4
-    assert (stream.statistics.corrupt, stream.statistics.resynchronisations) == (4, 0)
-    assert stream.unpack(identifier, data) is not None
-    assert stream.unpack(*frame_of(STATUS)) == STATUS
-    assert (stream.statistics.corrupt, stream.statistics.resynchronisations) == (4, 1)
+    known = stream.statistics
+    assert (known.corrupt, known.resynchronisations, known.refused.keys()) == (4, 0, {"State", "function 127"})
+    assert [stream.unpack(identifier, data), stream.unpack(*frame_of(STATUS))] == [state(7), STATUS]
+    assert (known.corrupt, known.resynchronisations) == (4, 1)
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,9 @@ MANY = 220_000_000
 "Bytes, beyond all that a reader may take."
 CHANNEL = record(Channel(1, "/ticks", "json", {}, 0))
 FILES: dict[str, Callable[[], bytes]] = {
+    "nothing": bytes,
+    "words": lambda: b"not a recording at all",
+    "a beginning alone": lambda: MAGIC,
     "a message of brackets": lambda: messages(NESTED),
     "a small message of brackets": lambda: messages(b'{"a":' * 120 + b"1" + b"}" * 120),
     "a schema of brackets": lambda: written(
@@ -135,6 +138,9 @@ BOXES: dict[str, Callable[[], bytes]] = {
     ),
     "columns of brackets": lambda: messages(
         msgpack.packb(["step"]), topic="/core", encoding="msgpack", header={"columns": "[" * 200_000}
+    ),
+    "columns that are a number": lambda: messages(
+        msgpack.packb(["step"]), topic="/core", encoding="msgpack", header={"columns": "5"}
     ),
     "no header, and a long recording": lambda: messages(*[b"{}"] * 10_000),
 }

@@ -35,13 +35,13 @@ class Clock:
         return self.now_s
 
 
-def write(folder: RecordingFolder, clock: Clock, *, is_marked: bool = False) -> Path:
+def write(folder: RecordingFolder, clock: Clock) -> Path:
     """A small recording of this moment."""
     with RecordingWriter(folder) as writer:
         ms = (clock.now_s - START_NS * 1e-9) * 1e3
         rng = random.Random(ms)
         writer.ticks(batch(*((ms + i, rng.random(), rng.random(), 35.0, 36.0, 0.25) for i in range(200))))
-    return mark(writer.path) if is_marked else writer.path
+    return writer.path
 
 
 def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> None:
@@ -49,7 +49,7 @@ def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> N
     folder = RecordingFolder(tmp_path, BUDGET, clock)
     for name in ("mine.mcap", "2020-01-01T00-00-00-mine.mcap"):
         (tmp_path / name).write_bytes(b"x" * 20_000)
-    marked = write(folder, clock, is_marked=True)
+    marked = mark(write(folder, clock))
     made = []
     for _ in range(40):
         clock.now_s += 3_600.0
@@ -73,19 +73,13 @@ def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> N
     assert marked.exists()
 
 
-def fill(folder: RecordingFolder, clock: Clock) -> None:
-    """With marked recordings."""
-    for _ in range(60):
-        clock.now_s += 3_600.0
-        write(folder, clock, is_marked=True)
-
-
 def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, monkeypatch: Any) -> None:
-    clock = Clock()
-    folder = RecordingFolder(tmp_path, BUDGET, clock)
+    folder = RecordingFolder(tmp_path, BUDGET)
+    for day in range(1, 7):
+        (tmp_path / f"2026-11-0{day}T00-00-00.marked.mcap").write_bytes(bytes(100_000))
     with pytest.raises(OSError, match=r"up to 0\.5 come, its budget is 1\.0, and nothing unmarked is left"):
-        fill(folder, clock)
-    assert all(each.is_marked for each in folder.segments())
+        folder.new()
+    assert len(folder.segments()) == 6
     # what stays free is for black boxes
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=900_000))
     assert "0.9 MB are free, and 1.0 stay so for black boxes" in folder.room(0)
@@ -96,13 +90,15 @@ def test_other_names_are_not_marked(tmp_path: Path, name: str) -> None:
     (tmp_path / name).touch()
     with pytest.raises(ValueError, match="allowed is that of a segment"):
         mark(tmp_path / name)
+    assert segment_of(tmp_path / name).began_s is None
 
 
-def test_the_former_name_is_a_segment_too(tmp_path: Path) -> None:
-    path = tmp_path / "2026-11-26T05-09-27.mcap"
+@pytest.mark.parametrize(("fraction", "began_s"), [("", 1_795_669_767.0), (".250Z", 1_795_669_767.25)])
+def test_a_name_says_when_it_began_also_in_the_former_form(tmp_path: Path, fraction: str, began_s: float) -> None:
+    path = tmp_path / f"2026-11-26T05-09-27{fraction}.mcap"
     path.touch()
-    assert (segment_of(path).began_s, segment_of(path).is_marked) == (1_795_669_767.0, False)
-    assert mark(mark(path)) == tmp_path / "2026-11-26T05-09-27.marked.mcap"
+    assert (segment_of(path).began_s, segment_of(path).is_marked) == (began_s, False)
+    assert mark(mark(path)) == tmp_path / f"2026-11-26T05-09-27{fraction}.marked.mcap"
 
 
 def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Path) -> None:

@@ -108,6 +108,9 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     assert process.heard() == Written("20300102T000000.000Z-DUE.mcap")
     process.say(Write("x.mcap", "SKEW", 0.0, {}))
     assert "x.mcap" in process.heard().refusal
+    # so does a part that is none
+    process.say(Begin(str(folder), HEADER), Part(0.0, 1, b"\xc1"), Write("y.mcap", "SKEW", 0.0, {}))
+    assert process.heard().refusal.startswith(f"{folder}/y.mcap: DecodeError")
     # no word, no daemon: it was killed. Each beginning is of another scene, and keeps nothing of the one before
     process.say(Begin(str(folder), HEADER), ticks(41, 20), Write("2031Z-LATER.mcap", "LATER", 3_600.0, {}))
     process.ours.close()
@@ -126,14 +129,9 @@ def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Proc
     assert len(list(tmp_path.iterdir())) == MAX_DUE
 
 
-def test_a_daemon_that_did_not_get_so_far_leaves_nothing(process: Process, tmp_path: Path) -> None:
-    process.say(Begin(str(tmp_path / "boxes"), HEADER))
+@pytest.mark.parametrize("words", [(), (ticks(1, 20), End())], ids=["gone before it kept anything", "ended in order"])
+def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path, words: tuple[Said, ...]) -> None:
+    process.say(Begin(str(tmp_path / "boxes"), HEADER), *words)
     process.ours.close()
     assert process.child.communicate(timeout=PATIENCE_S) == (None, "")
-    assert not (tmp_path / "boxes").exists()
-
-
-def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path) -> None:
-    process.say(Begin(str(tmp_path / "boxes"), HEADER), ticks(1, 20), End())
-    assert process.child.wait(PATIENCE_S) == 0
     assert not (tmp_path / "boxes").exists()

@@ -22,7 +22,7 @@ from tormagd.daemon.playout import Taken
 from tormagd.daemon.telemetry import tick_record
 from tormagd.inverse.solution import Answer, Question
 from tormagd.keeping import Part
-from tormagd.recording.black_box import write_black_box
+from tormagd.recording.black_box import is_tick, write_black_box
 from tormagd.recording.keeper import Ring
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import RefusedError
@@ -175,9 +175,6 @@ def frames(path: Path) -> list[dict[str, Any]]:
 
 def planted(box_entries: list[Any], tick: int, column: int, value: Any) -> list[Any]:
     """The entries with one value of one tick (1 is the first) changed."""
-    entries, seen = [], 0
-    for entry in box_entries:
-        is_tick = isinstance(entry, list) and type(entry[0]) is int
-        seen += is_tick
-        entries.append([*entry[:column], value, *entry[column + 1 :]] if is_tick and seen == tick else entry)
-    return entries
+    place = [place for place, entry in enumerate(box_entries) if is_tick(entry)][tick - 1]
+    changed = [*box_entries[place][:column], value, *box_entries[place][column + 1 :]]
+    return [*box_entries[:place], changed, *box_entries[place + 1 :]]

@@ -176,7 +176,6 @@ def test_clearing_while_driven_hides_no_fault_of_the_device(present: OperatingSt
     assert command(state, "clear-fault", 2.0, READY.replaced(device_latched=device_latched)) == state
 
 
-
 @pytest.mark.parametrize("fault", [Fault.NO_MOTION, Fault.FOLLOWING_ERROR, Fault.SKEW])
 def test_an_encoder_fault_takes_homing_away_until_the_device_has_homed_again(fault: Fault) -> None:
     """The device knows nothing of it, and calls itself homed all the time; a fault that comes later changes nothing."""
@@ -188,7 +187,6 @@ def test_an_encoder_fault_takes_homing_away_until_the_device_has_homed_again(fau
     assert refusal(asked, "enable").code == "not_homed"
     homing = homed_again(asked, is_homed=False)
     assert command(homed_again(homing, is_homed=True), "enable", 2.0, READY).operating_state is ENABLED
-
 
 
 def test_other_faults_leave_homing_to_the_device() -> None:
@@ -237,7 +235,6 @@ def test_a_row_says_why_it_is_and_what_its_guards_want(row: Transition | Refusal
     is_taken = isinstance(row, Transition)
     assert reason(row.event, row.source) == (f"{row.source} to {row.target}: {row.reason}" if is_taken else "")
     assert all(guard.wants and guard.remedy for guard in (row.guards if is_taken else ()))
-
 
 
 class Operating(RuleBasedStateMachine):

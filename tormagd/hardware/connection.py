@@ -145,7 +145,7 @@ class Connection:
         try:
             messages = backend.receive()
         except BackendError as error:
-            self._lose(now_s, error)
+            self._lose(now_s, str(error), error.remedy)
             return
         if self.traffic is not None and self._stream is not None and self._stream.received:
             self.traffic.read(now_s, self._stream.received)
@@ -182,7 +182,7 @@ class Connection:
             for message in link.due(now_s):
                 self._send(backend, message, sent)
         except BackendError as error:
-            self._lose(now_s, error)
+            self._lose(now_s, str(error), error.remedy)
             return
         if self.traffic is not None and self._stream is not None:
             self.traffic.wrote(now_s, sent, backend.statistics.unsent)
@@ -191,7 +191,7 @@ class Connection:
             link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
         self._notice()
         if link.state is LinkState.LOST:
-            self._give_back(now_s, link.cause, "")
+            self._lose(now_s, link.cause, "")
 
     def close(self) -> None:
         """Close the port; it stays closed until `open`.
@@ -296,16 +296,14 @@ class Connection:
         if self._stream is not None:
             sent.append(self._stream.sent)
 
-    def _lose(self, now_s: float, error: BackendError) -> None:
-        """End the conversation of a port that failed with `error`, and close the port to open it again later."""
-        assert self._link is not None, "only an open port can fail"
-        self._link.lose(str(error))
-        self._notice()
-        self._give_back(now_s, str(error), error.remedy)
+    def _lose(self, now_s: float, cause: str, remedy: str) -> None:
+        """End the conversation as lost for `cause`, close the port, and wait in LOST until it is opened again.
 
-    def _give_back(self, now_s: float, cause: str, remedy: str) -> None:
-        """Close the port, remember the unacknowledged request, and wait in LOST until the port is opened again."""
-        assert self._link is not None, "only what is open is given back"
+        The unacknowledged request is remembered. A device that ran counts as a loss, which is told once.
+        """
+        assert self._link is not None, "only an open port can be lost"
+        self._link.lose(cause)
+        self._notice()
         self._unfinished = self._link.pending
         self._release()
         self._wait(now_s, LinkState.LOST, cause, remedy)

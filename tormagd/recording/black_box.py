@@ -23,13 +23,14 @@ from tormagd.recording.stream import Record, Sent
 from tormagd.recording.writer import TICK_SCHEMA, TICKS_TOPIC, known_values, plain_schema, registered, sealed_mcap
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
+MAX_OFF_NS = {TICKS_TOPIC: 0, FRAMES_TOPIC: 1_000}
+"How far a derived message's time may be from what `/core` gives: a frame's is rounded twice."
 HEADER = "black_box"
 MAX_PARTS = 100_000
 MAX_BYTES = 50_000_000
 "Bound on all parts of one file together; a keeper holds less."
 MAX_ENTRIES = 1_000_000
 "Bound on the entries of one file: half a minute at 4 kHz has fewer."
-MAX_TIME_DIFFERENCE_NS = 1_000
 
 
 class BlackBoxFile(msgspec.Struct, frozen=True):
@@ -188,8 +189,8 @@ class _Reading:
         self._topics: dict[int, str] = {}
         self._derived: Derived | None = None
         self._expected: dict[str, deque[Shown]] = {TICKS_TOPIC: deque(), FRAMES_TOPIC: deque()}
-        self._late_ns: int | None = None
-        "Frame times less those derived without an offset, by the first frame; None before."
+        self._late_ns = {TICKS_TOPIC: 0}
+        "By topic, the first message's time less the derived one's; frames are derived without an offset."
         self._size = self._parts = 0
 
     def take(self, record: Record) -> None:
@@ -247,19 +248,15 @@ class _Reading:
         """Compare the file's next message of `topic` with the next derived one, and note in `odd` where they differ.
 
         Number and bytes have to be the same, a tick's time too. Frames' times may differ by what the first frame's do,
-        within MAX_TIME_DIFFERENCE_NS. A message for which none is derived differs.
+        within MAX_OFF_NS. A message for which none is derived differs.
         """
-        expected = self._expected[topic].popleft() if self._expected[topic] else None
-        if expected is None or (sent.sequence, sent.data) != (expected.sequence, expected.data):
-            is_same = False
-        elif topic == TICKS_TOPIC:
-            is_same = sent.t_ns == expected.t_ns
-        else:
+        if self._expected[topic]:
+            expected = self._expected[topic].popleft()
             late_ns = sent.t_ns - expected.t_ns
-            self._late_ns = late_ns if self._late_ns is None else self._late_ns
-            is_same = abs(late_ns - self._late_ns) <= MAX_TIME_DIFFERENCE_NS
-        if not is_same:
-            self.odd = f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has"
+            off_ns = abs(late_ns - self._late_ns.setdefault(topic, late_ns))
+            if (sent.sequence, sent.data) == (expected.sequence, expected.data) and off_ns <= MAX_OFF_NS[topic]:
+                return
+        self.odd = f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has"
 
     def end(self) -> None:
         """Note in `odd` the first derived message that the whole file does not have."""

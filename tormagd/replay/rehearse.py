@@ -6,6 +6,7 @@ the recorded device. So it runs with the recorded configuration too, to compare 
 
 import tomllib
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import msgspec
@@ -212,10 +213,8 @@ def _recorded(ticks: list[TickRecord]) -> Happened:
     operating state.
     """
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
-    before_s = first_s
-    for tick in ticks:
-        happened.note(tick.monotonic_s - first_s, tick.faults, tick.limits, tick.monotonic_s - before_s)
-        before_s = tick.monotonic_s
+    for before, tick in pairwise([ticks[0], *ticks]):
+        happened.note(tick.monotonic_s - first_s, tick.faults, tick.limits, tick.monotonic_s - before.monotonic_s)
     return happened
 
 

@@ -258,13 +258,13 @@ class _Running:
                 self._failure = None
                 self._planner.afresh(msgspec.convert(entry[1], float))
             case journal.TEACH | journal.ANSWER:
-                told = restored(entry[1], KNOWN)
-                if not isinstance(told, Learned | Answer):
-                    raise ValueError(f"{told!r}: allowed is what is learned of a device, or what a search found")
-                if isinstance(told, Learned):
-                    self._planner.teach(told)
-                else:
-                    self._planner.answered(told)
+                match restored(entry[1], KNOWN):
+                    case Learned() as learned:
+                        self._planner.teach(learned)
+                    case Answer() as answer:
+                        self._planner.answered(answer)
+                    case other:
+                        raise ValueError(f"{other!r}: allowed is what is learned of a device, or what a search found")
             case journal.CONFIRM:
                 self._planner.confirm(msgspec.convert(entry[1], Disputed))
             case journal.COMMAND:
