@@ -229,18 +229,25 @@ def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> No
     assert len(bus.backend.receive()) == min(queued, FRAMES_AT_ONCE)
 
 
+UP = "sudo ip link set can7 up type can bitrate 1000000 restart-ms 100"
+
+
 @pytest.mark.parametrize(
-    ("number", "said", "first"),
-    [(errno.ENODEV, "no such interface", "plug"), (errno.EAFNOSUPPORT, "knows no CAN", "sudo modprobe")],
+    ("interface", "number", "said", "remedy"),
+    [
+        ("socketcan", errno.ENODEV, "there is no such interface", f"plug the adapter in, then {UP}"),
+        ("socketcan", errno.EAFNOSUPPORT, "the kernel knows no CAN", f"sudo modprobe can_raw, then {UP}"),
+        ("socketcan", errno.ENOMEM, os.strerror(errno.ENOMEM), ""),
+        ("tormagsim", errno.ENODEV, os.strerror(errno.ENODEV), ""),
+    ],
 )
 def test_an_interface_that_is_not_there_says_how_it_comes(
-    monkeypatch: pytest.MonkeyPatch, number: int, said: str, first: str
+    monkeypatch: pytest.MonkeyPatch, interface: str, number: int, said: str, remedy: str
 ) -> None:
     monkeypatch.setattr(can, "Bus", Mock(side_effect=OSError(number, os.strerror(number))))
-    with pytest.raises(BackendError, match=f"socketcan can7: cannot be opened: .*{said}") as caught:
-        opened(Device(backend="can", options={"interface": "socketcan"}, port="can7"))
-    assert caught.value.remedy.startswith(first)
-    assert "ip link set can7 up type can bitrate 1000000" in caught.value.remedy
+    with pytest.raises(BackendError, match=f"^{interface} can7: cannot be opened: {said}$") as caught:
+        opened(Device(backend="can", options={"interface": interface}, port="can7"))
+    assert caught.value.remedy == remedy
 
 
 # -- behind an adapter on a serial line ----------------------------------------------------------------------------
@@ -452,11 +459,14 @@ def test_the_timer_is_a_number_and_read_through_the_stable_name_too(
     assert [latency_ms(port, tmp_path) for port in (USB, str(link), "/dev/ttyACM0")] == [timer_ms, timer_ms, None]
 
 
-def test_a_driver_that_can_is_made_prompt_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("prompt_ms", [1, 0])
+def test_a_driver_that_can_is_made_prompt_without_a_word(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, prompt_ms: int
+) -> None:
     timer, port = timer_of(USB, tmp_path), Mock(port=USB)
-    port.set_low_latency_mode.side_effect = lambda is_low: timer.write_text("1")
+    port.set_low_latency_mode.side_effect = lambda is_low: timer.write_text(f"{prompt_ms}")
     make_prompt(port, tmp_path)
-    assert latency_ms(USB, tmp_path) == 1
+    assert latency_ms(USB, tmp_path) == prompt_ms
     make_prompt(port, tmp_path)
     port.set_low_latency_mode.assert_called_once_with(True)  # what is prompt already is left alone
     assert caplog.records == []

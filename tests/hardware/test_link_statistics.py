@@ -76,6 +76,16 @@ def test_a_round_trip_of_any_length_is_known_after_one_hello_or_a_status_that_co
     assert (trip.least_s, trip.usual_s) == pytest.approx((way_ticks * PERIOD_S, way_ticks * PERIOD_S))
 
 
+def test_percentiles_are_of_all_round_trips(trip: RoundTrip) -> None:
+    """A hundred Drives at once, each of which is answered a millisecond after the one before."""
+    for counter in range(1, 101):
+        trip.drive(counter, 0.0)
+    for counter in range(1, 101):
+        trip.state(counter, counter * PERIOD_S)
+        trip.status(counter)
+    assert (trip.report(), trip.usual_s) == ({"least": 1e3, "p50": 51e3, "p99": 100e3}, pytest.approx(0.051))
+
+
 def test_an_answer_to_what_has_not_been_sent_ends_the_count(trip: RoundTrip) -> None:
     exchange(trip, range(1, 1_400), 1)
     trip.drive(10, 5.0)
@@ -241,7 +251,7 @@ def test_a_clock_that_stands_is_known_at_once_and_forgiven_when_it_goes() -> Non
     clock = heard(lambda now_s: now_s, 1_000)
     drifts = []
     for tick in range(STANDING + 2):
-        clock.add((1_000 + tick) * PERIOD_S, 1.0)
+        clock.add((1_000 + tick) * PERIOD_S, float("1.0"))  # equal, and not the same
         drifts.append(clock.drift)
     assert drifts == [0.0] * (STANDING + 1) + [-1.0]
     for tick in range(10_000):
@@ -295,7 +305,7 @@ def test_each_share_is_of_its_own_and_forgotten_after_a_second(change, name: str
     assert share > LOSES
     # the shares of one bad look among the ten of a second
     assert getattr(watched([GOOD] * 12 + [bad]), name) <= share / LOOKS * 2.0
-    assert not watched([bad] * 12 + [GOOD] * 12).is_lossy
+    assert not watched([bad] * 12 + [GOOD] * LOOKS).is_lossy
 
 
 def test_a_round_trip_is_long_once_two_looks_have_found_it_so() -> None:
