@@ -142,9 +142,8 @@ def test_before_a_disk_is_full_all_that_came_is_closed_in_order(tmp_path, monkey
     assert not recording.is_complete
     assert "15.9 MB" in recording.metadata["cut_by"]
     with path.open("rb") as file:
-        reader = make_reader(file)
-        assert reader.get_summary().statistics.message_count == len(list(reader.iter_messages()))
-    assert obey(path) == len(recording.ticks) + len(recording.snapshots)
+        told = make_reader(file).get_summary().statistics.message_count
+    assert obey(path) == told == writer.tick_count + writer.telemetry_count
     assert (len(recording.ticks), len(recording.snapshots)) == (writer.tick_count, writer.telemetry_count)
     assert (writer.tick_count + 400) // 500 == chunks
 
@@ -194,19 +193,6 @@ def test_columns_may_change_while_recording(tmp_path):
     first, second = (each.message for each in back(path).ticks)
     assert (first["old"], "new" in first, "old" in second) == (1.0, False, False)
     assert second == {"t_ns": START_NS + 1_000_000, "new": 2.0, "operating_state": "ENABLED"}
-
-
-def test_a_recorder_killed_in_the_middle_of_a_chunk_loses_only_that(tmp_path):
-    path = tmp_path / "long.mcap"
-    fill(RecordingWriter(path))
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    second = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)[1]
-    path.write_bytes(path.read_bytes()[: second.chunk_start_offset + 5_000])
-    recording = back(path)
-    assert not recording.is_complete
-    assert recording.ticks[-1].t_ns < second.message_start_time + 1
-    assert len(recording.ticks) > 500
 
 
 @given(place=st.floats(0.0, 1.0), value=st.integers(1, 255), keep=st.floats(0.0, 1.0))

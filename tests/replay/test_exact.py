@@ -11,14 +11,13 @@ import pytest
 from flight import asked
 from hypothesis import given, settings, strategies as st
 
-from firmware_protocol.codec import SCHEMA_HASH, Identity, Switches
+from firmware_protocol.codec import Switches
 from tormagd.assembly.build import Core
 from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.believe.strength import UNSEEN
 from tormagd.control.records import Outside
 from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restore, restored
-from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_statistics import RoundTrip
 from tormagd.model.displacement import Turn
 from tormagd.replay import conversation
@@ -97,17 +96,6 @@ def test_what_stands_for_no_value_is_refused(data: Any) -> None:
 def test_what_has_no_plain_form_is_refused() -> None:
     with pytest.raises(TypeError, match="allowed are values"):
         plain({"a": 1})
-
-
-def test_what_changes_in_place_is_given_what_another_remembered() -> None:
-    one, other = DeviceLink(1.0), DeviceLink(2.0)
-    one.receive(1.5, Identity(SCHEMA_HASH, 1, 0, 7))
-    one.round_trip.drive(3, 1.5)
-    restore(other, msgspec.msgpack.decode(msgspec.msgpack.encode(plain(one))), conversation.KNOWN)
-    assert first_difference(plain(one), plain(other)) is None
-    assert (other.state, other.identity) == (one.state, one.identity)
-    other.round_trip.drive(4, 2.5)
-    assert first_difference(plain(one), plain(other)) == ("round_trip._newest", 3, 4)
 
 
 def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core: Core) -> None:
