@@ -28,7 +28,7 @@ from firmware_protocol.codec import (
     Switches,
 )
 from tormagd.config import Device, Rates
-from tormagd.hardware.backend import ENTRY_POINTS, Backend, BackendError, choose, installed
+from tormagd.hardware.backend import ENTRY_POINTS, BackendError, choose, installed
 from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
 from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.frame_stream import FrameStream
@@ -39,11 +39,6 @@ from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, to_socket
 from tormagd_client.endpoints import ConfigError
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
-
-
-def descriptor(backend: Any) -> int:
-    """What is readable when something has come: the daemon waits for nothing."""
-    return int(backend._fd)
 
 
 # -- ports and buses ---------------------------------------------------------------------------------------------------
@@ -67,8 +62,9 @@ def opened(device: Device) -> CanBackend:
 STATUS_FRAME = bus_frame(STATUS)
 
 
-def wait_readable(backend: Backend) -> None:
-    assert select.select([descriptor(backend)], [], [], 5.0)[0]
+def wait_readable(backend: SerialPort | CanBackend) -> None:
+    """Until something has come: the daemon itself waits for nothing."""
+    assert select.select([backend._fd], [], [], 5.0)[0]
 
 
 def next_of(backend: CanBackend) -> list[Message]:
