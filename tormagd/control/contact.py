@@ -1,6 +1,11 @@
-"""Contact of hand and element, in the model's terms: the hand slides a handle, or presses a finger."""
+"""Contact of hand and element, in the model's terms: the hand slides a handle, or presses a finger.
 
-from typing import Final, final
+Each kind states the motion that the model is asked for, `planned` ahead and `motion_now`, and whether the latter
+`is_known`. Its `displacement_mm` and `rate_mm_s` are the motion that the portrait is drawn for. Where it `slides`,
+friction makes the force.
+"""
+
+from typing import Final, TypeAlias, final
 
 from tormagd.control.records import Measured, TimedSetpoint
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
@@ -15,49 +20,17 @@ PRESSED: Final = 0.9
 "A finger less deep than this share of the scene's depth is on its way in or out."
 
 
-class ElementContact:
-    """Kind of contact between hand and element, which states the motion that the model is asked for.
-
-    The methods raise NotImplementedError; each kind of contact gives its own.
-
-    displacement_mm, rate_mm_s   the motion that the portrait is drawn for
-    slides                       True where a handle slides and friction makes the force, False where a finger presses
-    """
-
-    def __init__(self, displacement_mm: float, rate_mm_s: float, slides: bool) -> None:
-        self.displacement_mm: Final = displacement_mm
-        self.rate_mm_s: Final = rate_mm_s
-        self.slides: Final = slides
-
-    def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, that the force is planned for; each contact gives its own.
-
-        `setpoint` is None without a publisher, `measured` before a measurement.
-        """
-        raise NotImplementedError
-
-    def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, to ask the model with for the present force.
-
-        Ask `is_known` first: without it the model's force at this motion is not the hand's.
-        """
-        raise NotImplementedError
-
-    def is_known(self, measured: Measured) -> bool:
-        """Tell whether the model can give the present force, for the motion of `motion_now`. NaN in `measured` is
-        not."""
-        raise NotImplementedError
-
-
 @final
-class Sliding(ElementContact):
+class Sliding:
     """The sliding handle of a brake, which plans take as moving and with its friction mobilised.
 
     There the field decides the force. Before break-away the hand chooses the force, and the inverse is ill-posed.
     """
 
     def __init__(self) -> None:
-        super().__init__(MOBILISED_MM, ROLLER_RATE_MM_S, slides=True)
+        self.displacement_mm: Final = MOBILISED_MM
+        self.rate_mm_s: Final = ROLLER_RATE_MM_S
+        self.slides: Final = True
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         """Return the displacement, mm, and the rate, mm/s, that the force is planned for.
@@ -65,7 +38,8 @@ class Sliding(ElementContact):
         `setpoint` is None without a publisher, `measured` before a measurement. The displacement is the setpoint's, or
         MOBILISED_MM where it states none. Until friction is measured to be mobilised (`is_known`), the rate is the one
         that the setpoint states, without its sign. Otherwise the rate is the measured `sliding_mm_s`, or MOVING_MM_S
-        before a measurement. A rate below CREEP_MM_S becomes CREEP_MM_S.
+        before a measurement. A rate below CREEP_MM_S becomes CREEP_MM_S. Nothing else is checked: what the setpoint
+        states may be far from what the model knows.
         """
         displacement_mm = MOBILISED_MM
         rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
@@ -78,16 +52,18 @@ class Sliding(ElementContact):
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return MOBILISED_MM and the handle's rate, mm/s, without its sign, whether or not friction `is_known`.
+        """Return the motion to ask the model with for the present force: MOBILISED_MM, and the rate, mm/s, unsigned.
 
-        A rate below CREEP_MM_S stays as it is, unlike in `planned`.
+        Ask `is_known` first: before that the hand chooses the force. A rate below CREEP_MM_S stays as it is, unlike in
+        `planned`.
         """
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether friction is mobilised.
+        """Tell whether friction is mobilised: whether the model can give the present force.
 
-        The handle then has gone MOBILISED_MM one way, and is at most GONE_BACK_MM from its furthest place.
+        The handle then has gone MOBILISED_MM one way since it last turned round, and is at most GONE_BACK_MM from its
+        furthest place. Whether it moves now does not matter. NaN gives False.
         """
         handle = measured.handle
         gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
@@ -95,14 +71,16 @@ class Sliding(ElementContact):
 
 
 @final
-class Pressing(ElementContact):
+class Pressing:
     """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest.
 
     `depth_mm` > 0 is the scene's; it is not checked.
     """
 
     def __init__(self, depth_mm: float) -> None:
-        super().__init__(depth_mm, 0.0, slides=False)
+        self.displacement_mm: Final = depth_mm
+        self.rate_mm_s: Final = 0.0
+        self.slides: Final = False
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         """Return the depth, mm, and the rate, mm/s, that the force is planned for.
@@ -122,10 +100,16 @@ class Pressing(ElementContact):
         return depth_mm, rate_mm_s
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the measured depth, mm, 0 or more, and its rate, mm/s, positive inwards, whether or not it
-        `is_known`."""
+        """Return the measured depth, mm, 0 or more, and its rate, mm/s, positive inwards.
+
+        Ask `is_known` first: the model knows no finger that is less deep.
+        """
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
     def is_known(self, measured: Measured) -> bool:
         """Tell whether the finger is deep enough: at least the share PRESSED of the scene's depth; not for NaN."""
         return measured.handle.displacement_mm >= PRESSED * self.displacement_mm
+
+
+ElementContact: TypeAlias = Sliding | Pressing
+"Either kind of contact."

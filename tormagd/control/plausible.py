@@ -54,8 +54,9 @@ class Leap(Value):
     def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
         """Tell whether both carriages read places that they can have reached by `now_s` from before the step.
 
-        The leap was noise on a line then. They can have gone LEAP_MM, and at LEAP_SPEEDS times `full_speed_mm_s`, one
-        carriage's. The longer it lasts, the more they can have gone. NaN has not come back.
+        The leap was noise on a line then. In all the time since before the step they can have gone as far as
+        LEAP_SPEEDS times `full_speed_mm_s`, one carriage's, brings them, and LEAP_MM. `now_s` is on the clock of
+        `seen_s`. NaN has not come back.
         """
         max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
@@ -73,9 +74,9 @@ def leap_between(
     """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None.
 
     `last` was found at `seen_s`, `measured` at `now_s`, both on the host's clock. The step took the longer of two
-    times, by the device's clock and by the host's. In it a carriage goes LEAP_MM, and at LEAP_SPEEDS times
-    `full_speed_mm_s`, one carriage's. NaN counts as a leap. That both records are of a homed device is the caller's to
-    know: homing moves the places.
+    times, by the device's clock and by the host's. In that time a carriage can go as far as LEAP_SPEEDS times
+    `full_speed_mm_s`, one carriage's, brings it, and LEAP_MM. One that went further is enough. NaN counts as a leap.
+    That both records are of a homed device is the caller's to know: homing moves the places.
     """
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
@@ -98,27 +99,28 @@ def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
 def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm: float) -> bool:
     """Tell whether an end switch contradicts its carriage's place, for gaps from `closed_mm` to `open_mm`.
 
-    `switches` are bits of `Switches`, of about the time of `measured`. An open switch is to be closed at the open end,
-    and only there. A closed switch is not to be closed but near the closed end; there it may be open, as no scene goes
-    on to it. One of the four is enough. NaN contradicts nothing: `is_outside` finds it. Whether the device is homed is
-    the caller's to know.
+    `switches` are bits of `Switches`, 1 for a closed contact, of about the time of `measured`. The contact of an open
+    end is to be closed at that end, and only there. The one of a closed end may be closed only near it; there it need
+    not be, as no scene goes on to it. One of the four is enough. Allowed besides is what a carriage goes in TOLD_S. NaN
+    contradicts nothing: `is_outside` finds it. Whether the device is homed is the caller's to know.
     """
     inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
-    is_open, is_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0
-    if _is_contradicted(measured.left_mm, measured.left_mm_s, is_open, is_closed, inner_mm, home_mm):
-        return True
-    is_open, is_closed = switches & _RIGHT_OPEN != 0, switches & _RIGHT_CLOSED != 0
-    return _is_contradicted(measured.right_mm, measured.right_mm_s, is_open, is_closed, inner_mm, home_mm)
+    left_open, left_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0
+    right_open, right_closed = switches & _RIGHT_OPEN != 0, switches & _RIGHT_CLOSED != 0
+    return _is_contradicted(
+        measured.left_mm, measured.left_mm_s, left_open, left_closed, inner_mm, home_mm
+    ) or _is_contradicted(measured.right_mm, measured.right_mm_s, right_open, right_closed, inner_mm, home_mm)
 
 
 def _is_contradicted(
     at_mm: float, speed_mm_s: float, is_open: bool, is_closed: bool, inner_mm: float, home_mm: float
 ) -> bool:
-    """Tell whether a carriage's place `at_mm`, half of an even gap, contradicts its open or its closed switch.
+    """Tell whether a carriage's place `at_mm`, half of an even gap, contradicts the contacts at its two ends.
 
-    Where `is_open`, the carriage may be OPEN_SWITCH_MM short of the open end, `home_mm`; else as far beyond it. Where
-    `is_closed`, it may be up to `inner_mm`; else that switch contradicts nothing. Allowed besides is what the carriage
-    goes in TOLD_S at `speed_mm_s`, either way. NaN contradicts nothing.
+    `is_open` and `is_closed` say whether the contact of the open and of the closed end is closed. With `is_open` the
+    carriage may be OPEN_SWITCH_MM short of the open end, `home_mm`, or beyond it; without, as far beyond it at most.
+    With `is_closed` it may be no further out than `inner_mm`; without, that contact contradicts nothing. Allowed
+    besides is what the carriage goes in TOLD_S at `speed_mm_s`, either way. NaN contradicts nothing.
     """
     moved_mm = TOLD_S * abs(speed_mm_s)
     if is_closed and at_mm > inner_mm + moved_mm:

@@ -13,40 +13,33 @@ LAW_SHARE: Final = 0.12
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap allowed, mm: the greater of `ceiling_mm` and `unseen_mm`.
+    """Return the least gap allowed, mm, within the portrait's: that of `ceiling_mm` for the believed device.
 
-    `ceiling_N` is the greatest force that the device may surely give, CEILING times the scene's. The result is within
-    the portrait's gaps. Raises DomainError where a fit gives NaN.
+    `ceiling_N` is the greatest force that the device may surely give, CEILING times the scene's. Until the handle has
+    slid, the real device may be one of which nothing is known, `belief.unseen`. Then the more open gap of both counts.
+    Where `belief.unseen` is None, only the believed device does. Raises DomainError where a fit gives NaN.
     """
-    return max(ceiling_mm(portrait, belief.device, ceiling_N, bounds), unseen_mm(portrait, belief, ceiling_N, bounds))
+    known_mm = ceiling_mm(portrait, belief.device, ceiling_N, bounds)
+    if belief.unseen is None:
+        return known_mm
+    return max(known_mm, ceiling_mm(portrait, belief.unseen, ceiling_N, bounds))
 
 
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
     """Return the least gap, mm, at which the device, taken SURE deviations stronger, gives no more than `ceiling_N`.
 
-    It is held within the portrait's gaps: at the open end a device that is stronger still gives more. Raises
-    DomainError where the fit gives NaN.
+    SURE is `believe.strength`'s, and `bounds` are what the configuration lets a device be. The gap is held within the
+    portrait's: a device that gives more even at the open gap gets that gap. Raises DomainError where the fit gives NaN.
     """
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
-
-
-def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap, mm, as `ceiling_mm`, for a device of which nothing is known (`belief.unseen`).
-
-    Until the handle has slid, the real device may be that one. Where `belief.unseen` is None, the portrait's closed gap
-    is returned, which holds nothing back. Raises DomainError as `ceiling_mm`.
-    """
-    if belief.unseen is None:
-        return portrait.gap_mm[-1]
-    return ceiling_mm(portrait, belief.unseen, ceiling_N, bounds)
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
     """Return `field_mT`, held within a share LAW_SHARE of the field that the force law gives for `wanted_N`.
 
-    `wanted_N` is the model's force, N. For one that no field of the law gives, the law's nearer end counts. `law` is
-    None where no law is known: the field stays as it is. Raises DomainError for a force of NaN; a field of NaN stays
-    NaN.
+    Fields are in mT. `wanted_N` is the model's force, N. For one that no field of the law gives, the law's nearer end
+    counts. `law` is None where no law is known: the field stays as it is. Raises DomainError for a force of NaN; a
+    field of NaN stays NaN.
     """
     if law is None:
         return field_mT

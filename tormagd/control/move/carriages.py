@@ -66,9 +66,8 @@ class Carriages(Actuator):
         self._lag_s: Final = electrical_time_s(motor) + EXCHANGE_S
         self._gear_loss: Final = 1.0 - motor.gear_efficiency
         self._coulomb: Final = motor.coulomb_V / motor.supply_V
-        terms = scene.terms
-        self._has_motor: Final = terms.motor
-        self._learns: Final = terms.learning
+        self._has_motor: Final = scene.terms.motor
+        self._learns: Final = scene.terms.learning
 
     def begin(self, gap_mm: float) -> None:
         """Begin at the gap `gap_mm`, at rest and with empty integrals, so that no duty jumps."""
@@ -80,7 +79,8 @@ class Carriages(Actuator):
     def resume(self, measured: Measured) -> None:
         """Go on from the measured gap and speed after a blind time, in which the device kept its last duty.
 
-        The speed counts as no faster than the motors' own; the integrals stay.
+        Reference and expected gap begin there anew. The speed counts as no faster than the motors' own, either way; the
+        integrals stay.
         """
         speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
         self.reference = Reference(measured.gap_mm, speed_mm_s)
@@ -102,10 +102,11 @@ class Carriages(Actuator):
     ) -> Drive:
         """Return the duties of one tick, `dt_s` > 0 after the last, and take both position loops one tick on.
 
-        `plan` None holds the gap. With or without one it opens while the force is over the ceiling, `is_over`. The
-        limits OVER_FORCE, RATE and SATURATED may show. Updates reference, expected gap, integrals and counts, and may
-        learn `acceleration_scale`. Call `begin` first. Raises DomainError for a duty that is not finite: call `forget`
-        then.
+        `plan` None holds the gap. With or without one it opens while the force is over the ceiling, `is_over`.
+        `measured` gives places and speeds, `measurement` the open switches and the supply. The limits OVER_FORCE, RATE
+        and SATURATED may show, in this order. Updates reference, expected gap, integrals and counts, and may learn
+        `acceleration_scale`. Call `begin` first: an actuator without a reference raises AssertionError. Raises
+        DomainError for a duty that is not finite: call `forget` then.
         """
         assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
@@ -146,9 +147,10 @@ class Carriages(Actuator):
     ) -> tuple[Reference, bool]:
         """Return the reference `dt_s` later, and whether the limit of its acceleration held it back.
 
-        With `plan` None the reference stops. A force over the ceiling (`is_over`) sends it open. What holds the gap
-        back is added to `limits`, RATE only with a plan. Counts one more tick in `acted.rate` where speed limits the
-        reference, and in `acted.slew` where acceleration does.
+        With `plan` None the reference comes to rest. A force over the ceiling (`is_over`) sends it open, with
+        OVER_FORCE. What holds the gap back is added to `limits`: RATE only with a plan, and only where speed leaves it
+        over LAGGING_MM behind. Counts one more tick in `acted.rate` where speed limits the reference, and in
+        `acted.slew` where acceleration does. The caller keeps the reference.
         """
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
@@ -166,10 +168,11 @@ class Carriages(Actuator):
         return reference, is_slewed
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
-        """Return the gap's speeds: at no load, and the greatest that the reference may open and close with.
+        """Return the gap's speeds, mm/s: at no load, and the greatest that the reference may open and close with.
 
-        Where the carriages fall behind, their measured speed takes the place of the motors'. This speed counts as at
-        least half of the motors', so that a carriage held still is found by its following error.
+        `pull` is the duty that the magnets' pull takes: to open, it leaves less. Where the carriages are over WEAK_MM
+        from where they are expected, their measured speed takes the place of the motors'. This speed counts as at least
+        half of the motors', so that a carriage held still is found by its following error. Changes nothing.
         """
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
@@ -182,8 +185,8 @@ class Carriages(Actuator):
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
         """Update `acceleration_scale` after a period in which the acceleration limit held the reference back.
 
-        The errors are the gap's, expected minus measured: carriages that are ahead raise it, others lower it, within 1
-        to MAX_ACCELERATION_SCALE. While the reference slows down nothing is learned.
+        The errors are the gap's place and speed, expected minus measured: carriages that are ahead raise it, others
+        lower it, within 1 to MAX_ACCELERATION_SCALE. While the reference slows down or rests nothing is learned.
         """
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
             return
@@ -196,8 +199,9 @@ class Carriages(Actuator):
     def _feed_forward(self, reference: Reference, pull: float) -> float:
         """Return one carriage's duty, positive to open and not limited, at the nominal supply.
 
-        It is for half the reference's speed and acceleration, with friction and the magnets' `pull`, a duty. The pull
-        counts only to open; both fade below COULOMB_SPEED_MM_S. The duty is 0 in a scene without the term `motor`.
+        It is for half the reference's speed and acceleration, the gap's, with friction and the magnets' `pull`, a duty.
+        The pull counts only to open; both fade while the carriage's speed is below COULOMB_SPEED_MM_S. The duty is 0 in
+        a scene without the term `motor`.
         """
         if not self._has_motor:
             return 0.0
@@ -213,9 +217,10 @@ class Carriages(Actuator):
     def _drive(self, left: float, right: float, supply_V: float, limits: list[Limit]) -> Drive:
         """Return the duties at the device's real supply, held within the duty limit.
 
-        `left` and `right` are the loops' duties at the nominal supply; the same volts take less duty of a higher one. A
-        `supply_V` under half of the nominal counts as half. Counts a tick with a duty out of range in `acted.range`,
-        and adds SATURATED to `limits` where a loop is saturated.
+        `left` and `right` are the loops' duties at the nominal supply: `left_motor` and `right_motor` of the result.
+        The same volts take less duty of a higher supply. A `supply_V` under half of the nominal counts
+        as half. Counts a tick with a saturated loop or a duty out of range in `acted.range`. SATURATED is added to
+        `limits`, which the result keeps, where a loop is saturated.
         """
         is_saturated = self.left.is_saturated or self.right.is_saturated
         if is_saturated:
