@@ -66,9 +66,10 @@ class Planner:
         """Make the next plan, keep it in `planned`, and return it. All planning stages take one update.
 
         `setpoint` is None without a publisher. `measured` is None while the device is silent: nothing is learned of it.
-        Where the gap does not follow the plans (`is_followed`), they begin where it is. From the plan's gap the
-        carriages' lag is learned, for the next plan. Raises DomainError for a number that is not finite, a field that
-        no gap gives, or a search's answer that is too old. The stages are then half updated: call `afresh`.
+        `is_followed` says whether the gap follows the plans, as `Stepper` does; where it does not, they begin at the
+        measured gap. From the plan's gap the carriages' lag is learned, for the next plan. A forecast is not made here:
+        `foresee` does. Raises DomainError for a number that is not finite, a field that no gap gives, or a search's
+        answer that is too old. The stages are then half updated, and `planned` is still the last plan: call `afresh`.
         """
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
@@ -86,7 +87,8 @@ class Planner:
         """Return the force of `device`, N, at the gap where it is: `measured`, or open where that is None or not homed.
 
         By as much as the newest plan's gap differs from the portrait's for its force, the measured gap is corrected
-        first. A plan that the ceiling held corrects nothing.
+        first. A plan that the ceiling held corrects nothing. A gap outside the portrait counts as its nearer end.
+        Changes nothing. Raises DomainError for NaN.
         """
         portrait, planned = self._portrait, self.planned
         if measured is None or not measured.is_homed:
@@ -125,8 +127,8 @@ class Planner:
     def afresh(self, now_s: float) -> None:
         """Begin anew at `now_s` after a plan that failed, with nothing known of the device or of setpoints.
 
-        The newest plan is then one that opens the gap. Plan numbers go on. The element's memory and the handle's travel
-        stay.
+        The newest plan is then one that opens the gap, with the limit NO_SETPOINT. Plan numbers go on. The element's
+        memory and the handle's travel stay, and so does a `question` to a search beside the plans.
         """
         self.believe.forget()
         self.governor.begin(now_s)
@@ -173,7 +175,8 @@ class Stepper:
         for a force over the ceiling. While the loop is blind, or after a leap of the encoders, a driven one gets 0 in
         mode RUN: friction holds the gap. `measurement` is None when the link is lost: mode OFF, and a driven device
         gives the fault LINK_LOST. A measurement with a number that is not finite gives the fault NOT_FINITE, and
-        measuring and driving begin anew. Raises DomainError where `now_s` is not finite; nothing has changed then.
+        measuring and driving begin anew. The result also has the newest request to the device, as a fault makes one to
+        open. Raises DomainError where `now_s` is not finite; nothing has changed then.
         """
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:
@@ -202,10 +205,12 @@ class Stepper:
         return self._drive(now_s, dt_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
-        """Take an operator's command `name`, one of `operating_state.COMMANDS`.
+        """Take an operator's command `name`, one of `operating_state.COMMANDS`, and change `safety` by it.
 
-        Enabling a disabled device also begins the motion at the measured gap. Raises RefusedError, and nothing has
-        changed then.
+        `conditions` are what the caller knows of the device; the skew and the greatest values are added here. Enabling
+        a disabled device also begins the motion at the measured gap, at rest, and the watch's counts. Nothing is sent:
+        the next `step` says what is. Raises RefusedError where the conditions or the state do not allow it, and nothing
+        has changed then.
         """
         measured, before = self.measured, self.safety
         self.safety = command(before, name, now_s, self.watch.command_conditions(conditions, measured))
@@ -221,7 +226,8 @@ class Stepper:
     def lose_link(self) -> None:
         """Forget the device after its link broke: its newest measurement, and how fast its motors gain speed.
 
-        A device that was driven gives the fault LINK_LOST. The gap's opening is no longer watched.
+        A device that was driven gives the fault LINK_LOST. The gap's opening is no longer watched. Calling it again
+        changes nothing more. `step` without a measurement does the same.
         """
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
@@ -230,10 +236,11 @@ class Stepper:
         self.move.lose_device()
 
     def _judge(self, now_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Measured:
-        """Latch the faults that show, and return `measured`.
+        """Latch in `safety` the faults that show, and return `measured`.
 
-        While the device is not driven, its homing and opening are watched too. A device that has lost its position
-        counts as not homed in the record returned, until it begins to home or is reset.
+        `plan` counts only for how long the sensor has been doubted. While the device is not driven, its homing and
+        opening are watched too. A device that has lost its position counts as not homed in the record returned and
+        kept, until it begins to home or is reset.
         """
         measure = self.measure
         shown = self.watch.faults(
@@ -256,7 +263,8 @@ class Stepper:
     def _hold(self, now_s: float) -> Duty:
         """Return duties of 0 in mode RUN: the device answers, and friction holds the gap. The watch counts nothing.
 
-        The limit is ENCODER in a leap, else HOST_STALL after a stall of this host, else DEVICE_SILENT.
+        Call it for a driven device while the loop is blind or in a leap. The limit is ENCODER in a leap, else
+        HOST_STALL within SHOWN_S of a stall of this host, else DEVICE_SILENT. The reference waits.
         """
         limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
         if self.measure.leap is not None:
@@ -267,8 +275,9 @@ class Stepper:
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
         """Return the duties that follow `plan`, or hold the gap while PAUSED, and count what the watch sees.
 
-        The limits are those of actuator and watch. A duty that is not finite gives the fault NOT_FINITE, and duties of
-        0, as in `_begin_anew`.
+        The mode is RUN. `dt_s` > 0 is the time since the last step. A force over the ceiling opens the gap in either
+        case. The limits are those of the actuator, then those of the watch. A duty that is not finite gives the fault
+        NOT_FINITE, and duties of 0 in mode OFF, as in `_begin_anew`.
         """
         followed = None if self.safety.operating_state is _PAUSED else plan
         try:
@@ -282,8 +291,8 @@ class Stepper:
     def _begin_anew(self) -> Duty:
         """Latch the fault NOT_FINITE, and return duties of 0 in mode OFF.
 
-        What the number may have entered is forgotten: the newest measurement, the watches on homing and motion, the
-        actuator.
+        The device is asked to open, as after any fault. What the number may have entered is forgotten: the newest
+        measurement, the watches on homing and motion, the actuator. The watch on the opening stays.
         """
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()

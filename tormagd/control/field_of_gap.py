@@ -37,7 +37,8 @@ class FieldOfGap:
     def gap_mm(self, field_mT: float) -> float:
         """Return the gap, mm, that gives `field_mT`; it may be no gap of the scene's.
 
-        Raises DomainError where no gap in the law's range does, and for NaN.
+        It is the inverse of `field_mT`, up to rounding. Raises DomainError where no gap in the law's range gives the
+        field, and for NaN.
         """
         if not self._weakest_mT <= field_mT <= self._strongest_mT:
             raise DomainError(

@@ -36,9 +36,9 @@ class Rising:
         self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     def after(self, value: float) -> int:
-        """Return how many numbers are at most `value`, 0..n, as `bisect_right` does.
+        """Return how many numbers are at most `value`, 0..n, as `bisect_right` does: the index of the next greater one.
 
-        Infinity gives one of the ends. Raises DomainError for NaN.
+        Infinity gives one of the ends, 0 or n. Raises DomainError for NaN.
         """
         values = self.values
         stretch = (value - values[0]) * self._per_unit
@@ -64,7 +64,8 @@ def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
     """Return y at `x` as `interpolated`, with the place `after` = `xs.after(x)` already known.
 
-    Nothing is checked. It spares the search where two lists are read at one `x`.
+    `after` is 0 for the first of `ys` and n for the last, whatever `x` is. Nothing is checked: NaN or another `after`
+    gives a wrong number. It spares the search where two lists are read at one `x`.
     """
     if after == 0:
         return ys[0]

@@ -52,10 +52,11 @@ class Measure:
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
         """Measure at `now_s`, one tick after `last_s`: return the new record, and keep it in `measured`.
 
-        A `measurement` of the last number, or of the last device time, gives the last record again. Updates `sight`,
-        and begins or ends a `leap`. A leap ends when the counts come back, when the device says that it is not homed,
-        or with `needs_homing`. Nothing is refused: call it with a measurement that `is_finite` only, as NaN would stay
-        in the filters.
+        Times are the host's, s. A `measurement` of the last number, or whose device time is less than MIN_DT_S after
+        the last or before it, gives the last record again. Updates `sight`, and begins or ends a `leap`. A leap begins
+        only between two measurements of a homed device. It ends when the counts come back, when the device says that it
+        is not homed, or with `needs_homing`. Nothing is refused: call it with a measurement that `is_finite` only, as
+        NaN would stay in the filters.
         """
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
@@ -73,8 +74,8 @@ class Measure:
     def without_position(self, measured: Measured) -> Measured:
         """Return `measured`, the newest record, marked as not homed, and keep it as the newest.
 
-        A record that is not homed is returned as it is. The places stay in the record. The next new measurement brings
-        the device's own word again.
+        A record that is not homed is returned as it is; one that is not the newest would become it. The places stay in
+        the record. The next new measurement brings the device's own word again.
         """
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
@@ -97,9 +98,10 @@ class Measure:
         self.measured = self._first(measurement)
 
     def _first(self, measurement: Measurement) -> Measured:
-        """Return a record of `measurement` at rest, with a handle that has not travelled.
+        """Return a record of `measurement` at rest: speeds and the handle's rates are 0, it has not travelled.
 
-        The handle's way, which the sign of the force is by, counts as positive.
+        The handle's way, which the sign of the force is by, counts as positive; `sliding_mm_s` begins at MOVING_MM_S.
+        The caller keeps the record. Nothing is checked.
         """
         return Measured(
             number=measurement.number,
@@ -120,8 +122,9 @@ class Measure:
         """Return the record of `measurement`, or `last` again where the device has said nothing new.
 
         Nothing new is the same number, or a device time less than MIN_DT_S after that of `last`. `last` is None before
-        the first: the record is one at rest. The force is positive against the handle's way. Speeds are filtered
-        derivatives over the *device's* clock, so that late delivery is not mistaken for slow motion.
+        the first: the record is one at rest. The force is positive against the handle's way. Without a new Sense the
+        handle's motion stays that of `last`. Speeds are filtered derivatives over the *device's* clock, so that late
+        delivery is not mistaken for slow motion. The caller keeps the record.
         """
         if last is None:
             return self._first(measurement)
@@ -152,8 +155,10 @@ class Measure:
     def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
         """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` > 0 after `last`.
 
-        `dt_s` is from the last Sense, on the device's clock. Rates are filtered, with their sign along the way of the
-        handle, or inwards for a finger. A finger's depth is its position, and at least 0 mm. Nothing is kept here.
+        `dt_s` is from the last Sense, on the device's clock. Rates are filtered over RATE_FILTER_S and QUICK_FILTER_S,
+        with their sign along the way of the handle, or inwards for a finger. `sliding_mm_s` follows the rate over
+        SLIDING_MM of travel, so that a handle that stops keeps it. A finger's depth is its position, and at least 0 mm;
+        its `turn` stays. Nothing is kept here, and nothing checked.
         """
         before = last.handle
         travel_mm = position_mm - last.handle_mm

@@ -46,10 +46,10 @@ class Nominal:
     ) -> tuple[ForceCurve, tuple[Outside, ...]]:
         """Return the model's force over the field for the motion to plan for, and what of it is out of range.
 
-        `setpoint` is None without a publisher, `measured` before a measurement. Each `Outside` names a quantity of the
-        motion that the model does not know, the value asked for and the value used. Of two the displacement comes
-        first; none gives an empty tuple, and so does a scene without `has_rate`. Raises DomainError for a motion of
-        NaN.
+        `setpoint` is None without a publisher, or where its motion is not to count; `measured` is None before a
+        measurement. The motion is the contact's `planned`. Each `Outside` names a quantity of it that the model does
+        not know, the value asked for and the value used. Of two the displacement comes first; none gives an empty
+        tuple, and so does a scene without `has_rate`. Raises DomainError for a motion of NaN.
         """
         if not self._has_rate:
             return self.only, ()
@@ -65,8 +65,8 @@ class Nominal:
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
         """Return the model's force over the field at this displacement, mm, and rate, mm/s.
 
-        Each is held within the model's range, infinity too; the displacement of a handle is always the mobilised one.
-        The curve tells the values used. Raises DomainError for NaN.
+        Each is held within the model's range, infinity too. Where a handle slides, any displacement is replaced by the
+        mobilised one. The curve tells the values used, and is a new one for each call. Raises DomainError for NaN.
         """
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

@@ -78,9 +78,10 @@ class TimedSetpoint(Value):
     def asked_N(self, travel: "Travel") -> float:
         """Return the force, N, that is asked for a handle with this `travel`: its `is_pushing` decides, not its rate.
 
-        A handle that withdraws is asked for `withdraw_N`. Where that is None, it is asked for the wall's friction, or
-        for `force_N` without a wall: a brake cannot push the handle back. Neither the preview nor the stamp's age
-        counts here, and nothing is held within what the device gives.
+        One that pushes on is asked for the wall's force at its place, or for `force_N` without a wall. One that
+        withdraws is asked for `withdraw_N`. Where that is None, it is asked for the wall's friction, or for `force_N`
+        without a wall: a brake cannot push the handle back. Neither the preview nor the stamp's age counts here.
+        Nothing is checked, or held within what the device gives.
         """
         if not travel.is_pushing and self.withdraw_N is not None:
             return self.withdraw_N

@@ -59,9 +59,10 @@ class Sight:
         """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind` and `was_blind`.
 
         `is_new` says that a State has come since the last step. The loop is blind after no new State for longer than
-        BLIND_S and BLIND_PERIODS periods; waiting for the very first does not make it blind. A step that comes later
-        than that ends a stall, which is noted, before the first State too. The loop is then blind until a later step
-        finds a new State.
+        BLIND_S and BLIND_PERIODS periods, whichever is more. Waiting for the very first does not make it blind. A step
+        that comes later than that after the last one ends a stall, which is noted, before the first State too. The loop
+        is then blind until a later step finds a new State, even where this one did. Times are not checked: a clock that
+        goes back ends no stall.
         """
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:

@@ -32,9 +32,10 @@ SHARES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 def main(arguments: list[str] | None = None) -> int:
     """Measure this machine for a configuration, print the result as one JSON object, and return the exit code.
 
-    `arguments` None takes those of the process. 0; 1 where stdout cannot be written; 2 for a configuration that is
-    refused, or whose scene does not fit it. Wrong usage raises SystemExit(2), a simulated device that does not arm
-    RuntimeError.
+    `arguments` None takes those of the process. The code is 0, or 1 where stdout cannot be written. It is 2 for a
+    configuration that is refused, or whose scene does not fit it: stderr names why, and stdout stays empty. It takes
+    some seconds. Wrong usage raises SystemExit(2), a simulated device that does not arm RuntimeError. What else
+    `measured` raises passes.
     """
     parser = argparse.ArgumentParser(prog="python -m tormagd.headroom", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's configuration")
@@ -50,11 +51,14 @@ def main(arguments: list[str] | None = None) -> int:
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
     """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer for `timer_s`.
 
-    `core_s` is the virtual time, s, that the core's calls are taken from. The result has `machine_us`, a median,
-    `build`, `step_us`, `plan_us` and `bare`. `bare` has `rate_hz`, `lateness_us`, `missed_share` (0..1) and
-    `not_granted`, what the kernel refused. `step_us`, `plan_us` and `lateness_us` are as `quantiles`. Gives this thread
-    the daemon's scheduling for good. Raises ConfigError where scene and configuration do not fit each other,
-    RuntimeError as `calls`.
+    `timer_s` is in s of real time. `core_s` is the virtual time, s, that the core's calls are taken from; repeating
+    them takes as long again in real time. The result has `machine_us`, a median, `build`, as `build` returns it,
+    `step_us`, `plan_us` and `bare`. `bare` has `rate_hz`, `lateness_us`, `missed_share` (0..1) and `not_granted`, a
+    sentence for each thing that the kernel refused. `step_us`, `plan_us` and `lateness_us` are as `quantiles`.
+
+    Gives this thread the daemon's scheduling, and freezes the collector's objects, for good. Raises ConfigError where
+    scene and configuration do not fit each other, RuntimeError and DomainError as `calls`, OSError where the kernel
+    gives no timer. A `core_s` under half a period gives no calls, and raises IndexError.
     """
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority
@@ -82,9 +86,9 @@ async def _in_real_time(
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Return `mean`, `p50`, `p99`, `p999` and `max` of `values`, in their unit, rounded to 0.1.
+    """Return `mean`, `p50`, `p99`, `p999` and `max` of `values`, in their unit, rounded to 0.1, in this order.
 
-    `values` has one at least: an empty list raises IndexError. Between two values a quantile is linear.
+    `values` has one at least: an empty list raises IndexError. Between two values a quantile is linear. NaN gives NaN.
     """
     return {"mean": round(float(np.mean(values)), 1)} | {
         name: round(float(np.percentile(values, share)), 1) for name, share in SHARES.items()

@@ -39,9 +39,10 @@ class CoreCost(NamedTuple):
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
     """Run `core` for `seconds` of virtual time on a pulse; return the calls of `step` and of `plan`, one each a tick.
 
-    `config` is the core's. The calls act on the stages of a second loop, armed in the same way. So repeat each once, in
-    their order, a tick's plan before its step. Less than half a period gives no calls. Raises RuntimeError if a device
-    does not arm, DomainError as `ClosedLoop.tick`.
+    `config` is the core's, which is not checked. The device is the simulated PLANT, armed before the `seconds`; the
+    pulse is that of SWING_SHARE. The calls act on the stages of a second loop, armed in the same way. So make each
+    once, in their order, a tick's plan before its step. `core` itself does not change. Less than half a period gives no
+    calls. Raises RuntimeError if a device does not arm, DomainError as `ClosedLoop.tick`.
     """
     period_s = 1.0 / config.rates.control_hz
     # stages change in place, so the calls are repeated on those of another loop, which has come as far
@@ -72,9 +73,9 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
     """Repeat one plan and one step a beat until all are done, and return the processor time of each, us.
 
-    There are as many plans as steps, in the order of `calls`. The caller has asked for the thread's scheduling. No call
-    may raise: the event loop would only log the error, and the same beat be repeated for ever. Raises OSError as
-    `beat`.
+    There are as many plans as steps, in the order of `calls`, which is not checked; none give empty lists. What they
+    return is dropped. The caller has asked for the thread's scheduling. No call may raise: the event loop would only
+    log the error, and the same beat be repeated for ever. Freezes the garbage as `beat` does. Raises OSError as `beat`.
     """
     found = CoreCost([], [])
     ended = asyncio.Event()

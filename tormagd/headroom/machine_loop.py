@@ -47,9 +47,9 @@ def work() -> tuple[float, float, int]:
 
 
 def machine_us(repetitions: int = REPETITIONS) -> float:
-    """Return the median processor time of one round, us, of this thread, after one round that does not count.
+    """Return the median processor time of one round of `work`, us, of this thread, after one that does not count.
 
-    `repetitions` is 1 at least; 0 raises ValueError.
+    There are `repetitions` rounds, 1 at least: 0 raises StatisticsError, a ValueError.
     """
     work()
     taken_ns = []

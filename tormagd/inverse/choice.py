@@ -33,8 +33,9 @@ def named(
 ) -> Choice:
     """Return the choice of a search by its name; None stands for its usual grid step, mT, or number of neighbours.
 
-    Raises `DomainError` for an unknown name, and for a setting that the search does not have. The value of a setting is
-    not checked here, but by `build`.
+    `solver` is one of RUNTIME_SOLVERS. A setting that the search lacks is 0 in the choice; `reason` goes in as it is.
+    Raises `DomainError` for an unknown name, and for a setting given that the search does not have. The value of a
+    setting is not checked here, but by `build`; a fraction of a neighbour is cut off.
     """
     require_that(solver in _USUAL, "solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
     settings = []
@@ -45,13 +46,15 @@ def named(
 
 
 def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel, *, rises: bool) -> FieldSolver:
-    """Build the chosen search over a range of fields. `rises`: every curve of the model rises over the whole range.
+    """Build the chosen search over a range of fields, mT, and return it.
 
-    "newton" is a RisingSearch, "nearest" and "torch" are a NearestFieldSearch, "thesis" is RowByRow. "torch" and
-    "thesis" import torch, and hold it to one thread, for the whole process. They ask `model`; the others ask the curve
-    that they are given. Raises `DomainError` where the settings or the name do not fit, the range does not rise, and
-    where torch is needed and not installed. It is raised, too, for "newton" without `rises`, and for "thesis" where the
-    model states no mean error.
+    `rises`: every curve of the model rises over the whole range, which the caller has found out. "newton" is a
+    RisingSearch, "nearest" and "torch" are a NearestFieldSearch, "thesis" is RowByRow with the model's mean error as
+    epsilon. `choice` is one that `named` returned: a name of no search is built as "thesis". "torch" and "thesis"
+    import torch, and hold it to one thread, for the whole process. They ask `model`; the others ask the curve that they
+    are given. Raises `DomainError` where the settings do not fit, the range does not rise, and where torch is needed
+    and not installed. It is raised, too, for "newton" without `rises`, and for "thesis" where the model states no mean
+    error.
     """
     if choice.solver == "newton":
         require_that(rises, "solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")

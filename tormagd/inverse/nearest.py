@@ -19,8 +19,9 @@ Batch = Callable[[ForceCurve], Floats]
 def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[np.float64]:
     """Return fields from least to greatest, mT, evenly spaced by `step_mT` or a little less, both ends included.
 
-    Raises `DomainError` unless both ends are finite and the least is below the greatest. Also for a step that is not
-    above 0, is greater than the range, or makes more than 100,000 points.
+    `field_range_mT` is the least and the greatest field. Raises `DomainError` unless both are finite and the least is
+    below the greatest. Also for a step that is NaN, not above 0, greater than the range, or makes more than
+    MAX_GRID_POINTS.
     """
     low, high = field_range_mT
     require_number("field_range_mT", low)
@@ -62,7 +63,8 @@ class NearestFieldSearch:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """Return the field for `force_N`; of several the one nearest `last_field_mT`, or the least where that is None.
 
-        A force out of reach gets the field that comes nearest; `reach` says so. A last field may lie out of range.
+        A force out of reach gets the field of the grid that comes nearest; `reach` says so. A last field may lie out of
+        range; the answer does not. The predicted force is the curve's there, also where a `batch` searched.
         `iterations` is 2. Keeps nothing from call to call. Raises `DomainError` for numbers that are not finite or too
         large.
         """
@@ -75,8 +77,9 @@ class NearestFieldSearch:
     def _candidates(self, excess_N: Floats, near_mT: float, same_N: float) -> tuple[NDArray[np.float64], Reach]:
         """Return the fields that fit equally well, mT, and whether the force asked is in reach.
 
-        `excess_N` is the predicted less the asked force at each grid point. Forces nearer than `same_N` are equal.
-        Roots between grid points are among the fields; the grid point nearest `near_mT` is, where it fits as well.
+        `excess_N` is the predicted less the asked force at each grid point. Forces within `same_N` of each other are
+        equal. Roots between grid points are among the fields; the grid point nearest `near_mT` is, where it fits as
+        well. The fields come in no order, and may repeat; there is one at least.
         """
         fields = self._fields_mT
         below = excess_N < 0

@@ -39,10 +39,12 @@ class RisingSearch:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """Return the field for `force_N`. The search begins at `last_field_mT`, or at the least field where it is None.
 
-        A last field out of range counts as the end that it lies beyond. A force out of reach gets the nearer end of the
-        range; `reach` says so. `iterations` is 1 to a little over MAX_EVALUATIONS. Keeps nothing from call to call. A
-        curve that falls somewhere is not noticed: any of its roots, or an end, may be the answer. Raises `DomainError`
-        for numbers that are not finite or too large.
+        The field is the root to ACCURACY_MT, and the predicted force is the curve's there. A last field out of range
+        counts as the end that it lies beyond. A force out of reach gets the nearer end of the range; `reach` says so.
+        `iterations` is 1 to a little over MAX_EVALUATIONS. Where these do not suffice, the field where the search
+        stands is the answer, and `reach` is INSIDE. Keeps nothing from call to call. A curve that falls somewhere is
+        not noticed: any of its roots, or an end, may be the answer. Raises `DomainError` for numbers that are not
+        finite or too large.
         """
         low, high = self._low_mT, self._high_mT
         span = high - low

@@ -19,8 +19,9 @@ torch.set_num_threads(1)  # a second thread costs more than it saves at these si
 def batch(model: ForceModel, fields_mT: Floats) -> Batch:
     """Return a function from a curve to the forces of `model`, N, at all `fields_mT` (n), in one pass in torch.
 
-    Of the curve it takes displacement, rate and share of iron only, unchecked. The weights and fields are copied: later
-    changes do not count. Two threads must not call it at once.
+    The forces (n) are in the order of the fields, in an array of their own for each call. Of the curve it takes
+    displacement, rate and share of iron only, unchecked: they are not held within what the model knows. The weights and
+    fields are copied: later changes do not count. Two threads must not call it at once.
     """
     network, rows = to_network(model), torch.zeros((len(fields_mT), len(FEATURES)), dtype=torch.float64)
     rows[:, FIELD] = torch.from_numpy(fields_mT)
@@ -39,7 +40,8 @@ def batch(model: ForceModel, fields_mT: Floats) -> Batch:
 def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
     """Return a function from a curve and one field, mT, to the force of `model`, N: a pass in torch for one row.
 
-    Of the curve it takes displacement, rate and share of iron only. Nothing is checked. The weights are copied.
+    Of the curve it takes displacement, rate and share of iron only. Nothing is checked, or held within what the model
+    knows: NaN gives NaN. The weights are copied: later changes of the model do not count.
     """
     network = to_network(model)
 
@@ -69,9 +71,10 @@ class RowByRow:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest.
 
-        `reach` is INSIDE where a row is within epsilon, or rows lie on both sides. It is BELOW where all rows give more
-        than `force_N`, ABOVE where none does. `iterations` counts the rows evaluated. `last_field_mT` may be None; it
-        is checked and not used. Raises `DomainError` for numbers that are not finite or too large.
+        Of the rows up to there, the nearest in force is the answer; of two alike, the first. `reach` is INSIDE where a
+        row is within epsilon, or rows lie on both sides. It is BELOW where all rows give more than `force_N`, ABOVE
+        where none does. `iterations` counts the rows evaluated. `last_field_mT` may be None; it is checked and not
+        used. Raises `DomainError` for numbers that are not finite or too large.
         """
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0

@@ -79,7 +79,7 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
     """Check the arguments of a search; return the field that its answer should be near, mT.
 
     That is the last field, or `least_mT`, the opener gap, where it is None. It is not held within the search's range.
-    Raises `DomainError` naming the field or the force that is not finite, or too large.
+    Raises `DomainError` naming `last_field_mT` or `force_N` where it is not finite, or beyond LARGEST.
     """
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):
@@ -101,7 +101,8 @@ def answer(
 ) -> FieldSolution:
     """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence.
 
-    The confidence counts how far the two forces are apart. Nothing is checked, and the curve is not evaluated.
+    The confidence is the curve's at `field_mT`, 0..1, less the further the two forces are apart. `iterations` and
+    `reach` go in as they are. Nothing is checked, and the curve's force is not evaluated.
     """
     trust = curve.confidence(field_mT, force_N - predicted_N)
     return FieldSolution(field_mT, predicted_N, trust, iterations, reach)

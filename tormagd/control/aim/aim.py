@@ -96,9 +96,10 @@ class Aim:
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open, no setpoint, the limit NO_SETPOINT and this `number`.
 
-        Call it before the first `update`. The element's field there lags `lag_mT` behind the gap's: it becomes
-        `element_mT`, and the newest `answer`. A `question` stays. Raises DomainError where the open gap is none of the
-        field law's.
+        Call it before the first `update`, whose plan has the next number. The plan's force is the portrait's least, its
+        confidence 1, its `predicted_N` None. The element's field there lags `lag_mT` behind the gap's: it becomes
+        `element_mT`, and the newest `answer`, as of `now_s`. A `question` stays. Raises DomainError where the open gap
+        is none of the field law's.
         """
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
@@ -117,11 +118,14 @@ class Aim:
     ) -> Plan:
         """Return the next plan, for the force in `ask` and the device in `belief`.
 
-        The plan's gap is never less than `least_mm`; where that holds it open, the plan has the limit CEILING.
-        `setpoint` is the one behind `ask`, None without a publisher; `measured` is None while the device is silent.
-        `memory` gives the lag of the element's field. Updates `number` and `element_mT`, and `question` where a search
-        runs beside the plans. Raises DomainError where no gap gives the field, a number is not finite, or the newest
-        answer is older than OLDEST_ANSWER_S. The stage may then be half updated: begin anew.
+        The plan's gap is within the scene's, and never less than `least_mm`; where that holds it open, the plan has the
+        limit CEILING. `setpoint` is the one behind `ask`, None without a publisher. The motion that it states counts
+        only while `ask.is_meant`. `measured` is None while the device is silent. `memory` gives the lag of the
+        element's field, and does not change. Updates `number` and `element_mT`, and `question` where a search runs
+        beside the plans.
+
+        Raises DomainError where no gap gives the field, a number is not finite, or the newest answer is older than
+        OLDEST_ANSWER_S. The stage may then be half updated: `begin` anew.
         """
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
@@ -143,17 +147,19 @@ class Aim:
     def answer_to(self, question: Question) -> Answer:
         """Search the field for `question`, for a search that runs beside the plans, and return the answer.
 
-        The answer has the question's time. Changes nothing: the answer is not kept, and may be searched for in another
-        process. Raises DomainError for a number that is not finite or too large.
+        The answer has the question's time. Its field is the model's, not yet held near the force law. The motion asked
+        for is held within the model's range. Changes nothing: the answer is not kept, and may be searched for in
+        another process. Raises DomainError for a number that is not finite or too large.
         """
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        """Return the field for the model's force `wanted_N`; of several the one nearest `element_mT`.
+        """Return the field for the model's force `wanted_N` along `curve`; of several the one nearest `element_mT`.
 
-        Where the search runs beside the plans, note the `question` for it, and return its newest answer. Raises
-        DomainError for an answer older than OLDEST_ANSWER_S, and for a number that is not finite or too large.
+        Where the search runs beside the plans, note the `question` for it, and return its newest answer, which may be
+        one to an earlier question. Raises DomainError for an answer older than OLDEST_ANSWER_S at `now_s`; the question
+        is noted before. Also raises it where the plans search, for a number that is not finite or too large.
         """
         if not self._is_beside:
             return self._search.solve(curve, wanted_N, self.element_mT)
@@ -179,7 +185,10 @@ class Aim:
         """Return the record of the plan to `gap_mm` at `now_s`, with the gap's motion ahead on the path of `ask`.
 
         `setpoint` is the one behind `ask`, None without a publisher. `min_mm` is the least gap that is safe, `field_mT`
-        the field looked for, with the search's `confidence`.
+        the gap's field that is looked for, with the search's `confidence`. `limits` and `outside` go in as they are.
+        The record's `trim` is the asked force over the model's for a device at speed. Where the model's is not above 0,
+        it is that device's scale. The `stamp_s` is -inf unless the setpoint is followed. Changes nothing. Raises
+        DomainError for NaN in the path.
         """
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
@@ -236,8 +245,9 @@ class Aim:
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
         """Return the gap's speed, mm/s, and acceleration, mm/s^2, at the beginning of the path `path_N` (7) of forces.
 
-        They are those of the parabola nearest to the path along the portrait, opening positive. Both are held within
-        what the configuration lets the gap do. A path out of reach stands at the portrait's end, without motion. Raises
+        `path_N` are the device's forces at PATH_S. The motion is that of the parabola nearest in squares to their gaps
+        in the portrait, opening positive. It begins at the first gap. Speed and acceleration are held within what the
+        configuration lets the gap do. A path out of reach stands at the portrait's end, without motion. Raises
         DomainError for NaN.
         """
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain

@@ -53,7 +53,8 @@ class Portrait:
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
         """Return the gap, mm, of `force_N`, as `gap_mm_at`, and |dF/dgap|, N/mm, at the next point of more force.
 
-        Beyond the last point the slope is the last point's. Raises DomainError for NaN.
+        The slope is that point's own, not interpolated as by `slope_at_N_mm`; beyond the last point it is the last
+        point's. Raises DomainError for NaN.
         """
         after = self._rising_N.after(force_N)
         gap_mm = interpolated_before(after, force_N, self._rising_N, self.gap_mm)
@@ -74,8 +75,8 @@ class Portrait:
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """Return the rate of force, N/s, that the speed `gap_speed_mm_s` makes at the gap that gives `force_N`.
 
-        It has the sign of the speed, though a gap that opens loses force. Where no gap gives `force_N`, the nearer end
-        counts. Raises DomainError for a force of NaN.
+        It has the sign of the speed, though a gap that opens loses force: the caller minds the sign. Where no gap gives
+        `force_N`, the slope at the nearer end counts. Raises DomainError for a force of NaN; the speed is not checked.
         """
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
@@ -90,11 +91,12 @@ class PortraitSearch:
         self._field: Final = field
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`, as `FieldSolver.solve` does.
+        """Return the field for `force_N`: that of the gap which gives it in the portrait.
 
-        `last_field_mT`, None without one, is only checked. A force in reach has confidence 1, and is itself the
-        predicted force: `curve` is not asked. For one out of reach the field is that of the nearer end, with the
-        confidence that `curve` gives there. `iterations` is 1. Raises DomainError for a number that is not finite.
+        `last_field_mT`, None without one, is only checked: a portrait has one gap for a force. A force in reach has
+        confidence 1, and is itself the predicted force: `curve` is not asked. For one out of reach field and predicted
+        force are those of the nearer end, as `reach` tells. Its confidence is the one that `curve` gives there.
+        `iterations` is 1. Raises DomainError for a number that is not finite or too large.
         """
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
@@ -131,8 +133,9 @@ def law_beside(
 ) -> LawOfField:
     """Return the force law at the gaps of the portrait `shown`, scaled to the portrait's force.
 
-    `law` and `field` are of one insert, `elastomer`'s. The scale is the median ratio of the portrait's force to the
-    law's. Raises DomainError where the gaps leave the law's domain.
+    `law` is the field law of the insert that `field` and `elastomer` are of, with its `geometry`; that they belong
+    together is not checked. The scale is the median ratio of the portrait's force to the law's. Raises DomainError
+    where the gaps leave the domain of either, and where a scaled force is not finite.
     """
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
@@ -143,7 +146,8 @@ def law_beside(
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
     """Return the portrait that the model's `curve` predicts, at GRID gaps over `gap_range_mm`, closed to open.
 
-    The closed gap has to be below the open one, and the force has to rise with the field over them: neither is checked.
+    `gap_range_mm` is the closed and the open gap, mm, in this order; the portrait's lists begin with the open one. The
+    closed gap has to be below the open one, and the force has to rise with the field over them: neither is checked.
     Raises DomainError where the field law ends, and for a force that is not finite.
     """
     gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)

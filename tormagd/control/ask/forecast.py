@@ -66,8 +66,9 @@ _LONGEST: Final = BEAT_DELAYS[-1]
 def embedding(delays: tuple[int, ...]) -> Array:
     """Return the places of all stretches in a full history, as negative indices from its end.
 
-    `delays` are TAPS rising whole numbers, at most BEAT_DELAYS' last. Shape (TAPS + 1 + HORIZON, n), whole numbers. A
-    column holds one stretch: the points at `delays`, its end, and the points that followed. The first column is the
+    `delays` are TAPS rising whole numbers, at most BEAT_DELAYS' last; they are not checked. The result has the shape
+    (TAPS + 1 + HORIZON, n), whole numbers. A column holds one stretch: the points at `delays` before its end, the
+    nearest first, then its end, then the points that followed. Columns go back in time by STRIDE. The first one is the
     newest stretch, after which its own end is repeated.
     """
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
@@ -137,7 +138,8 @@ class Forecast:
     def trust(self) -> float:
         """Return how far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast.
 
-        The trust is the skill score of LONG_S times (1 + the score of SHORT_S), both factors held within 0..1.
+        At 1 the forecast alone counts. The trust is the skill score of LONG_S times (1 + the score of SHORT_S), both
+        factors held within 0..1. Above 0 `forces_N` may be called.
         """
         if not self.changes_N:
             return 0.0
@@ -151,9 +153,11 @@ class Forecast:
     def update(self, stamp_s: float, force_N: float) -> None:
         """Take one setpoint, judge what was forecast for its time, and remember it on the grid. Makes no forecast.
 
-        `stamp_s` and `force_N` are finite; they are not checked. A stamp up to GRID_S before the newest counts as the
-        newest. A force with the newest stamp replaces the newest force. An older stamp, or a pause of more than
-        MAX_STEP_S, begins anew. A forecast stays until the next, as far as it reaches.
+        `stamp_s` and `force_N` are finite; they are not checked. A stamp less than GRID_S before the newest counts as
+        the newest. A force with the newest stamp replaces the newest force, and adds no point. An older stamp, or a
+        pause of more than MAX_STEP_S, begins anew with this setpoint, as the first does: nothing learned, no skill.
+        Between two setpoints the grid's forces are linear. A forecast stays until the next `foresee`, as far as it
+        reaches.
         """
         if -GRID_S < stamp_s - self.stamp_s < 0.0:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
@@ -169,10 +173,10 @@ class Forecast:
     def foresee(self, slope_N_s: float) -> bool:
         """Make a forecast from the newest point of the grid, and return whether one was due.
 
-        A forecast is due after every EVERY points, once the history has MIN_HISTORY points; else nothing changes. It is
-        empty where the history has no stretch like the newest; the skill of SHORT_S is then lost. So True does not say
-        that there is a forecast: `trust` does. Its guess, and that of the slope `slope_N_s`, are noted; `update` judges
-        them by what comes.
+        A forecast is due after every EVERY points, once the history has MIN_HISTORY points; else nothing changes. It
+        replaces the one before. It is empty where the history has no stretch like the newest; the skill of SHORT_S is
+        then lost. So True does not say that there is a forecast: `trust` does. Its guess for the point JUDGED ahead is
+        noted, with that of the setpoints' slope `slope_N_s`; `update` judges both by what comes.
         """
         if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
             return False
@@ -193,10 +197,11 @@ class Forecast:
         return True
 
     def forces_N(self, begins_after_s: float, after_s: list[float]) -> list[float]:
-        """Return the forecast forces (n) at `begins_after_s` + `after_s` (n), s, after the newest setpoint's stamp.
+        """Return the forecast forces (n), N, at `begins_after_s` + `after_s` (n), s, after the newest setpoint's stamp.
 
-        The times are >= 0; no times give no forces. Beyond the forecast's end its last force holds. Call it only while
-        `trust` is above 0: an empty forecast raises IndexError. Raises DomainError for a time of NaN.
+        The times are >= 0, which is not checked; no times give no forces. At the stamp itself the force is the newest
+        setpoint's. Beyond the forecast's end its last force holds. Nothing is held within what a device gives. Call it
+        only while `trust` is above 0: an empty forecast raises IndexError. Raises DomainError for a time of NaN.
         """
         changes = self.changes_N
         # the forecast is shifted through the newest setpoint, which may have come after the point it was made from
@@ -213,8 +218,10 @@ class Forecast:
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
         """Add `count` >= 1 points to the grid, up to a setpoint later than the newest, and judge the guesses for them.
 
-        Between the newest setpoint and this one, at `stamp_s`, the force is taken as linear. The caller keeps the
-        setpoint itself. A forecast that reaches at most one point beyond the new setpoint is dropped.
+        Between the newest setpoint and this one, at `stamp_s`, the force is taken as linear. The oldest points beyond
+        HISTORY go. Guesses move on by `count`, those for the new points are judged and gone. The caller keeps the
+        setpoint itself, and has checked that it is later. A forecast that reaches at most one point beyond it is
+        dropped.
         """
         spacing_s = stamp_s - self.stamp_s
         times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]
@@ -231,8 +238,8 @@ class Forecast:
             self.changes_N = []
 
     def _judge(self, guess: Guess, came_N: float) -> None:
-        """Update the skills and both embeddings' mean squared errors with `came_N`, what came at the point of one
-        guess."""
+        """Update both skills and both embeddings' mean squared errors by one guess and `came_N`, the force at its
+        point."""
         error_N, slope_error_N = guess.forecast_N - came_N, guess.slope_N - came_N
         self.long = self.long.after(error_N, slope_error_N, _LONG_SHARE)
         self.short = self.short.after(error_N, slope_error_N, _SHORT_SHARE)
@@ -243,7 +250,8 @@ class Forecast:
     def _guess(self, rise: list[float], beat: list[float], changes: list[float], slope_N_s: float) -> Guess:
         """Return the force at the point JUDGED after the grid's newest, by each embedding, their mixture and the slope.
 
-        `rise`, `beat` and `changes` are changes of force from that newest point, N.
+        `rise`, `beat` and `changes` are changes of force from that newest point, N, with more than JUDGED numbers each.
+        Nothing is kept here.
         """
         since_s = self.stamp_s - self.time_s
         return Guess(
@@ -257,8 +265,8 @@ class Forecast:
 def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
     """Return the force, N, JUDGED points ahead, along changes from a point `since_s` before the newest force.
 
-    `changes_N` has more than JUDGED numbers, the first 0. Over `since_s` the force counts as having changed as to the
-    first point ahead.
+    `changes_N` has more than JUDGED numbers, the first 0, a grid step apart. Of the changes, what they say of `since_s`
+    has come already, as steeply as to the first point ahead: it is taken off.
     """
     return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
 
@@ -266,9 +274,10 @@ def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
 def _search(history: Array) -> list[tuple[list[float], float]]:
     """Forecast with each embedding, and return for each the changes of force, N, and a distance, N².
 
-    `history` holds the forces on the grid, MIN_HISTORY to HISTORY of them, the newest last. The first result is that of
-    RISE_DELAYS. The changes (1 + HORIZON) go from the newest point of the grid to itself and the next HORIZON points.
-    The list is empty where no stretch is like the newest, or where its leverage is over MAX_LEVERAGE. The distance is
+    `history` holds the forces on the grid, MIN_HISTORY to HISTORY of them, the newest last; it is not changed. There
+    are two results, that of RISE_DELAYS first. The changes (1 + HORIZON) go from the newest point of the grid to itself
+    and the next HORIZON points, so the first is 0. The list is empty where every stretch differs from the newest by
+    more than UNLIKE_N, or where its leverage is over MAX_LEVERAGE. The distance is always given. It is
     that of the stretch most like the newest: the mean square of a point, at least SAME_N's.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
@@ -291,7 +300,7 @@ def _search(history: Array) -> list[tuple[list[float], float]]:
 
 
 def _constants(rows: list[list[float]]) -> list[float]:
-    """Return the regressions' constants (1 + HORIZON), by elimination: 0, then one for each point that followed.
+    """Return the regressions' constants (1 + HORIZON), N, by elimination: 0, then one for each point that followed.
 
     `rows` (TAPS + 1) are weighted sums of products, one row for each regressor, with 1 last; they are not changed.
     Columns are the regressors, then the HORIZON points that followed. A newest stretch of more leverage than

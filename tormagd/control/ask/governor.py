@@ -119,7 +119,12 @@ class Governor:
         `setpoint` is None without a publisher. `device` is what is known of the device's strength, `travel` the
         handle's motion. What is known ahead is looked at `lag_s` later, the carriages' lag. `held_N` is the force of a
         gap that follows no plan; None where it follows plans. A valid setpoint leaves the force at `held_N`, and is
-        reached along a ramp once that is None.
+        reached along a ramp once that is None. A clock that goes back counts as one that stands.
+
+        A setpoint whose age is over `valid_for_s` is too old: the limit STALE. Without one it is NO_SETPOINT. RANGE,
+        STANDBY, F_MIN and F_MAX say what holds a valid one. RATE says that the gap, or a ramp between walls, is behind,
+        and TAKEOVER that a ramp leads to a publisher's forces. The setpoint's own limits are passed on. The result's
+        `is_meant` tells whether a valid setpoint is followed, `asked_N` what it asks for.
 
         A setpoint that jumps is followed at once, within the scene's and the device's bounds. Three things go at the
         scene's release rate. Without a valid setpoint, the force decays to the device's least. A new publisher's
@@ -127,7 +132,7 @@ class Governor:
         place of a wall.
 
         Raises DomainError for a number that is not finite or beyond LARGEST, and for a preview without `preview_dt_s` >
-        0.
+        0. State may then be half advanced: `begin` anew.
         """
         lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
         dt_s = max(now_s - self.time_s, 0.0)
@@ -181,15 +186,19 @@ class Governor:
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def foresee(self) -> bool:
-        """Make a forecast for the next plans, if one is due, and return whether it was. Call between plans."""
+        """Make a forecast for the next plans, if one is due, and return whether it was. Call between plans.
+
+        Without the term forecast none is due.
+        """
         return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def _note_setpoint(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
         """Update the setpoints' slope, newest force, stamp and holder.
 
-        A new holder begins a ramp, without slope or forecast. The slope becomes 0 after a pause above MAX_STEP_S,
-        against a wall, or without the term forecast. A stamp that is not newer leaves it. It is held to what the gap's
-        speed gives at `force_N`.
+        `allowed_N` is the setpoint's force within what the scene allows, `force_N` the one within the device's reach. A
+        new holder begins a ramp, without slope or forecast. The slope becomes 0 after a pause above MAX_STEP_S, against
+        a wall, or without the term forecast. A stamp that is not newer leaves it. It is filtered, and held to what the
+        gap's speed gives at `force_N`.
         """
         spacing_s = setpoint.stamp_s - self.stamp_s
         if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
@@ -206,8 +215,9 @@ class Governor:
     def _blended(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, dt_s: float) -> float:
         """Return `allowed_N`, or a force on the ramp to it where another wall, or none, has replaced a wall.
 
-        The ramp goes at the release rate, besides what the handle's motion changes. A new holder and a handle that
-        withdraws have none. Updates `blend_N`, `law_N`, `law_mm` and `was_pushing`.
+        `allowed_N` is what the setpoint asks for, within what the scene allows. The ramp goes at the release rate,
+        besides what the handle's motion changes. A new holder and a handle that withdraws have none. Updates `blend_N`,
+        `law_N`, `law_mm` and `was_pushing`; call it before `_note_setpoint`, whose last holder and force it reads.
         """
         wall, place_mm = setpoint.wall, travel.place_mm
         before_N = self.law_N
@@ -237,8 +247,9 @@ class Governor:
     ) -> list[float]:
         """Return the forces (7) at PATH_S on the best path for a handle that pushes against `wall` at its present rate.
 
-        The gap closes early by at most EARLY_N over the force at each moment, and passes the wall's place at speed.
-        Updates `sent_N` and `expected_N`.
+        The forces are within `bounds`, with what is left of a ramp between walls, `blend_N`, added. The gap closes
+        early by at most EARLY_N over the force at each moment, and passes the wall's place at speed. Updates `sent_N`
+        and `expected_N`.
         """
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
         begins_s = lag_s + SPEEDING_UP_S
@@ -256,8 +267,9 @@ class Governor:
     def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
         """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1.
 
-        Without the term forecast nothing is given, and 0 returned. 0 is also returned for a setpoint that was meant to
-        be followed `soon_s` > MAX_STEP_S ago.
+        `allowed_N` is the setpoint's force within what the scene allows, `stamp_s` its stamp. Without the term forecast
+        nothing is given, and 0 returned. 0 is also returned for a setpoint that was meant to be followed `soon_s` >
+        MAX_STEP_S ago; the forecast gets it all the same.
         """
         if not self._has_forecast:
             return 0.0
@@ -277,9 +289,10 @@ class Governor:
     ) -> list[float]:
         """Return the forces (7) at PATH_S on the best path for the setpoint's preview.
 
-        Now is `soon_s` after its stamp and playout. With the term forecast and a preview shorter than TIMES_S, the
-        forecast goes on from the preview's end. The preview's mean slope then becomes `slope_N_s`. Otherwise the
-        forecast forgets. Updates `sent_N` and `expected_N`.
+        They are within `bounds`. Now is `soon_s` after its stamp and playout. With the term forecast and a preview
+        shorter than TIMES_S, the preview's last force goes to the forecast, which goes on from there. The preview's
+        mean slope then becomes `slope_N_s`. Otherwise the forecast forgets. Updates `sent_N` and `expected_N`. Raises
+        DomainError for a force beyond LARGEST. Call it only for a setpoint with a preview.
         """
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
@@ -348,10 +361,10 @@ class Governor:
         return path_N[: len(PATH_S)]
 
     def _left_from(self, force_N: float) -> tuple[float, float]:
-        """Return the force at the last plan, and the force that the carriages were sent to then.
+        """Return two forces, N: that at the last plan, and that which the carriages were sent to then.
 
-        Where no path was followed, both are the force at the last plan. During a ramp both are `force_N`, what the ramp
-        leads to.
+        Where no path was followed, both are the force at the last plan. During a ramp to a publisher's forces both are
+        `force_N`, what the ramp leads to. Changes nothing.
         """
         # a ramp leads to what is asked, whatever the gap can make of it
         from_N = force_N if self.is_passing else self.asked_N
@@ -360,9 +373,11 @@ class Governor:
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
     ) -> tuple[float, tuple[Limit, ...]]:
-        """Return `allowed_N` held to what the device gives (F_MIN, F_MAX), with the limits in force.
+        """Return `allowed_N` held to what the device gives, `lowest_N` to `highest_N`, and the limits in force.
 
-        `asked_N` adds RANGE where the scene does not allow it, and STANDBY where the scene waits at a greater force.
+        F_MIN or F_MAX tells that the device holds it; both never come. `asked_N` is what the setpoint itself asks for.
+        It adds RANGE where the scene does not allow it, and STANDBY where the scene waits at a greater force. An empty
+        tuple: nothing holds it.
         """
         limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._allowed[1] else (Limit.RANGE,)
         if asked_N < self._allowed[0] and self._least_N < self._allowed[0]:
@@ -376,8 +391,9 @@ class Governor:
     def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
         """Return a force that falls to `lowest_N` at the release rate, for no valid setpoint, and forget the last one.
 
-        The force above `lowest_N` never grows, even where a device is found to be weaker. The next setpoint is reached
-        along a ramp. `age_s`, None without a setpoint, and `limits` only go into the result.
+        `lowest_N` is the device's least force. The force above it never grows, even where a device is found to be
+        weaker; all forces ahead are that of now. The next setpoint is reached along a ramp. `age_s`, None without a
+        setpoint, and `limits` only go into the result.
         """
         # where a device turns out weaker, the force above its least does not grow
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
@@ -394,10 +410,11 @@ class Governor:
 
 
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
-    """Raise DomainError where a number of `setpoint` or its age is not finite or beyond LARGEST.
+    """Raise DomainError, naming the field, where a number of `setpoint` or its age is not finite or beyond LARGEST.
 
-    Also raise it for a preview whose `preview_dt_s` is not above 0. Each force of a preview is looked at only where
-    their sum is not finite or beyond LARGEST.
+    None passes. Also raise it for a preview whose `preview_dt_s` is not above 0; without a preview that is not looked
+    at. Each force of a preview is looked at only where their sum is not finite or beyond LARGEST: great forces that
+    cancel out pass.
     """
     if not (
         -_LARGEST <= age_s <= _LARGEST
@@ -427,8 +444,10 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
 def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:
     """Return the forces of a preview, N, held to `bounds`, at the times TIMES_S from `begins_s` >= 0 after its stamp.
 
-    There are MIN_TIMES or more, as far as the preview goes. Past its end, forces go on along its mean slope for a
-    moment, mixed with a trusted forecast. Raises DomainError for a force beyond LARGEST.
+    There are MIN_TIMES or more, as far as the preview goes, or HORIZON_S further with a trusted forecast. Between the
+    setpoint's force and those of its preview they are linear. Past its end, forces go on along its mean slope for
+    AHEAD_S at most, mixed with a trusted forecast. Raises DomainError for a force beyond LARGEST. A setpoint without a
+    preview raises IndexError.
     """
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]

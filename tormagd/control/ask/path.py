@@ -68,10 +68,13 @@ class Path:
         force to send. The gap follows its carriages with the time constant SPEEDING_UP_S + `lag_s`, and the forces (7)
         are those of the gap. `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`.
 
-        With `most_N` None the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7)
-        opens the path where it would give more. Its pairs are the most at that time, and the most when the gap gets
-        there. The carriages may set out to the second by as much as the gap lags at top speed. `wanted_N` has to be of
-        so much later already.
+        With `most_N` None the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7),
+        N, opens the path where it would give more; `wanted_N` has to be of a time constant later already. Its pairs are
+        the most at that time, and the most when the gap gets there. The carriages may set out to the second by as much
+        as the gap lags at top speed.
+
+        Forces are the device's; those returned are within what the portrait's gaps give. Neither lengths nor `dt_s` >=
+        0 are checked.
         """
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
@@ -112,7 +115,8 @@ def nearest_path_mm(
     """Return the first `count` gaps of the path that misses `wanted_mm` (n) least, in squares times `weights` (n) > 0.
 
     The points are the first n >= `count` of the rising `times_s`. The path goes no faster than `speed_mm_s`, and was at
-    `start_mm` `elapsed_s` before the first point.
+    `start_mm` `elapsed_s` before the first point. It is chosen for all n points, though not all are returned. The gaps
+    are in mm, and not held within a device's. Nothing is checked, and the arguments stay as they are.
     """
     best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
     path_mm: list[float] = []

@@ -25,8 +25,8 @@ class Skill(Value):
     def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
         """Return the skill with both guesses' newest errors, N, which count for `share` of the means, 0..1.
 
-        The sign of an error does not matter; `error_N` is this guess's. Nothing is checked: NaN stays in all skills
-        that follow.
+        `error_N` is this guess's. Both errors have the same sense, guess less truth or truth less guess. Nothing is
+        checked: NaN stays in all skills that follow.
         """
         gained = other_error_N * other_error_N - error_N * error_N
         difference_N = other_error_N - error_N

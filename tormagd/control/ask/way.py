@@ -22,7 +22,7 @@ SLID_MM: Final = 0.5
 def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
     """Return the handle's place, mm, and rate, mm/s, both positive pushing on. `push_sign` is 1 or -1, as for `Way`.
 
-    The rate is the quick one, `quick_mm_s`. Neither is checked.
+    The place counts from the encoder's zero. The rate is the quick one, `quick_mm_s`. Nothing is checked.
     """
     handle = measured.handle
     return push_sign * measured.handle_mm, push_sign * handle.turn.direction * handle.quick_mm_s

@@ -81,9 +81,10 @@ class Actuator:
     ) -> Drive:
         """Return the duties of one tick, `dt_s` > 0 after the last. Call `begin` first, and again after `stop`.
 
-        `measurement` is the device's newest, `measured` what is made of it. `plan` None holds the gap. With or without
-        one it opens while the force is over the ceiling, `is_over`. The gap is never to be closer than the plan's
-        least. Raises DomainError for a duty that is not finite: call `forget` then.
+        `measurement` is the device's newest, `measured` what is made of it; `now_s` is on the clock of `plan.time_s`.
+        `plan` None holds the gap. With or without one it opens while the force is over the ceiling, `is_over`. The gap
+        is never to be closer than the plan's least. Updates `reference`, `acted`, and may learn `acceleration_scale`.
+        Raises DomainError for a duty that is not finite: call `forget` then.
         """
         raise NotImplementedError
 

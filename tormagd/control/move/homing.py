@@ -80,7 +80,8 @@ class Homing:
     def update(self, now_s: float, measurement: Measurement) -> None:
         """Take one look at the device, and set `faults`: WRONG_DIRECTION, HOMING, OVER_FORCE, STATUS_STALE, or none.
 
-        A device that neither homes nor has just stopped homing has none.
+        At most one is set, for this look only. The first look at a homing, and a device that neither homes nor has just
+        stopped homing, have none. `now_s` is on the clock of `measurement.reported_s`.
         """
         self.faults = ()
         if measurement.mode is not _HOMING:
@@ -92,9 +93,9 @@ class Homing:
             self._follow(now_s, measurement)
 
     def _begin(self, now_s: float, measurement: Measurement) -> None:
-        """Begin with a device that was found homing: note its places, its switches, and the force it may show.
+        """Begin with a device that was found homing: note the time, its places and switches, and the force it may show.
 
-        That force is the ceiling, or RISES times what the sensor shows now where this is more.
+        That force is the ceiling, or RISES times what the sensor shows now, without its sign, where this is more.
         """
         self.is_running, self.began_s, self.time_s, self.over_s = True, now_s, now_s, 0.0
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
@@ -105,8 +106,9 @@ class Homing:
     def _follow(self, now_s: float, measurement: Measurement) -> None:
         """Watch a homing that goes on, and set the first fault that shows; else leave `faults`.
 
-        In this order: `_went_back` over BACKS_OFF_MM, HOMING after LONGEST_S, OVER_FORCE after OVER_S of too much
-        force, STATUS_STALE.
+        In this order: `_went_back` over BACKS_OFF_MM, HOMING after LONGEST_S, OVER_FORCE, STATUS_STALE. OVER_FORCE
+        shows after over OVER_S of too much force without a break, STATUS_STALE for a Status older than STATUS_S. Notes
+        places, switches and time.
         """
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
@@ -126,8 +128,9 @@ class Homing:
     def _end(self, now_s: float, measurement: Measurement) -> None:
         """Judge a homing that has ended, and set `faults`; it is done, given up, or ended by a request to open.
 
-        A homed device that has not shown both open switches has the fault HOMING. One that latched after a carriage
-        went over WENT_BACK_MM towards closed has that of `_went_back`. Others have none.
+        A homed device that has not shown both open switches, now or before, has the fault HOMING. One that
+        is latched and not homed has that of `_went_back`, where a carriage went over WENT_BACK_MM towards closed. The
+        places are those of the look before. Others have none.
         """
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN
@@ -141,7 +144,8 @@ class Homing:
         """Return the fault of a carriage that has gone over `most_mm` towards closed from where it was most open.
 
         HOMING where its open switch is closed there: the device believes a switch that is stuck, or another's. Else
-        WRONG_DIRECTION. The way counts from the beginning, and again from when the device sets its zero.
+        WRONG_DIRECTION. That a carriage has gone so far is the caller's to know. The way counts from the beginning, and
+        again from when the device sets its zero.
         """
         left_mm, right_mm = self.went_back_mm
         is_left_stuck = left_mm > most_mm and measurement.is_left_open

@@ -37,7 +37,8 @@ _FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED
 def is_open(measurement: Measurement, is_placed: bool) -> bool:
     """Tell whether the gap is open.
 
-    Where `is_placed`, it is with both carriages within OPEN_MM of their open switches; else with both switches closed.
+    With `is_placed` the carriages' places are known: both have to be within OPEN_MM of their open switches or beyond,
+    whatever the contacts say. Without it, the contacts of both open switches have to be closed.
     """
     if is_placed:
         return min(measurement.left_mm, measurement.right_mm) >= -OPEN_MM
@@ -99,9 +100,11 @@ class Opening:
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
         """Take one look at a device that is not driven, and set `faults` to NOT_OPENING or to none.
 
-        With `is_placed` the carriages' places are known, but with `is_blind` not at present. `safety` gives the newest
-        request. After a fault the next look clears `faults`, and the device is not judged before another request. A
-        device that homes is not judged either.
+        With `is_placed` the carriages' places are known, but with `is_blind` not at present: then, and without
+        `is_placed`, the device's word is judged. `safety` gives the newest request and its number. Known places are
+        judged whether or not the device was asked to open. After a fault the next look clears `faults`, and the device
+        is not judged before another request. A device that homes is not judged either. The first look after `rest`, or
+        after one that judged nothing, counts from its own time.
         """
         number = safety.request_number
         if self.faults:
@@ -133,8 +136,9 @@ class Opening:
     def _judge_by_places(self, measurement: Measurement) -> None:
         """Judge the carriages by their places, and set `faults` to NOT_OPENING where one is later than LATE_S.
 
-        Updates how late both are, and where. The device's own opening speed, lower at a low supply voltage, says how
-        far they should have come since the last State.
+        Else `faults` stays. Updates how late both are, and where; `waits_s` becomes 0. The device's own opening speed,
+        lower at a low supply voltage, says how far they should have come. Time is that since the last State, on the
+        device's clock.
         """
         dt_s = max(measurement.device_time_s - self.device_s, 0.0)
         share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
@@ -151,7 +155,8 @@ class Opening:
         NOT_OPENING.
 
         A device that says that it opens is late after a search's time. One that was asked to open (`is_asked`) and does
-        not is late after LATE_S. A device that shows both open switches, or a failure, is not late.
+        not is late after LATE_S. A device that shows both open switches, or a failure, is not late: `waits_s` becomes
+        0. It counts the time between Status messages, at most REPORT_S each. Without `is_placed` the places are noted.
         """
         if not is_placed:
             self._place(measurement)
@@ -168,8 +173,9 @@ class Opening:
 
 
 def _late_s(late_s: float, before_mm: float, now_mm: float, speed_mm_s: float) -> float:
-    """Return how late a carriage is at `now_mm` that was `late_s` late at `before_mm`, against `speed_mm_s`.
+    """Return how late a carriage is at `now_mm`, s, that is `late_s` late if it stood at `before_mm`.
 
-    A carriage that is open is not late.
+    `speed_mm_s` > 0 is what it should open with. One that goes back is later still. A carriage within OPEN_MM of its
+    open switch is not late, and none is less than 0 s late.
     """
     return 0.0 if now_mm >= -OPEN_MM else max(late_s - (now_mm - before_mm) / speed_mm_s, 0.0)

@@ -42,8 +42,9 @@ class Speeds(Value):
 def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
     """Return where `plan` leads, with speed and acceleration, `lag_s` from now, when the present duty takes effect.
 
-    A plan is carried on by its age, CARRY_S at most, and `lag_s`. The least gap `floor_mm` and the greatest `open_mm`
-    hold the place, and end the motion towards them.
+    A plan is carried on by its age, CARRY_S at most, and `lag_s`; one from the future has the age 0. The least gap
+    `floor_mm` and the greatest `open_mm` hold the place, and end the motion towards them. The plan's own least gap is
+    not looked at: the caller puts it into `floor_mm`. Nothing is checked; NaN in the plan stays.
     """
     age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + lag_s
     gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
@@ -64,12 +65,13 @@ def follow(
     speeds: Speeds,
     floor_mm: float = -math.inf,
 ) -> tuple[Reference, bool, bool]:
-    """Return the reference `dt_s` later, and two limits: whether speed held it back, and whether acceleration did.
+    """Return the reference `dt_s` > 0 later, and two limits: whether speed held it back, and whether acceleration did.
 
-    The reference closes no faster than it can stop at `floor_mm`. It approaches `target` at the greatest speed that it
-    can still brake from with `acceleration_mm_s2`. So a step is time-optimal and does not overshoot. The target's own
-    speed is added, which follows a moving target without lag. A target that turns round leaves less to brake with.
-    While speeding up, the acceleration falls to nothing at `speeds.no_load_mm_s`.
+    The reference closes no faster than it can stop at `floor_mm`, but is not moved out of there. It approaches `target`
+    at the greatest speed that it can still brake from with `acceleration_mm_s2`. So a step is time-optimal and does not
+    overshoot. The target's own speed is added, which follows a moving target without lag. A target that turns round
+    leaves less to brake with, MIN_BRAKING of it at least. While speeding up, the acceleration falls to nothing at
+    `speeds.no_load_mm_s`. Speeds are held within `speeds` each way. Nothing is checked, and `reference` stays as it is.
     """
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
@@ -92,9 +94,10 @@ def follow(
 
 
 def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> float:
-    """Return the greatest speed from which `distance_mm` still suffices to come to rest, in steps of `dt_s`.
+    """Return the greatest speed, mm/s, from which `distance_mm` >= 0 still suffices to come to rest in steps of `dt_s`.
 
-    Near the target the speed is no more than the distance in APPROACH_S.
+    It brakes with `braking_mm_s2` > 0. The speed is at most the distance in APPROACH_S, or in `dt_s` where that is
+    more, which counts near the target; 0 at no distance. A negative distance is not checked, and may raise ValueError.
     """
     change = braking_mm_s2 * dt_s
     fastest = (math.sqrt(change * change + 8.0 * braking_mm_s2 * distance_mm) - change) / 2.0
@@ -118,9 +121,10 @@ class Expected:
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """Follow `reference` for `dt_s`, with the time constant `lag_s`.
+        """Follow the place and speed of `reference` for `dt_s` > 0, with the time constant `lag_s`.
 
-        Also filters the speed with the time constant `filter_s`, as the measured speeds are.
+        `filtered_mm_s` follows the speed with the time constant `filter_s`, as the measured speeds are filtered. All
+        three fields change. Nothing is checked: NaN stays until `begin`.
         """
         self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
         self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)

@@ -109,7 +109,9 @@ class Watch:
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
         """Return `conditions` completed by the carriages' skew, and by the greatest values that a command may find.
 
-        `measured` is None while the device is silent: the conditions are then not fresh, and the skew is infinite.
+        The values are those of skew, mm, round trip, s, and clock drift, a share. Nothing is judged here: `command`
+        does. `measured` is None while the device is silent: the conditions are then not fresh, and the skew is
+        infinite. Without a silence they are as fresh as they were.
         """
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
@@ -136,10 +138,12 @@ class Watch:
     ) -> tuple[Fault, ...]:
         """Return all faults that show now, and change nothing: `operating_state.latch` sorts them.
 
-        Those of the device always may, and OUT_OF_STROKE of a homed one. `leap` is an encoder step that no carriage
-        makes, None without one: ENCODER shows once a later Status has come. `sensor_doubted_s` is how long the force
-        sensor has not been believed. Faults of link and motion show only while `safety.is_driven`, those of motion not
-        during a leap. DEVICE_NOT_RUNNING shows alone, once STARTING_S have passed since enabling.
+        Those that the device reports may always show, OUT_OF_STROKE while it is homed and its places count. `leap` is
+        an encoder step that no carriage makes, None without one: ENCODER shows once a later Status has come, and
+        OUT_OF_STROKE does not. `sensor_doubted_s` is how long of sliding the force sensor has not been believed. Faults
+        of link and motion show only while `safety.is_driven`, those of motion not during a leap. DEVICE_NOT_RUNNING
+        shows alone, where a driven device is not in RUN once STARTING_S have passed since enabling. Motion is judged by
+        the times that `update` counted. Empty: nothing is wrong.
         """
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
@@ -164,8 +168,9 @@ class Watch:
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
         """Return the limits that show now, and change nothing: SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK.
 
-        They show over the warning skew, for SHOWN_S after a stall of the loop, and with an old Sense. LINK_DEGRADED
-        shows on a lossy or slow wire, CLOCK for a clock off by over CLOCK_OFF.
+        They show, in this order, over the warning skew, for SHOWN_S after a stall of the loop, and with a Sense older
+        than `sight.unsensed_s`. LINK_DEGRADED shows on a lossy wire, or a round trip over SLOW_SHARE, CLOCK for a
+        device's clock off by over CLOCK_OFF, either way.
         """
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
@@ -184,9 +189,10 @@ class Watch:
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
         """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`.
 
-        Counts for how long a gap strays, a carriage stands or goes against its duty, and the force is over the ceiling.
-        A count begins again where its cause has gone. On a brake the force counts only while the handle moves. The
-        duties are kept for the next tick.
+        Duties are the motors', at the nominal supply. Counts for how long a gap strays from `reference_mm`, a carriage
+        stands or goes against its duty, and the force is over the ceiling. A count begins again where its cause has
+        gone. A gap strays by over `limits.following_error_mm`; a reference of NaN is no straying. On a brake the force
+        counts only while the handle moves. The duties are kept for the next tick.
         """
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
@@ -203,7 +209,8 @@ class Watch:
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
         """Return the faults that the device reports; none while a clearing of its faults may still be under way.
 
-        A command timeout of the device after a stall of this host is the fault HOST_STALL.
+        A command timeout of the device is the fault HOST_STALL where this host has just stalled for nearly as long. So
+        it is where that fault is latched already. Changes nothing.
         """
         shown: int = measurement.faults
         if not shown or now_s < safety.clearing_until_s:
@@ -216,9 +223,10 @@ class Watch:
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
         """Return the faults of the link: messages too old, a round trip too long, a device's clock too far off.
 
-        They are MEASUREMENT_STALE, SENSE_STALE, STATUS_STALE, LINK_DEGRADED and CLOCK. While the answer to the first
-        Drive after a stall may be on its way, no message is too old. A Sense is too old only where the scene needs the
-        sensor.
+        They are, in this order, MEASUREMENT_STALE, SENSE_STALE, STATUS_STALE, LINK_DEGRADED and CLOCK; empty for none.
+        While the answer to the first Drive after a stall may be on its way, no message is too old. A Sense is too old
+        only where the scene needs the sensor. A State's delay on the line counts as age. Ages are as of half a period
+        from now. Changes nothing.
         """
         faults: list[Fault] = []
         # the tick nearest to the end of a timeout judges it: the next one could be a period late
@@ -262,8 +270,11 @@ class Watch:
         return faults
 
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
-        """Tell whether a carriage stands while its duty is over `limits.no_motion_duty`, the same way as a step
-        before."""
+        """Tell whether a carriage stands while it is driven the same way as a step before; one of the two is enough.
+
+        It is driven by a duty over `limits.no_motion_duty`, without its sign. It stands below STILL_MM_S. The duties of
+        the step before are those kept; a kept 0 counts as positive. Changes nothing.
+        """
         # a duty that turns round before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
         is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
@@ -275,8 +286,8 @@ class Watch:
         """Count in `opposed_s`, by `dt_s`, for how long a carriage moves against its duty.
 
         Only a duty over `limits.no_motion_duty`, without its sign, drives a carriage, and only a speed over STILL_MM_S
-        is a motion. While either carriage moves against its duty the count goes on. Else it becomes 0 where one moves
-        the right way or none is driven, and stands where driven carriages stand.
+        is a motion. While either carriage moves against its duty, `opposed_s` grows by `dt_s`. Else it becomes 0 where
+        one moves the right way or none is driven, and stays where driven carriages stand.
         """
         left_mm_s = right_mm_s = 0.0
         is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
