@@ -105,6 +105,12 @@ class Schema(NamedTuple):
         return int.from_bytes(hashlib.sha256(self.canonical_layout().encode("ascii")).digest()[:4], "big")
 
 
+def steps_held(length: int, signed: bool) -> tuple[int, int]:
+    """Return the least and the greatest step that an integer of `length` bits holds."""
+    span = 1 << length
+    return (-span // 2, span // 2 - 1) if signed else (0, span - 1)
+
+
 def read_schema(path: Path = DBC) -> Schema:
     """Read the schema of a DBC file, its messages by rising identifier.
 
@@ -160,8 +166,7 @@ def _signal(message_name: str, signal: Any, kinds: list[str]) -> SignalSource:
     if bool(choices) != (kind in ("Enumeration", "Flags")) or bool(choices) != bool(type_name):
         raise SchemaError(f"{where}: a value table, its kind and its TypeName go together")
     steps = round(signal.minimum / signal.scale), round(signal.maximum / signal.scale)
-    span = 1 << signal.length
-    storage = (-span // 2, span // 2 - 1) if signal.is_signed else (0, span - 1)
+    storage = steps_held(signal.length, signal.is_signed)
     if steps[0] < storage[0] or steps[1] > storage[1] or (kind == "Wrapping" and steps != storage):
         raise SchemaError(f"{where}: steps {steps} do not fit, or for a wrapping signal do not fill, {storage}")
     # The codec checks enumerations and flags by range, so their values must leave no gap.

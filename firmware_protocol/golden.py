@@ -13,7 +13,7 @@ from typing import Any, Final
 import cantools
 from cobs import cobs  # type: ignore[import-untyped]
 
-from firmware_protocol.dbc import MessageSource, Schema
+from firmware_protocol.dbc import MessageSource, Schema, steps_held
 
 RANDOM_VECTORS: Final = 8
 RANDOM_SEED: Final = 20240229
@@ -47,7 +47,7 @@ def vector_files(schema: Schema, dbc: Path) -> dict[str, str]:
     valid = [vector for message in schema.messages for vector in _valid_payloads(message, database)]
     head = {"protocol_version": schema.version, "schema_hash": f"{schema.schema_hash():08X}"}
     messages = head | {"valid": valid, "invalid": list(_invalid_payloads(schema, valid))}
-    frames = head | {"valid": _valid_frames(valid), "streams": list(_streams())}
+    frames = head | {"valid": _valid_frames(valid), "streams": _streams()}
     return {"messages.json": _text(messages), "frames.json": _text(frames)}
 
 
@@ -102,8 +102,7 @@ def _invalid_payloads(schema: Schema, valid: list[Json]) -> Iterator[Json]:
     def refused(function: int, payload: bytes, reason: str) -> Json:
         return {"function": function, "payload": payload.hex(), "reason": reason}
 
-    known = {message.function for message in schema.messages}
-    for function in (0, max(known) + 1, 0xFF):
+    for function in (0, max(message.function for message in schema.messages) + 1, 0xFF):
         yield refused(function, bytes(8), "unknown function")
     for message in schema.messages:
         payload = bytes.fromhex(next(v["payload"] for v in reversed(valid) if v["message"] == message.name))
@@ -114,14 +113,13 @@ def _invalid_payloads(schema: Schema, valid: list[Json]) -> Iterator[Json]:
             for bit in range(0, 8 * len(payload), 7):
                 flipped = (int.from_bytes(payload, "big") ^ 1 << bit).to_bytes(len(payload), "big")
                 yield refused(message.function, flipped, f"{message.name} with one bit flipped")
-            others = known - {message.function}
             for other in schema.messages:
-                if other.function in others and other.protected and other.length == len(payload):
+                if other is not message and other.protected and other.length == len(payload):
                     yield refused(other.function, payload, f"{message.name} taken for {other.name}")
         for signal in message.fields:
-            storage = 1 << signal.length
+            lowest, highest = steps_held(signal.length, signal.signed)
             for step in (signal.steps[0] - 1, signal.steps[1] + 1):
-                if not (-storage // 2 <= step < storage // 2 if signal.signed else 0 <= step < storage):
+                if not lowest <= step <= highest:
                     continue
                 body = bytearray(payload)
                 first, count = signal.start // 8, signal.length // 8
@@ -161,8 +159,8 @@ def _valid_frames(messages: list[Json]) -> list[Json]:
     ]
 
 
-def _streams() -> Iterator[Json]:
-    """Yield byte streams, each with the frames and counters that a receiver must take from it."""
+def _streams() -> list[Json]:
+    """Return byte streams, each with the frames and counters that a receiver must take from it."""
     payload = bytes.fromhex("0011002233440055")
     a, b, c, d = (_stuffed(3, sequence, payload) for sequence in (254, 255, 0, 1))
     flipped = b[:4] + bytes((b[4] ^ 0x10,)) + b[5:]
@@ -184,25 +182,25 @@ def _streams() -> Iterator[Json]:
         }
 
     damaged = {"corrupt": 1, "lost": 1, "resynchronisations": 1}
-    yield stream("four in a row, sequence through zero", a + b + c + d, [a, b, c, d])
-    yield stream("idle zeros between frames", b"\x00\x00" + a + b"\x00" + b, [a, b])
-    yield stream("one bit flipped", a + flipped + c, [a, c], **damaged)
-    yield stream("cut off in the middle", a + b[:6] + c + d, [a, d], corrupt=1, lost=2, resynchronisations=1)
-    yield stream("delimiter gone", a + b[:-1] + c + d, [a, d], corrupt=1, lost=2, resynchronisations=1)
-    yield stream(
-        "zero inside a frame", a + b[:6] + b"\x00" + b[6:] + c, [a, c], corrupt=2, lost=1, resynchronisations=1
-    )
-    yield stream("noise, then a frame", b"\x55\xaa\xff\x01" + a + b + c, [b, c], corrupt=1, resynchronisations=1)
-    yield stream("too long", a + b"\x07" * 300 + b"\x00" + b, [a, b], corrupt=1, resynchronisations=1)
-    yield stream("too short", a + short + c, [a, c], **damaged)
-    yield stream("a CRC without a header", a + bare + c, [a, c], **damaged)
-    yield stream("a byte more than a whole frame", a + b[:-1] + b"\x01\x00" + c, [a, c], **damaged)
-    yield stream("a zero more than a whole frame", a + longer + c, [a, c], **damaged)
-    yield stream("a zero less than a whole frame", a + shorter + c, [a, c], **damaged)
-    yield stream("COBS distance past the end", a + b"\x09\x01\x02\x00" + c, [a, c], **damaged)
-    yield stream("one missing", a + c + d, [a, c, d], lost=1)
-    yield stream("one overtaken", a + c + b + d, [a, c, b, d])
-    yield stream("a late repetition", a + b + c + a + d, [a, b, c, a, d])
-    yield stream("the same frame twice", a + b + b + c, [a, b, c], repeated=1)
-    yield stream("same sequence, another frame", a + another + b, [a, another, b], repeated=1)
-    yield stream("unfinished", a + b[:-1], [a])
+    return [
+        stream("four in a row, sequence through zero", a + b + c + d, [a, b, c, d]),
+        stream("idle zeros between frames", b"\x00\x00" + a + b"\x00" + b, [a, b]),
+        stream("one bit flipped", a + flipped + c, [a, c], **damaged),
+        stream("cut off in the middle", a + b[:6] + c + d, [a, d], corrupt=1, lost=2, resynchronisations=1),
+        stream("delimiter gone", a + b[:-1] + c + d, [a, d], corrupt=1, lost=2, resynchronisations=1),
+        stream("zero inside a frame", a + b[:6] + b"\x00" + b[6:] + c, [a, c], corrupt=2, lost=1, resynchronisations=1),
+        stream("noise, then a frame", b"\x55\xaa\xff\x01" + a + b + c, [b, c], corrupt=1, resynchronisations=1),
+        stream("too long", a + b"\x07" * 300 + b"\x00" + b, [a, b], corrupt=1, resynchronisations=1),
+        stream("too short", a + short + c, [a, c], **damaged),
+        stream("a CRC without a header", a + bare + c, [a, c], **damaged),
+        stream("a byte more than a whole frame", a + b[:-1] + b"\x01\x00" + c, [a, c], **damaged),
+        stream("a zero more than a whole frame", a + longer + c, [a, c], **damaged),
+        stream("a zero less than a whole frame", a + shorter + c, [a, c], **damaged),
+        stream("COBS distance past the end", a + b"\x09\x01\x02\x00" + c, [a, c], **damaged),
+        stream("one missing", a + c + d, [a, c, d], lost=1),
+        stream("one overtaken", a + c + b + d, [a, c, b, d]),
+        stream("a late repetition", a + b + c + a + d, [a, b, c, a, d]),
+        stream("the same frame twice", a + b + b + c, [a, b, c], repeated=1),
+        stream("same sequence, another frame", a + another + b, [a, another, b], repeated=1),
+        stream("unfinished", a + b[:-1], [a]),
+    ]

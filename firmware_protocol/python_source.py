@@ -8,7 +8,7 @@ import textwrap
 from typing import Final
 
 from firmware_protocol.checksum import CRC8_INITIAL, CRC8_TABLE
-from firmware_protocol.dbc import MessageSource, Schema, SignalSource
+from firmware_protocol.dbc import MessageSource, Schema, SignalSource, steps_held
 
 LINE_WIDTH: Final = 120
 TEXT_WIDTH: Final = 110
@@ -19,6 +19,12 @@ _WIRE_HEAD: Final = '''\
 Whatever does not fit is None here, or an error of Python's where it is not even a number. `codec` says what was wrong.
 """
 
+from functools import cache
+from operator import index
+from struct import Struct
+from typing import Final
+
+from firmware_protocol.checksum import CRC8_FINAL_XOR, CRC8_TABLE
 '''
 _ROUNDING: Final = """_HALVES: Final = 1.5 * 2.0**52
 # Between 2**52 and 2**53 floats are the whole numbers, and a sum goes to the nearest, of two as near to the even one.
@@ -152,14 +158,8 @@ def _wire_module(schema: Schema) -> str:
     packs = "".join(
         f'_PACK_{_constant(message.name)}: Final = Struct("<{_codes(message)}").pack\n' for message in schema.messages
     )
-    imports = ["from struct import Struct\n", "from typing import Final\n"]
-    if any(_is_wide(signal) for message in schema.messages for signal in message.fields):
-        imports.insert(0, "from operator import index\n")
-    if flags:
-        imports.insert(0, "from functools import cache\n")
     head = (
-        f"{_WIRE_HEAD}{''.join(imports)}\n"
-        "from firmware_protocol.checksum import CRC8_FINAL_XOR, CRC8_TABLE\n"
+        f"{_WIRE_HEAD}"
         f"{_import('enumerations', sorted(enumerations))}"
         f"{_import('layouts', sorted(['Message', *(message.name for message in schema.messages)]))}\n"
         "_BYTES: Final = tuple([bytes((byte,)) for byte in range(256)])\n"
@@ -188,11 +188,6 @@ def _mask(value: int) -> str:
 def _is_wide(signal: SignalSource) -> bool:
     """Tell whether a signal is a whole number of over 8 bits."""
     return signal.python_type != "float" and signal.length > 8
-
-
-def _storage(signal: SignalSource) -> tuple[int, int]:
-    span = 1 << signal.length
-    return (-span // 2, span // 2 - 1) if signal.signed else (0, span - 1)
 
 
 def _crc(message: MessageSource, data: str) -> list[str]:
@@ -253,8 +248,9 @@ def _unpack(message: MessageSource) -> str:
             raw = f"(({raw}) ^ {half}) - {half}" if count > 1 else f"({raw} ^ {half}) - {half}"
         lines.append(f"{s.name} = {raw}")
         lowest, highest = s.steps
-        if (lowest, highest) != _storage(s):
-            test = f"not {lowest} <= {s.name} <= {highest}" if lowest > _storage(s)[0] else f"{s.name} > {highest}"
+        held = steps_held(s.length, s.signed)
+        if s.steps != held:
+            test = f"not {lowest} <= {s.name} <= {highest}" if lowest > held[0] else f"{s.name} > {highest}"
             lines += [f"if {test}:", "    return None"]
         if s.python_type == "float":
             values.append(f"{s.name} * {s.scale!r}")

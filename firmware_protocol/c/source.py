@@ -39,29 +39,17 @@ def _undated(text: str) -> str:
     return "\n".join(line.rstrip() for line in _STAMP.sub(r"\1 from tormag.dbc.", text).splitlines()).rstrip() + "\n"
 
 
-def _lower(message: MessageSource) -> str:
-    return message.name.lower()
-
-
-def _upper(message: MessageSource) -> str:
-    return message.name.upper()
-
-
-def _lines(lines: Iterable[str]) -> str:
-    return "\n".join(lines)
-
-
 def _messages_header(schema: Schema) -> str:
     """Return messages.h: version, schema hash, functions, scales and the type of a message."""
-    functions = _lines(f"#define TORMAG_FUNCTION_{_upper(m)} {m.function}u" for m in schema.messages)
-    scales = _lines(
-        f"#define TORMAG_{_upper(message)}_{signal.name.upper()}_SCALE {signal.scale!r}"
+    functions = "\n".join(f"#define TORMAG_FUNCTION_{m.name.upper()} {m.function}u" for m in schema.messages)
+    scales = "\n".join(
+        f"#define TORMAG_{message.name.upper()}_{signal.name.upper()}_SCALE {signal.scale!r}"
         + (f" /* {signal.unit} */" if signal.unit else "")
         for message in schema.messages
         for signal in message.fields
         if signal.python_type == "float"
     )
-    members = _lines(f"        struct tormag_{_lower(m)}_t {_lower(m)};" for m in schema.messages)
+    members = "\n".join(f"        struct tormag_{m.name.lower()}_t {m.name.lower()};" for m in schema.messages)
     return f"""{_NOTICE}
 #ifndef TORMAG_MESSAGES_H
 #define TORMAG_MESSAGES_H
@@ -115,12 +103,12 @@ def _switch(schema: Schema, bodies: Iterable[Iterable[str]], default: str) -> st
     """Return a C switch over a message's function, with one body for each message."""
     lines = ["    switch (message->function) {"]
     for message, body in zip(schema.messages, bodies, strict=True):
-        lines += [f"    case TORMAG_FUNCTION_{_upper(message)}:", *(f"        {line}" for line in body)]
-    return _lines([*lines, "    default:", f"        {default}", "    }"])
+        lines += [f"    case TORMAG_FUNCTION_{message.name.upper()}:", *(f"        {line}" for line in body)]
+    return "\n".join([*lines, "    default:", f"        {default}", "    }"])
 
 
 def _range_check(message: MessageSource) -> list[str]:
-    name = _lower(message)
+    name = message.name.lower()
     signals = [signal.name.lower() for signal in message.fields]  # as cantools writes them
     checks = [f"tormag_{name}_{signal}_is_in_range(message->signals.{name}.{signal})" for signal in signals]
     return ("return " + "\n    && ".join(checks) + ";").split("\n")
@@ -128,17 +116,18 @@ def _range_check(message: MessageSource) -> list[str]:
 
 def _messages_source(schema: Schema) -> str:
     """Return messages.c: length, protection, range check, packing and unpacking by a message's function."""
-    lengths = _lines(
-        f"    case TORMAG_FUNCTION_{_upper(m)}:\n        return TORMAG_{_upper(m)}_LENGTH;" for m in schema.messages
+    lengths = "\n".join(
+        f"    case TORMAG_FUNCTION_{m.name.upper()}:\n        return TORMAG_{m.name.upper()}_LENGTH;"
+        for m in schema.messages
     )
-    protected = " || ".join(f"function == TORMAG_FUNCTION_{_upper(m)}" for m in schema.messages if m.protected)
+    protected = " || ".join(f"function == TORMAG_FUNCTION_{m.name.upper()}" for m in schema.messages if m.protected)
 
     def call(message: MessageSource, way: str, first: str, second: str) -> list[str]:
-        name = _lower(message)
-        return [f"(void)tormag_{name}_{way}({first}, {second}, TORMAG_{_upper(message)}_LENGTH);", "break;"]
+        name = message.name
+        return [f"(void)tormag_{name.lower()}_{way}({first}, {second}, TORMAG_{name.upper()}_LENGTH);", "break;"]
 
-    packing = [call(m, "pack", "payload", f"&message->signals.{_lower(m)}") for m in schema.messages]
-    unpacking = [call(m, "unpack", f"&message->signals.{_lower(m)}", "payload") for m in schema.messages]
+    packing = [call(m, "pack", "payload", f"&message->signals.{m.name.lower()}") for m in schema.messages]
+    unpacking = [call(m, "unpack", f"&message->signals.{m.name.lower()}", "payload") for m in schema.messages]
     return f"""{_NOTICE}
 #include "messages.h"
 

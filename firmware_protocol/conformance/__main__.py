@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         command.error(str(error))
     finally:
-        line.close()
+        line.port.close()
     return PASSED if results and all(result.passed is not False for result in results) else FAILED
 
 

@@ -23,7 +23,7 @@ from firmware_protocol.codec import (
     encode,
 )
 from firmware_protocol.conformance.check import Check, Hazard, check
-from firmware_protocol.conformance.host import ANSWER_S, PERIOD_S, Beat, Host, Unmet, shown
+from firmware_protocol.conformance.host import ANSWER_S, PERIOD_S, Beat, Host, Unmet, shown, unless
 
 DRIVE: Final = FUNCTION[Drive]
 SILENT = "no State, drive_counter unchanged; the good Drive after it is answered"
@@ -66,8 +66,7 @@ def _ignores(host: Host, put: Iterable[Send]) -> str:
             raise Unmet(f"form {tried}: {states} State")
         host.next_status(Beat.NOTHING)
         after = host.next_status(Beat.NOTHING).drive_counter
-        if after != before:
-            raise Unmet(f"form {tried}: drive_counter {after} in Status, {before} before it")
+        unless(after != before, f"form {tried}: drive_counter {after} in Status, {before} before it")
         host.counter = (host.counter + 1) % 256
         host.beat(Beat.OFF)
         host.pass_time(ANSWER_S)

@@ -148,7 +148,7 @@ class Host:
         self.stroke_mm = stroke_mm
         self.reset = reset
         self.random = random.Random(41)
-        self._booted_s = None if uptime_s is None else line.now_s() - uptime_s
+        self._booted_s = None if uptime_s is None else line.port.now_s() - uptime_s
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
         self.refused: dict[str, int] = {}
@@ -162,16 +162,16 @@ class Host:
         self.homings: list[Homing] = []
         self.stalled_s = 0.0
         """The greatest lateness of this process since `begin`."""
-        self.drive_s = line.now_s()
+        self.drive_s = line.port.now_s()
         """When the last good Drive was sent."""
         self.counter = 0
         self._nonce = 0
-        self._next_s = line.now_s()
+        self._next_s = line.port.now_s()
 
     @property
     def now_s(self) -> float:
-        """The line's clock."""
-        return self.line.now_s()
+        """The clock of the line's port."""
+        return self.line.port.now_s()
 
     @property
     def uptime_s(self) -> float | None:
@@ -245,10 +245,12 @@ class Host:
             self.drive(DriveMode.RUN if beat is Beat.RUN else DriveMode.OFF, left, right)
         self._listen(period_s)
 
-    def pass_time(self, seconds: float, beat: Beat = Beat.NOTHING, period_s: float = PERIOD_S) -> None:
-        """Repeat `beat` every millisecond or `period_s` for a time."""
+    def pass_time(
+        self, seconds: float, beat: Beat = Beat.NOTHING, period_s: float = PERIOD_S, duty: float = 0.0
+    ) -> None:
+        """Repeat `beat` every millisecond or `period_s` for a time, with `duty` for both motors."""
         for _ in range(round(seconds / period_s)):
-            self.beat(beat, period_s=period_s)
+            self.beat(beat, duty, duty, period_s)
 
     def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = Beat.OFF) -> bool:
         """Repeat `beat` every millisecond until `reached()` or for `limit_s`; return whether it was reached."""
@@ -381,8 +383,7 @@ class Host:
         """Bring the device to IDLE without a fault, by a Hello, Drive OFF and, in LATCHED, a Clear. Raises Unmet."""
         self.hello()
         self.pass_time(SEEN_S, Beat.OFF)
-        resting = (DeviceMode.IDLE, DeviceMode.LATCHED)
-        if not self.until(lambda: self.status.mode in resting, HOMED_S):
+        if not self.until(self.is_resting, HOMED_S):
             raise Unmet(f"not IDLE after {HOMED_S:g} s of Drive OFF: {shown(self.status)}")
         if self.status.mode is DeviceMode.LATCHED and not self.command(Clear):
             raise Unmet(f"Clear was not acknowledged: {shown(self.status)}")
@@ -555,18 +556,15 @@ def positions(state: State) -> str:
 
 def contradictions(status: Status) -> list[str]:
     """Return what in one Status cannot be true together, in words; empty where nothing is wrong."""
-    found = [
-        f"{side}_OPEN with {side}_CLOSED"
-        for side in ("LEFT", "RIGHT")
-        if Switches[f"{side}_OPEN"] in status.switches and Switches[f"{side}_CLOSED"] in status.switches
-    ]
-    if is_homed(status) and status.mode in (DeviceMode.HOMING, DeviceMode.LATCHED):
-        found.append(f"HOMED while {status.mode.name}")
-    if status.mode is DeviceMode.LATCHED and not status.faults:
-        found.append("LATCHED without a fault")
-    if status.faults and status.mode in (DeviceMode.IDLE, DeviceMode.RUN):
-        found.append(f"a fault while {status.mode.name}")
-    return found
+    mode, switches = status.mode, status.switches
+    found = {
+        "LEFT_OPEN with LEFT_CLOSED": (Switches.LEFT_OPEN | Switches.LEFT_CLOSED) in switches,
+        "RIGHT_OPEN with RIGHT_CLOSED": (Switches.RIGHT_OPEN | Switches.RIGHT_CLOSED) in switches,
+        f"HOMED while {mode.name}": is_homed(status) and mode in (DeviceMode.HOMING, DeviceMode.LATCHED),
+        "LATCHED without a fault": mode is DeviceMode.LATCHED and not status.faults,
+        f"a fault while {mode.name}": status.faults and mode in (DeviceMode.IDLE, DeviceMode.RUN),
+    }
+    return [what for what, is_so in found.items() if is_so]
 
 
 def usual(values: list[float]) -> float:

@@ -54,23 +54,20 @@ class FramePort(Protocol):
 class SerialLine:
     """One conversation with one device, in frames of COBS and CRC-16 on a serial port.
 
-    Every method that uses the port raises OSError when it is gone.
+    Its `port` has the clock, and is closed by whoever opened it. Every method that uses the port raises OSError when it
+    is gone.
     """
 
     def __init__(self, port: BytePort) -> None:
-        self._port = port
+        self.port = port
         self._decoder = FrameDecoder()
         self._sequence = 0
         self._before: tuple[int, int, int] | None = None
         port.write(DELIMITER)  # ends whatever was there before
 
-    def now_s(self) -> float:
-        """Return the time of the port's clock."""
-        return self._port.now_s()
-
     def send(self, function: int, payload: bytes) -> None:
         """Send one frame, with the next sequence number."""
-        self._port.write(self._frame(function, payload))
+        self.port.write(self._frame(function, payload))
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
         """Return damaged forms of a frame, by the kind of damage, for `send_damaged`; a device has to ignore each.
@@ -95,23 +92,19 @@ class SerialLine:
 
     def send_damaged(self, unit: bytes) -> None:
         """Send bytes as they are."""
-        self._port.write(unit)
+        self.port.write(unit)
 
     def receive(self, until_s: float) -> list[Arrival]:
         """Wait until `until_s`, and return the whole frames that came."""
         arrivals = [
             Arrival(time_s, frame.function, frame.payload)
-            for time_s, data in self._port.read(until_s)
+            for time_s, data in self.port.read(until_s)
             for frame in self._decoder.feed(data)
         ]
         if self._before is None and arrivals:
             statistics = self._decoder.statistics
             self._before = statistics.corrupt, statistics.lost, statistics.repeated
         return arrivals
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
 
     def _frame(self, function: int, payload: bytes) -> bytes:
         """Return a whole frame, and count the sequence on."""
@@ -139,13 +132,14 @@ class SerialLine:
 class CanLine:
     """One conversation with one device, a node on a CAN bus: payloads are the data of CAN frames.
 
-    Every method that uses the bus raises OSError when it is gone.
+    Its `port` is the bus, which has the clock, and is closed by whoever opened it. Every method that uses the bus
+    raises OSError when it is gone.
     """
 
     def __init__(self, port: FramePort, node: int) -> None:
         """Begin a conversation with `node`. Raises EncodeError for a node outside 0..15."""
         can_identifier(1, node)
-        self._port, self._node = port, node
+        self.port, self._node = port, node
         self._others: set[int] = set()
 
     @property
@@ -153,13 +147,9 @@ class CanLine:
         """Always empty: the CAN controllers check frames, and what they discard is not seen."""
         return {}
 
-    def now_s(self) -> float:
-        """Return the time of the bus's clock."""
-        return self._port.now_s()
-
     def send(self, function: int, payload: bytes) -> None:
         """Send one frame to the node."""
-        self._port.write(can_identifier(function, self._node), payload)
+        self.port.write(can_identifier(function, self._node), payload)
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
         """Return whole frames to other nodes, for `send_damaged`; the device has to ignore them.
@@ -172,21 +162,17 @@ class CanLine:
 
     def send_damaged(self, unit: bytes) -> None:
         """Send a frame that is given as two bytes of identifier and its data."""
-        self._port.write(int.from_bytes(unit[:2], "big"), unit[2:])
+        self.port.write(int.from_bytes(unit[:2], "big"), unit[2:])
 
     def receive(self, until_s: float) -> list[Arrival]:
         """Wait until `until_s`, and return the frames of the node; note which other nodes are on the bus."""
         arrivals = []
-        for time_s, identifier, data in self._port.read(until_s):
+        for time_s, identifier, data in self.port.read(until_s):
             if identifier & 0xF == self._node:
                 arrivals.append(Arrival(time_s, identifier >> 4, data))
             else:
                 self._others.add(identifier & 0xF)
         return arrivals
-
-    def close(self) -> None:
-        """Close the bus."""
-        self._port.close()
 
 
 Line: TypeAlias = SerialLine | CanLine

@@ -48,8 +48,7 @@ def hello_nonce(host: Host) -> str:
     for nonce in (255, 77, 77, 255):
         host.hello(nonce=nonce)
         seen.append(host.next_status(Beat.NOTHING).command_nonce)
-        if seen[-1] != nonce:
-            raise Unmet(f"nonce {seen[-1]} in Status after a Hello with {nonce}")
+        unless(seen[-1] != nonce, f"nonce {seen[-1]} in Status after a Hello with {nonce}")
     return f"nonces {seen}"
 
 
@@ -114,8 +113,7 @@ def clear_clears(host: Host) -> str:
 def run_needs_homing(host: Host) -> str:
     """Check that a device without a zero does not run."""
     host.without_zero()
-    if is_homed(host.status):
-        raise Unmet(f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
+    unless(is_homed(host.status), f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     host.pass_time(SEEN_S, Beat.RUN)
     return host.shows(DeviceMode.IDLE, Beat.RUN)
 

@@ -9,7 +9,6 @@ from firmware_protocol.conformance.check import Hazard, check
 from firmware_protocol.conformance.host import (
     NO_FAULT,
     OPENED_S,
-    PERIOD_S,
     SEEN_S,
     TIME_SPAN_S,
     Beat,
@@ -84,8 +83,7 @@ def _from_inside(host: Host, ends_run: Callable[[], object], fault: DeviceFault,
 
 def _lets_go(host: Host) -> None:
     """Send Drive OFF with closing duties for SEEN_S. Raises Unmet where the device is not opening by then."""
-    for _ in range(round(SEEN_S / PERIOD_S)):
-        host.beat(Beat.OFF, CLOSING_DUTY, CLOSING_DUTY)
+    host.pass_time(SEEN_S, Beat.OFF, duty=CLOSING_DUTY)
     unless(host.status.mode is not DeviceMode.RETRACTING, f"Drive OFF with duties: {shown(host.status)}")
 
 

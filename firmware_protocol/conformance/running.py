@@ -111,8 +111,7 @@ def _duty_moves(host: Host, *, is_left: bool) -> str:
         )
         if moved_mm <= -MOVED_MM and abs(other_mm) < MOVED_MM / 2:
             return unless((currents_A[0] > currents_A[1]) is not is_left, seen)
-        if max(abs(moved_mm), abs(other_mm)) >= MOVED_MM:
-            raise Unmet(seen)
+        unless(max(abs(moved_mm), abs(other_mm)) >= MOVED_MM, seen)
     raise Unmet(f"{seen}, {shown(host.status)}")
 
 
@@ -130,8 +129,7 @@ def open_switch_stops(host: Host) -> str:
         raise Unmet(f"not at the open switches: {shown(host.status)}")
     start = host.last(State)
     host.forget()
-    for _ in range(200):
-        host.beat(Beat.RUN, AT_STOP_DUTY, AT_STOP_DUTY)
+    host.pass_time(0.2, Beat.RUN, duty=AT_STOP_DUTY)
     currents_A = [abs(A) for _, sense in host.all_of(Sense) for A in (sense.left_current_A, sense.right_current_A)]
     most_A = max(currents_A, default=0.0)
     left_mm, right_mm = _moved_mm(host, start)
@@ -221,8 +219,7 @@ def has_to_let_go(host: Host) -> str:
     """
     host.hello(beat=Beat.RUN)  # a host says one every second
     start = host.last(State)
-    for _ in range(round(SEEN_S / PERIOD_S)):
-        host.beat(Beat.RUN, REFUSED_DUTY, REFUSED_DUTY)
+    host.pass_time(SEEN_S, Beat.RUN, duty=REFUSED_DUTY)
     moved_mm = min(_moved_mm(host, start))
     besides = f"before a Drive OFF, moved by {moved_mm:+.2f} mm"
     host.shows(DeviceMode.IDLE, Beat.RUN, besides=besides, wrong=abs(moved_mm) > REFUSED_MM)
@@ -274,8 +271,7 @@ def refuses_run(host: Host, mode: DeviceMode) -> str:
     host.pass_time(ANSWER_S)
     start = host.last(State)
     host.forget()
-    for _ in range(round(SEEN_S / PERIOD_S)):
-        host.beat(Beat.RUN, REFUSED_DUTY, REFUSED_DUTY)
+    host.pass_time(SEEN_S, Beat.RUN, duty=REFUSED_DUTY)
     host.pass_time(ANSWER_S)
     states = len(host.all_of(State))
     moved_mm = min(_moved_mm(host, start))

@@ -61,8 +61,7 @@ def _status_rate(host: Host, beat: Beat) -> str:
     start_s = host.now_s
     host.pass_time(LISTENED_S, beat)
     times = [time_s for time_s, _ in host.all_of(Status)]
-    if len(times) < 2:
-        raise Unmet(f"{len(times)} Status in {LISTENED_S:g} s")
+    unless(len(times) < 2, f"{len(times)} Status in {LISTENED_S:g} s")
     period_s = (times[-1] - times[0]) / (len(times) - 1)
     widest_s = max(after - before for before, after in pairwise([start_s, *times, host.now_s]))
     seen = f"one every {period_s * 1e3:.1f} ms, {widest_s * 1e3:.0f} ms apart at most"
@@ -80,8 +79,7 @@ def every_drive_answered(host: Host) -> str:
     seen = f"{states} State, {senses} Sense for {DRIVES} Drives"
     if refused := {what: count for what, count in host.refused.items() if what.startswith("S")}:
         seen += f"; refused since the start: {refused}"
-    if (states, senses) != (DRIVES, DRIVES):
-        raise Unmet(seen)
+    unless((states, senses) != (DRIVES, DRIVES), seen)
     # on a bus the State of a later Drive may overtake a Sense, as its identifier is lower
     behind = list(accumulate(1 if kind is State else -1 for kind in kinds))
     early = sum(count < 0 for count in behind)
@@ -154,8 +152,7 @@ def state_counter(host: Host) -> str:
     """Check that State's counter rises by one: by it the host counts lost States, and knows repeated ones."""
     host.pass_time(0.6, Beat.OFF)
     counters = [state.counter for _, state in host.all_of(State)]
-    if len(counters) < 2:
-        raise Unmet(f"{len(counters)} State")
+    unless(len(counters) < 2, f"{len(counters)} State")
     steps = [(after - before) % 256 for before, after in pairwise(counters)]
     wrong = [step for step in steps if step != 1]
     seen = f"{len(wrong)} of {len(steps)} steps are not 1: {sorted(set(wrong))[:5]}, first {counters[:5]}"

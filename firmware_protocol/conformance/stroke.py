@@ -7,7 +7,6 @@ from typing import Final
 from firmware_protocol.codec import DeviceFault, DeviceMode, Sense, State, Status, Switches
 from firmware_protocol.conformance.check import Hazard, check
 from firmware_protocol.conformance.host import (
-    PERIOD_S,
     SEEN_S,
     STATUS_S,
     Beat,
@@ -125,8 +124,8 @@ def answers_are_of_now(host: Host) -> str:
     """Check that currents and positions are of the Drive that they answer, currents with their unit and sign."""
     host.running(MIDDLE_MM)
     start_mm = places(host.last(State))
-    for _ in range(2):  # the second one measures what the first began; an answer that lags shows a motor at rest
-        host.beat(Beat.RUN, 1.0, 1.0, STARTED_S)
+    # the second Drive measures what the first began; an answer that lags shows a motor at rest
+    host.pass_time(2 * STARTED_S, Beat.RUN, STARTED_S, duty=1.0)
     sense = host.last(Sense)
     currents_A = sense.left_current_A, sense.right_current_A
     way_mm = min(after - before for before, after in zip(start_mm, places(host.last(State)), strict=True))
@@ -137,14 +136,11 @@ def answers_are_of_now(host: Host) -> str:
 
 def _speed_mm_s(host: Host, duty: float) -> float:
     """Give both motors a duty for PULSE_S and return the slower carriage's speed in its direction, once settled."""
-    for _ in range(round(SETTLED_S / PERIOD_S)):
-        host.beat(Beat.RUN, duty, duty)
+    host.pass_time(SETTLED_S, Beat.RUN, duty=duty)
     start = places(host.last(State))
-    for _ in range(round((PULSE_S - SETTLED_S) / PERIOD_S)):
-        host.beat(Beat.RUN, duty, duty)
+    host.pass_time(PULSE_S - SETTLED_S, Beat.RUN, duty=duty)
     end = places(host.last(State))
-    if host.now_s - host.newest[Status].time_s > 2.5 * STATUS_S:
-        raise Unmet(f"no Status at a duty of {duty:g}")
+    unless(host.now_s - host.newest[Status].time_s > 2.5 * STATUS_S, f"no Status at a duty of {duty:g}")
     ways_mm = [(after - before) * (1.0 if duty > 0.0 else -1.0) for before, after in zip(start, end, strict=True)]
     return min(ways_mm) / (PULSE_S - SETTLED_S)
 
@@ -165,8 +161,7 @@ def skew_opens(host: Host) -> str:
         host.bring(goals[0], goals[1], SLOW_MM_S, lambda: _skew_mm(host) > SKEW_MM + BOUND_MM or _has_left(host))
         apart_mm = _skew_mm(host)
         seen.append(f"{apart_mm:.2f} mm apart: {shown(host.next_status(Beat.RUN))}")
-        if host.status.faults != DeviceFault.SKEW or apart_mm < SKEW_MM - BOUND_MM:
-            raise Unmet("; ".join(seen))
+        unless(host.status.faults != DeviceFault.SKEW or apart_mm < SKEW_MM - BOUND_MM, "; ".join(seen))
         seen.append(opens_fully(host, DeviceFault.SKEW))
     return "; ".join(seen)
 
@@ -198,8 +193,7 @@ def end_stop_opens(host: Host) -> str:
         innermost_mm = min(min(places(state)) for _, state in host.all_of(State))
         off = innermost_mm / -host.stroke_mm - 1.0
         seen.append(f"{innermost_mm:.2f} mm, {off:+.1%}: {shown(host.next_status(Beat.RUN))}")
-        if host.status.faults != DeviceFault.END_STOP or abs(off) > SCALE:
-            raise Unmet("; ".join(seen))
+        unless(host.status.faults != DeviceFault.END_STOP or abs(off) > SCALE, "; ".join(seen))
         seen.append(opens_fully(host, DeviceFault.END_STOP))
     return "; ".join(seen)
 

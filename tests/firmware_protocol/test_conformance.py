@@ -257,10 +257,6 @@ def is_latched(device: Rogue) -> bool:
 HASH_REVERSED = int.from_bytes(SCHEMA_HASH.to_bytes(4, "little"), "big")
 
 
-def identity_with(schema_hash: int) -> Identity:
-    return Identity(schema_hash, 1, 0, 1)
-
-
 def fitting(message: Message, **right: int) -> Message:
     """As if a Hello had said what is right."""
     return message.replaced(**right) if isinstance(message, Hello) else message
@@ -463,11 +459,6 @@ def remembering() -> Callable[[Rogue], None]:
             device.real._left_zero_mm = device.real._right_zero_mm = 3.0
 
     return boot
-
-
-def needs_no_hello(device: Rogue, _time_s: float, message: Message) -> None:
-    if isinstance(message, Drive) and device.count[Hello] == 0:
-        device.real._compatible = True
 
 
 def with_switches(switches: Callable[[Rogue, Switches], Switches]) -> Callable[[Rogue, Sensors], Sensors]:
@@ -743,8 +734,8 @@ PLANTED = (
         ),
     ),
     wire("CRC-16 without its final XOR", "identity_answers_hello", of=Reframed, frame=without_final_xor),
-    rogue("another hash", "schema_hash", identity=lambda device: identity_with(SCHEMA_HASH ^ 0x100)),
-    rogue("hash reversed", "schema_hash", identity=lambda device: identity_with(HASH_REVERSED)),
+    rogue("another hash", "schema_hash", identity=lambda device: Identity(SCHEMA_HASH ^ 0x100, 1, 0, 1)),
+    rogue("hash reversed", "schema_hash", identity=lambda device: Identity(HASH_REVERSED, 1, 0, 1)),
     rogue("Hello is no nonce", "hello_nonce", receive=keeps_nonce_at(Hello)),
     rogue("ignores the schema", "schema_mismatch", hears=lambda _, message: fitting(message, schema_hash=SCHEMA_HASH)),
     rogue("ignores the version", "version_mismatch", hears=lambda _, message: fitting(message, protocol_version=1)),
@@ -890,7 +881,6 @@ PLANTED = (
     rogue("timeout of 35 ms", "short_silence_is_borne", ticks=timeout_of(0.035)),
     rogue("timeout of 65 ms", "silence_is_noticed", ticks=timeout_of(0.065)),
     rogue("no timeout", "silence_is_noticed", ticks=extends),
-    rogue("no timeout", "silence_is_noticed", ticks=extends),
     rogue("latches without opening", "silence_is_noticed", ticked=latches_without_opening),
     rogue("any message extends", "only_good_drives_extend", before=extends),
     rogue("a repetition extends", "only_good_drives_extend", before=repetition_extends),
@@ -923,7 +913,11 @@ PLANTED = (
     # what kills: errors that an earlier kit did not see
     rogue("latch clears itself", "silence_latches", ticked=clears_itself),
     wire("commands without CRC-16", "frame_crc_16", mended=commands_without_crc_16),
-    rogue("runs without a Hello", "warm_reset", before=needs_no_hello),
+    rogue(
+        "runs without a Hello",
+        "warm_reset",
+        before=sets(Drive, lambda device, message: device.count[Hello] == 0, _compatible=True),
+    ),
     rogue("timeout blind by its sign", "any_uptime", ticks=blind_while(lambda _, time_s: time_s % 65.536 > 32.768)),
     rogue("spurious timeout", "any_uptime", ticks=spurious),
     rogue("timeout not armed before a duty", "silence_is_noticed", ticks=blind_while(has_no_duty_yet)),
@@ -1100,7 +1094,7 @@ SAID = {
 
 def hosted(line: Any, uptime_s: float | None = None) -> Host:
     """A host that can reset the simulated device."""
-    messages = line._port.device.messages
+    messages = line.port.device.messages
     return Host(line, uptime_s=uptime_s, reset=lambda how: messages._reset(messages._time_s))
 
 
@@ -1168,9 +1162,8 @@ def test_the_command_prints_json_and_exits_with_0(ran: Callable[..., int], capsy
     assert ran(serial_line(), "--yes", "--json", "--only", "schema_hash") == 0
     out, err = capsys.readouterr()
     checks = json.loads(out)["checks"]
-    assert [check["name"] for check in checks] == ["schema_hash", "left_open"]
+    assert [(check["name"], check["passed"]) for check in checks] == [("schema_hash", True), ("left_open", True)]
     assert set(checks[0]) >= {"name", "passed", "seen", "expected"}
-    assert checks[0]["passed"] is True
     assert "ok    schema_hash" in err
 
 
@@ -1195,7 +1188,7 @@ def test_nothing_is_sent_before_somebody_agrees(
         monkeypatch.setattr(sys, "stdin", answer)
         assert ran(line) == 2
     assert "MOTORS WILL MOVE" in capsys.readouterr().err
-    assert line.now_s() == 0.0
+    assert line.port.now_s() == 0.0
     monkeypatch.setattr(sys, "stdin", Terminal("Yes\n"))
     assert ran(line, "--only", "schema_hash") == 0
 
