@@ -18,7 +18,7 @@ from tormagd.model.displacement import MOBILISED_MM, Turn
 from tormagd.model.memory import NO_MEMORY
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState
+from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, RefusedError
 from tormagd.scenes.scene import Scene
 
 MeasurementMaker = Callable[..., Measurement]
@@ -160,6 +160,12 @@ class Bench:
 
     def command(self, name: str, **conditions: object) -> None:
         self.stepper.command(name, self.now_s, READY.replaced(**conditions))  # type: ignore[arg-type]
+
+    def refused(self, name: str, **conditions: object) -> RefusedError:
+        """A command that is refused."""
+        with pytest.raises(RefusedError) as caught:
+            self.command(name, **conditions)
+        return caught.value
 
     def enabled(self, **changes: object) -> "Bench":
         """Enabled after three periods of this kind."""

@@ -34,9 +34,8 @@ def test_enabling_is_bumpless(running) -> None:
 
 
 def test_enabling_wants_a_measurement(bench) -> None:
-    with pytest.raises(RefusedError) as caught:
-        bench.command("enable")
-    assert (caught.value.code, bench.stepper.safety.operating_state) == ("not_fresh", OperatingState.DISABLED)
+    assert bench.refused("enable").code == "not_fresh"
+    assert bench.stepper.safety.operating_state is OperatingState.DISABLED
 
 
 # -- counts that jump ----------------------------------------------------------------------------------------------
@@ -98,16 +97,10 @@ def test_what_a_carriage_does_at_full_speed_is_no_leap(bench, speed_mm_s: float,
 def test_after_an_encoder_fault_positions_are_unknown_until_the_device_has_homed(running) -> None:
     running.run_into(Fault.ENCODER, left_mm=-5.0)
     assert not running.stepper.measured.is_homed
-    running.command("clear-fault")
-    for name in ("enable", "home", "enable"):
+    for name in ("clear-fault", "home"):
+        running.command(name)
         running.step(count=5)
-        assert not running.stepper.measured.is_homed
-        if name == "home":
-            running.command(name)
-            continue
-        with pytest.raises(RefusedError) as caught:
-            running.command(name)
-        assert caught.value.code == "not_homed"
+        assert (running.stepper.measured.is_homed, running.refused("enable").code) == (False, "not_homed")
     running.step(count=30, mode=DeviceMode.HOMING, switches=Switches.LEFT_OPEN | Switches.RIGHT_OPEN)
     assert not running.stepper.measured.is_homed
     running.step(count=2)

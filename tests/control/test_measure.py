@@ -47,19 +47,24 @@ def follow_handle(measure):
 def test_the_first_is_at_rest(look: Look, measure) -> None:
     measured = look(measure(3, left_mm=-10.0, right_mm=-10.5))
     assert (measured.left_mm, measured.right_mm, measured.gap_mm, measured.skew_mm) == (37.5, 37.0, 74.5, 0.5)
-    assert (measured.left_mm_s, measured.right_mm_s, measured.handle.rate_mm_s) == (0.0, 0.0, 0.0)
-    assert measured.handle.displacement_mm == 0.0
+    at_rest = measured.left_mm_s, measured.right_mm_s, measured.handle.rate_mm_s, measured.handle.displacement_mm
+    assert at_rest == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_the_same_measurement_again_changes_nothing(look: Look, measure) -> None:
-    second = look(measure(0), measure(1, left_mm=-7.4))
-    assert look(measure(1, left_mm=-7.4, received_s=9.0)) is second
-
-
-@pytest.mark.parametrize("device_time_s", [0.005, 0.004, -1.0])
-def test_a_device_clock_that_does_not_advance_gives_no_speed(look: Look, measure, device_time_s: float) -> None:
-    last = look(measure(5))
-    assert look(measure(6, device_time_s=device_time_s, left_mm=-6.0)) is last
+@pytest.mark.parametrize(
+    ("number", "changes"),
+    [
+        (5, {"received_s": 9.0}),
+        (6, {"device_time_s": 0.005}),
+        (6, {"device_time_s": 0.004}),
+        (6, {"device_time_s": -1.0}),
+    ],
+)
+def test_the_same_measurement_or_device_time_again_changes_nothing(
+    look: Look, measure, number: int, changes: dict[str, float]
+) -> None:
+    last = look(measure(4), measure(5))
+    assert look(measure(number, left_mm=-6.0, **changes)) is last
 
 
 @given(speed=st.floats(-40.0, 40.0), dt_s=st.floats(2e-4, 5e-3))
@@ -103,15 +108,26 @@ def test_one_encoder_count_is_filtered(look: Look, measure) -> None:
     assert (after.left_mm_s, after.right_mm_s) == (pytest.approx(COUNT_MM / 1e-3 / 4.0), 0.0)
 
 
-def test_displacement_counts_from_the_reversal(follow_handle) -> None:
-    handle = follow_handle([*[0.1 * k for k in range(51)], 4.9, 4.5, 4.0]).handle
-    assert handle.turn.direction == -1.0
-    assert (handle.turn.turned_mm, handle.displacement_mm) == pytest.approx((5.0, 1.0))
+FORTH_MM = [0.1 * k for k in range(51)]
 
 
-def test_displacement_saturates_where_friction_is_mobilised(follow_handle) -> None:
-    forth, back = [0.1 * k for k in range(51)], [5.0 - 0.1 * k for k in range(1, 100)]
-    assert [follow_handle(way).handle.displacement_mm for way in (forth, forth + back)] == [MOBILISED_MM] * 2
+@pytest.mark.parametrize(
+    ("way_mm", "direction", "turned_mm", "displacement_mm"),
+    [
+        (FORTH_MM, 1.0, 0.0, MOBILISED_MM),
+        ([*FORTH_MM, 4.9, 4.5, 4.0], -1.0, 5.0, 1.0),
+        ([*FORTH_MM, *[5.0 - 0.1 * k for k in range(1, 100)]], -1.0, 5.0, MOBILISED_MM),
+        # many small steps back are one, from the furthest point
+        ([0.0, 3.0, *[3.0 - HANDLE_COUNT_MM * k for k in range(20)]], -1.0, 3.0, 19 * HANDLE_COUNT_MM),
+    ],
+    ids=["from the start", "from the reversal", "mobilised again", "a slow creep back"],
+)
+def test_displacement_counts_from_the_reversal_until_friction_is_mobilised(
+    follow_handle, way_mm: list[float], direction: float, turned_mm: float, displacement_mm: float
+) -> None:
+    handle = follow_handle(way_mm).handle
+    found = handle.turn.direction, handle.turn.turned_mm, handle.displacement_mm
+    assert found == pytest.approx((direction, turned_mm, displacement_mm))
 
 
 @given(wobble=st.lists(st.floats(-TURN_MM, 0.0), min_size=1, max_size=30))
@@ -124,12 +140,6 @@ def test_encoder_noise_at_rest_is_no_reversal(follow_handle) -> None:
     handle = follow_handle([3.0 + HANDLE_COUNT_MM * (k % 2) for k in range(500)]).handle
     assert handle.turn.direction == 1.0
     assert abs(handle.rate_mm_s) < 1.0
-
-
-def test_slow_creep_back_is_a_reversal_in_the_end(follow_handle) -> None:
-    """A reversal is counted from the furthest point: many small steps back are one."""
-    steps = [3.0 - HANDLE_COUNT_MM * k for k in range(20)]
-    assert follow_handle([0.0, 3.0, *steps]).handle.turn.direction == -1.0
 
 
 @given(positions=st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=60))

@@ -74,28 +74,14 @@ def of_field(slopes: list[float], bias: float, output: list[float], constant: fl
     return make_model(weight, np.full(len(slopes), bias), np.array(output), constant)
 
 
-@pytest.fixture(scope="session")
-def bump() -> ForceModel:
-    """Force that rises to a greatest value near 450 mT and falls again, the same on both sides."""
-    return of_field([8.0, -8.0], 4.0, [1.5, 1.5], -2.0)
-
-
-@pytest.fixture(scope="session")
-def lopsided() -> ForceModel:
-    """Force that rises steeply to its greatest value near 450 mT and falls gently."""
-    return of_field([40.0, -4.0], 4.0, [1.5, 1.5], -2.0)
-
-
-@pytest.fixture(scope="session")
-def plateau() -> ForceModel:
-    """Force that climbs steeply at 450 mT and is flat to the last bit on both sides."""
-    return of_field([500.0], 0.0, [1.0], 0.0)
-
-
-@pytest.fixture(scope="session")
-def creeping() -> ForceModel:
-    """The plateau, with a rise of 8 units of rounding across it."""
-    return of_field([500.0, 1.0], 0.0, [1.0, 1e-14], -0.9)
+BUMP = of_field([8.0, -8.0], 4.0, [1.5, 1.5], -2.0)
+"Force that rises to a greatest value near 450 mT and falls again, the same on both sides."
+LOPSIDED = of_field([40.0, -4.0], 4.0, [1.5, 1.5], -2.0)
+"Force that rises steeply to its greatest value near 450 mT and falls gently."
+PLATEAU = of_field([500.0], 0.0, [1.0], 0.0)
+"Force that climbs steeply at 450 mT and is flat to the last bit on both sides."
+CREEPING = of_field([500.0, 1.0], 0.0, [1.0, 1e-14], -0.9)
+"The plateau, with a rise of 8 units of rounding across it."
 
 
 # -- what all of them promise -----------------------------------------------------------------------------------------
@@ -162,13 +148,13 @@ def test_on_a_rising_model_the_root_is_found(rising: ForceModel, name: str) -> N
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)
-def test_on_a_model_that_falls_again_the_branch_is_kept(bump: ForceModel, name: str) -> None:
-    searcher = solver(name, bump)
-    peak = bump.predict_one(0.5, 10, 450.0, CIP)
+def test_on_a_model_that_falls_again_the_branch_is_kept(name: str) -> None:
+    searcher = solver(name, BUMP)
+    peak = BUMP.predict_one(0.5, 10, 450.0, CIP)
     for start, side in ((400.0, -1), (500.0, 1)):
         last = start
         for depth in (*np.linspace(0.2, 2, 40), *np.linspace(2, 0.2, 40)):
-            solution = searcher.solve(bump.curve(0.5, 10, CIP), peak - float(depth), last)
+            solution = searcher.solve(BUMP.curve(0.5, 10, CIP), peak - float(depth), last)
             assert solution.reach is Reach.INSIDE
             assert (solution.field_mT - 450) * side > 0
             assert abs(solution.field_mT - last) < 60
@@ -177,17 +163,17 @@ def test_on_a_model_that_falls_again_the_branch_is_kept(bump: ForceModel, name: 
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)
-def test_without_a_last_field_the_lowest_root_wins(bump: ForceModel, name: str) -> None:
-    force = bump.predict_one(0.5, 10, 300.0, CIP)
+def test_without_a_last_field_the_lowest_root_wins(name: str) -> None:
+    force = BUMP.predict_one(0.5, 10, 300.0, CIP)
     accuracy = SUBJECTS[name].accuracy_mT
-    assert solver(name, bump).solve(bump.curve(0.5, 10, CIP), force, None).field_mT == pytest.approx(
+    assert solver(name, BUMP).solve(BUMP.curve(0.5, 10, CIP), force, None).field_mT == pytest.approx(
         300, abs=10 * accuracy
     )
 
 
 @pytest.mark.parametrize("name", FORGETFUL)
-def test_a_search_without_memory_answers_with_one_of_the_roots(bump: ForceModel, name: str) -> None:
-    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 300.0, CIP), 600.0)
+def test_a_search_without_memory_answers_with_one_of_the_roots(name: str) -> None:
+    solution = solver(name, BUMP).solve(BUMP.curve(0.5, 10, CIP), BUMP.predict_one(0.5, 10, 300.0, CIP), 600.0)
     assert min(abs(solution.field_mT - 300), abs(solution.field_mT - 600)) <= 5
     assert solution.reach is Reach.INSIDE
 
@@ -215,17 +201,17 @@ def test_out_of_reach_is_the_nearest_end_and_never_silent(rising: ForceModel, na
 
 
 @pytest.mark.parametrize("name", ANY_SHAPE)
-def test_above_the_peak_of_a_bump_is_above(bump: ForceModel, name: str) -> None:
-    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 450.0, CIP) + 0.1, 200.0)
+def test_above_the_peak_of_a_bump_is_above(name: str) -> None:
+    solution = solver(name, BUMP).solve(BUMP.curve(0.5, 10, CIP), BUMP.predict_one(0.5, 10, 450.0, CIP) + 0.1, 200.0)
     assert (solution.reach, solution.field_mT) == (Reach.ABOVE, pytest.approx(450, abs=2))
 
 
 @pytest.mark.parametrize("name", ANY_SHAPE)
-def test_a_tie_is_resolved_by_continuity(plateau: ForceModel, name: str) -> None:
+def test_a_tie_is_resolved_by_continuity(name: str) -> None:
     """Hundreds of fields give the same force to the last bit: the last field among them stays."""
-    top = plateau.predict_one(0.5, 10, 740.0, CIP)
+    top = PLATEAU.predict_one(0.5, 10, 740.0, CIP)
     for last in (600.0, 633.3):
-        solution = solver(name, plateau).solve(plateau.curve(0.5, 10, CIP), top, last)
+        solution = solver(name, PLATEAU).solve(PLATEAU.curve(0.5, 10, CIP), top, last)
         assert (solution.reach, solution.predicted_force_N) == (Reach.INSIDE, pytest.approx(top, abs=0.02))
         if name in CONTINUOUS:
             # the grid searches may move to a neighbouring grid point
@@ -318,9 +304,9 @@ def attainable(model: ForceModel, displacement_mm: float, rate_mm_s: float, shar
 
 
 @pytest.mark.parametrize(("neighbours", "keeps"), [(1, False), (2, False), (16, True)])
-def test_neighbours_decide_where_the_force_falls(lopsided: ForceModel, neighbours: int, keeps: bool) -> None:
+def test_neighbours_decide_where_the_force_falls(neighbours: int, keeps: bool) -> None:
     """Steep up, gently down: of the points nearest in force the first few are all on the gentle side."""
-    solver, curve = nearest(neighbours=neighbours, step_mT=5.0), lopsided.curve(0.5, 10, CIP)
+    solver, curve = nearest(neighbours=neighbours, step_mT=5.0), LOPSIDED.curve(0.5, 10, CIP)
     last, strayed = 440.0, False
     for force in np.linspace(curve.force_N(440.0), curve.force_N(420.0), 80).tolist():
         solution = solver.solve(curve, force, last)
@@ -330,16 +316,16 @@ def test_neighbours_decide_where_the_force_falls(lopsided: ForceModel, neighbour
     assert strayed is not keeps
 
 
-def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel, creeping: ForceModel) -> None:
+def test_on_a_plateau_the_field_moves_as_little_as_possible() -> None:
     """Where hundreds of fields give the same force, the answer is one of the nearest in force, not a far one; a rise by
     a few units of rounding up to 800 mT is no reason to travel there."""
     solver = nearest(neighbours=701)
-    creep = creeping.curve(0.5, 10, CIP)
+    creep = CREEPING.curve(0.5, 10, CIP)
     assert 0 < creep.force_N(800.0) - creep.force_N(500.0) < 1e-14
-    for curve in (plateau.curve(0.5, 10, CIP), creep):
+    for curve in (PLATEAU.curve(0.5, 10, CIP), creep):
         above = solver.solve(curve, curve.force_N(800.0) + 1, 600.0)
         assert (above.reach, above.field_mT) == (Reach.ABOVE, pytest.approx(600, abs=0.5))
-    assert solver.solve(plateau.curve(0.5, 10, CIP), plateau.predict_one(0.5, 10, 800.0, CIP), 700.0).field_mT == (
+    assert solver.solve(PLATEAU.curve(0.5, 10, CIP), PLATEAU.predict_one(0.5, 10, 800.0, CIP), 700.0).field_mT == (
         pytest.approx(700, abs=0.5)
     )
 

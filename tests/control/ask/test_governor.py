@@ -184,15 +184,6 @@ def test_a_takeover_turns_where_the_new_holder_does_and_ends_a_step_from_its_for
     assert ask.force_N == to_N
 
 
-def test_a_takeover_after_a_silence_begins_from_the_decayed_force() -> None:
-    following = governor(0.0, 1.6)
-    for tick in range(1, 301):
-        decayed_N = decide(following, tick * 1e-3, TimedSetpoint(1.6, 0.001, VALID_S)).force_N
-    assert decide(following, 0.301, TimedSetpoint(1.6, 0.301, VALID_S, holder=1)).force_N == pytest.approx(
-        decayed_N + SCENE.release_N_s * 1e-3
-    )
-
-
 def test_another_holders_forces_teach_no_slope_and_no_period() -> None:
     following, _ = stream_of([1.0, 1.1, 1.2])
     assert following.slope_N_s != 0.0
@@ -222,13 +213,17 @@ def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
         assert following.asked_N == ask.path_N[0]
 
 
-def test_a_publisher_that_comes_back_is_followed_again_without_a_slope_from_before() -> None:
+@pytest.mark.parametrize("holder", [0, 1])
+def test_after_a_silence_a_publisher_is_followed_from_the_decayed_force_without_a_slope_from_before(
+    holder: int,
+) -> None:
+    """Whether it is the same that comes back or another."""
     following, _ = stream_of([1.0, 1.1, 1.2])
-    decide(following, 0.5, TimedSetpoint(1.2, 0.03, VALID_S))
-    ask = decide(following, 0.501, TimedSetpoint(1.5, 0.501, VALID_S))
-    assert ask.limits == (Limit.TAKEOVER,)
+    decayed_N = decide(following, 0.2, TimedSetpoint(1.2, 0.03, VALID_S)).force_N
+    ask = decide(following, 0.201, TimedSetpoint(1.5, 0.201, VALID_S, holder=holder))
+    assert (ask.force_N, ask.limits) == (pytest.approx(decayed_N + SCENE.release_N_s * 1e-3), (Limit.TAKEOVER,))
     assert np.all(path_N(ask) == ask.force_N)
-    ask = decide(following, 1.2, TimedSetpoint(1.5, 1.2, VALID_S))
+    ask = decide(following, 1.2, TimedSetpoint(1.5, 1.2, VALID_S, holder=holder))
     assert (ask.force_N, ask.limits) == (1.5, ())
     assert np.all(path_N(ask) == 1.5)
 

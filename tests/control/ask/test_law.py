@@ -132,12 +132,7 @@ def test_a_brake_waits_at_its_standby_and_says_so(asked_N: float, rendered_N: fl
     for _ in range(3):
         ask = waiting.ask(Travel(0.0, 10.0), asked_N)
     assert (ask.force_N, ask.limits) == (rendered_N, limits)
-
-
-def test_without_a_publisher_nothing_waits() -> None:
-    waiting = Following(msgspec.structs.replace(SCENE, standby_N=0.6))
-    waiting.ask(Travel(0.0, 10.0))
-    assert waiting.governor.update(2.0, None, DeviceFit(), 0.0).force_N == 0.4
+    assert waiting.governor.update(2.0, None, DeviceFit(), 0.0).force_N == 0.4, "without a publisher nothing waits"
 
 
 class Pushed:

@@ -99,30 +99,30 @@ def test_a_switch_that_never_closed_is_missed(home: Home, seen: Switches) -> Non
         assert (name in str(home.homing)) == (Switches[name] not in seen)
 
 
-def test_homing_without_end(home: Home) -> None:
-    home.look(round(LONGEST_S * 1e3))
+def rising(before_N: float, most_N: float) -> list[tuple[int, dict[str, float]]]:
+    """Forces that are borne, the last of them for as long as it may be."""
+    return [(20, {"force_N": before_N}), (500, {"force_N": -most_N + 0.01}), (39, {"force_N": most_N + 0.01})]
+
+
+@pytest.mark.parametrize(
+    ("borne", "fault"),
+    [
+        ([(round(LONGEST_S * 1e3), {})], Fault.HOMING),
+        (rising(0.3, 3.0), Fault.OVER_FORCE),
+        (rising(10.0, 12.5), Fault.OVER_FORCE),
+        (rising(-10.0, 12.5), Fault.OVER_FORCE),
+        ([(20, {}), (99, {"reported_s": 0.02})], Fault.STATUS_STALE),
+    ],
+    ids=["no end", "a force", "a force from much", "a force from much the other way", "no Status"],
+)
+def test_what_is_borne_for_a_while_is_then_a_fault(
+    home: Home, borne: list[tuple[int, dict[str, float]]], fault: Fault
+) -> None:
+    for count, seen in borne:
+        home.look(count, **seen)
     assert not home.faults
-    home.look(3)
-    assert home.faults[0] is Fault.HOMING
-
-
-@pytest.mark.parametrize(("before_N", "most_N"), [(0.3, 3.0), (10.0, 12.5), (-10.0, 12.5)])
-def test_a_force_that_rises(home: Home, before_N: float, most_N: float) -> None:
-    home.look(20, force_N=before_N)
-    home.look(500, force_N=-most_N + 0.01)
-    home.look(39, force_N=most_N + 0.01)
-    assert not home.faults
-    home.look(3, force_N=most_N + 0.01)
-    assert home.faults[0] is Fault.OVER_FORCE
-
-
-def test_a_status_that_stops(home: Home) -> None:
-    home.look(20)
-    last_s = home.ticks * 1e-3
-    home.look(99, reported_s=last_s)
-    assert not home.faults
-    home.look(3, reported_s=last_s)
-    assert home.faults[0] is Fault.STATUS_STALE
+    home.look(3, **seen)
+    assert home.faults[0] is fault
 
 
 def test_the_next_homing_begins_anew(home: Home) -> None:

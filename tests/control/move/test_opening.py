@@ -67,12 +67,13 @@ def test_one_that_stops_half_way(opens: Opens) -> None:
     assert opens.look(1.0, -13.0, mode=DeviceMode.IDLE) == pytest.approx(LATE_S, abs=3e-3)
 
 
-def test_one_carriage_that_stops(opens: Opens) -> None:
-    assert opens.look(1.0, -25.0, SPEED_MM_S, right_mm=-20.0) == pytest.approx(LATE_S, abs=3e-3)
-
-
-def test_one_that_goes_the_wrong_way(opens: Opens) -> None:
-    assert opens.look(1.0, -12.0, -SPEED_MM_S) == pytest.approx(LATE_S / 2.0, abs=3e-3)
+@pytest.mark.parametrize(
+    ("start_mm", "speed_mm_s", "seen", "late_s"),
+    [(-25.0, SPEED_MM_S, {"right_mm": -20.0}, LATE_S), (-12.0, -SPEED_MM_S, {}, LATE_S / 2.0)],
+    ids=["one carriage that stops", "both go the wrong way"],
+)
+def test_one_that_goes_on_wrong(opens: Opens, start_mm: float, speed_mm_s: float, seen: dict, late_s: float) -> None:
+    assert opens.look(1.0, start_mm, speed_mm_s, **seen) == pytest.approx(late_s, abs=3e-3)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.8])

@@ -1,6 +1,7 @@
 """The gap reference: within its limits whatever the target does, on a step without overshoot, on a ramp without lag."""
 
 import math
+from collections.abc import Iterable, Iterator
 
 import pytest
 from hypothesis import example, given, settings, strategies as st
@@ -18,6 +19,21 @@ SPEEDS = Speeds(NO_LOAD_MM_S, LIMITS.gap_speed_mm_s, LIMITS.gap_speed_mm_s)
 "Both ways alike."
 HALF_COUNT_MM = 0.5 * 8.0 / 4480.0
 "Less than this no encoder sees."
+
+
+def followed(
+    start_mm: float,
+    targets: Iterable[Reference],
+    dt_s: float = DT_S,
+    speeds: Speeds = SPEEDS,
+    floor_mm: float = -math.inf,
+) -> Iterator[Reference]:
+    """The reference after each of these targets, a period apart, from rest and with the shipped acceleration."""
+    reference = Reference(start_mm)
+    for target in targets:
+        reference, _, _ = follow(MAX_MM_S2, reference, target, dt_s, speeds, floor_mm)
+        yield reference
+
 
 gaps = st.floats(45.0, 95.0)
 limits = st.builds(Position, gap_acceleration_mm_s2=st.floats(100.0, 5_000.0))
@@ -75,11 +91,9 @@ def test_a_step_is_reached_without_overshoot(position: Position, speeds: Speeds,
 
 def test_a_step_takes_hardly_longer_than_its_limits_ask() -> None:
     """1 mm of gap: time-optimal with this acceleration is 2 sqrt(d / a); the last stretch is a little slower."""
-    reference, ticks = Reference(70.0), 0
-    while abs(reference.gap_mm - 69.0) > 0.1:
-        reference, _, _ = follow(MAX_MM_S2, reference, Reference(69.0), DT_S, SPEEDS)
-        ticks += 1
-    assert ticks * DT_S < 1.3 * 2.0 * math.sqrt(1.0 / LIMITS.gap_acceleration_mm_s2)
+    ticks = int(1.3 * 2.0 * math.sqrt(1.0 / MAX_MM_S2) / DT_S)
+    *_, reference = followed(70.0, [Reference(69.0)] * ticks)
+    assert abs(reference.gap_mm - 69.0) <= 0.1
 
 
 @given(start=st.floats(60.0, 80.0), speed=st.floats(-0.8, 0.8).map(lambda share: share * LIMITS.gap_speed_mm_s))
@@ -109,11 +123,9 @@ def test_being_held_back_is_said() -> None:
 @example(start=95.0, target=45.0, dt_s=1e-5)
 @example(start=95.0, target=45.0, dt_s=0.1)
 def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: float) -> None:
-    reference = Reference(start)
     # one period of full braking covers a dt^2 / 2: a slow loop cannot stop more exactly than a part of that
     grain = HALF_COUNT_MM + 0.2 * LIMITS.gap_acceleration_mm_s2 * dt_s**2
-    for _ in range(400):
-        reference, _, _ = follow(MAX_MM_S2, reference, Reference(target), dt_s, SPEEDS)
+    for reference in followed(start, [Reference(target)] * 400, dt_s):
         assert math.isfinite(reference.gap_mm + reference.speed_mm_s + reference.acceleration_mm_s2)
         assert min(start, target) - grain <= reference.gap_mm <= max(start, target) + grain
     if dt_s * 400 > 4.0:
@@ -123,27 +135,23 @@ def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: 
 def test_either_way_has_its_own_limit() -> None:
     slow = SPEEDS.replaced(opening_mm_s=30.0)
     for target, most in ((95.0, 30.0), (45.0, LIMITS.gap_speed_mm_s)):
-        reference, speeds = Reference(70.0), []
-        for _ in range(500):
-            reference, _, _ = follow(MAX_MM_S2, reference, Reference(target), DT_S, slow)
-            speeds.append(abs(reference.speed_mm_s))
-        assert max(speeds) == pytest.approx(most, rel=1e-3)
+        way = followed(70.0, [Reference(target)] * 500, speeds=slow)
+        assert max(abs(reference.speed_mm_s) for reference in way) == pytest.approx(most, rel=1e-3)
 
 
 def test_a_target_that_turns_is_met_where_it_turns() -> None:
     """A swing that begins off the target: knowing how it turns leaves less overshoot than knowing only its speed."""
-    excess = {}
+    rate, excess_mm = 2.0 * math.pi * 3.0, []
     for is_known in (True, False):
-        reference, worst = Reference(70.0), 0.0
-        for tick in range(1_000):
-            phase = 2.0 * math.pi * 3.0 * tick * DT_S
-            rate = 2.0 * math.pi * 3.0
-            target = Reference(71.0 - math.cos(phase), rate * math.sin(phase), rate**2 * math.cos(phase) * is_known)
-            reference, _, _ = follow(MAX_MM_S2, reference, target, DT_S, SPEEDS)
-            worst = max(worst, abs(reference.gap_mm - target.gap_mm))
-        excess[is_known] = worst
-    assert excess[True] <= excess[False]
-    assert excess[True] < 0.1
+        phases = [rate * tick * DT_S for tick in range(1_000)]
+        targets = [
+            Reference(71.0 - math.cos(phase), rate * math.sin(phase), rate**2 * math.cos(phase) * is_known)
+            for phase in phases
+        ]
+        ways = zip(followed(70.0, targets), targets, strict=True)
+        excess_mm.append(max(abs(reference.gap_mm - target.gap_mm) for reference, target in ways))
+    assert excess_mm[0] <= excess_mm[1]
+    assert excess_mm[0] < 0.1
 
 
 @given(
@@ -181,7 +189,5 @@ def test_what_is_expected_of_a_ramp_is_late_by_the_lag() -> None:
 )
 @example(start=75.0, path=[(75.0 - 0.038 * tick, -38.0, 0.0) for tick in range(400)])
 def test_no_target_leads_it_beyond_its_floor(start: float, path: list[tuple[float, float, float]]) -> None:
-    reference = Reference(start)
-    for gap_mm, speed_mm_s, turning in path:
-        reference, _, _ = follow(MAX_MM_S2, reference, Reference(gap_mm, speed_mm_s, turning), DT_S, SPEEDS, 70.0)
+    for reference in followed(start, [Reference(*target) for target in path], floor_mm=70.0):
         assert reference.gap_mm >= 70.0 - MAX_MM_S2 * DT_S**2 / 8.0  # 0.2 um: it brakes in whole periods
