@@ -5,6 +5,7 @@ A device that does not follow ends the check with `Unmet`.
 
 import math
 import random
+from collections import Counter
 from collections.abc import Callable
 from enum import Enum, auto
 from itertools import dropwhile, groupby
@@ -151,13 +152,13 @@ class Host:
         self._booted_s = None if uptime_s is None else line.port.now_s() - uptime_s
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
-        self.refused: dict[str, int] = {}
+        self.refused = Counter[str]()
         """Whole frames that held no message of a device: what was wrong with them, and how often."""
         self.resets = 0
         """How often a Status with nonce 0 followed one with another nonce."""
-        self.contradictions: dict[str, int] = {}
+        self.contradictions = Counter[str]()
         """Contradictions within a Status, and how often each came."""
-        self.misplaced: dict[str, int] = {}
+        self.misplaced = Counter[str]()
         """End switches that did not fit the positions, and how often."""
         self.homings: list[Homing] = []
         self.stalled_s = 0.0
@@ -334,29 +335,24 @@ class Host:
             try:
                 message = decode(arrival.function, arrival.payload)
             except DecodeError as error:
-                self._refuse(f"{error.name or f'function {arrival.function}'}: {error.check}")
+                self.refused[f"{error.name or f'function {arrival.function}'}: {error.check}"] += 1
                 continue
             if isinstance(message, State | Sense | Status | Identity):
                 self._take(Heard(arrival.time_s, message))
             else:
-                self._refuse(f"{type(message).__name__}: a host's message")
+                self.refused[f"{type(message).__name__}: a host's message"] += 1
         late_s = self.now_s - self._next_s
         if late_s > PERIOD_S:  # missed beats are not made up for by a burst
             self.stalled_s = max(self.stalled_s, late_s)
             self._next_s += late_s
-
-    def _refuse(self, what: str) -> None:
-        self.refused[what] = self.refused.get(what, 0) + 1
 
     def _take(self, heard: Heard) -> None:
         """Keep a message, and count the resets and contradictions that a Status shows."""
         message = heard.message
         if isinstance(message, Status):
             self.resets += self._shown_nonce() != 0 and message.command_nonce == 0
-            for what in contradictions(message):
-                self.contradictions[what] = self.contradictions.get(what, 0) + 1
-            for what in self._misplaced(heard.time_s, message):
-                self.misplaced[what] = self.misplaced.get(what, 0) + 1
+            self.contradictions.update(contradictions(message))
+            self.misplaced.update(self._misplaced(heard.time_s, message))
         self.heard.append(heard)
         self.newest[type(message)] = heard
 

@@ -122,8 +122,7 @@ def no_answer_without_drive(host: Host) -> str:
     host.forget()
     host.pass_time(0.2)
     states, senses = len(host.all_of(State)), len(host.all_of(Sense))
-    seen = f"{states} State, {senses} Sense"
-    return unless(states or senses, seen)
+    return unless(states or senses, f"{states} State, {senses} Sense")
 
 
 @check(
@@ -180,8 +179,7 @@ def device_clock(host: Host) -> str:
     if not drifts:
         raise Unmet(f"{len(states)} State in {CLOCKED_S:g} s")
     drift = usual(drifts)
-    seen = f"{1.0 + drift:.4f} s in a second, {drift:+.2%}"
-    return unless(abs(drift) > MAX_DRIFT, seen)
+    return unless(abs(drift) > MAX_DRIFT, f"{1.0 + drift:.4f} s in a second, {drift:+.2%}")
 
 
 @check(Hazard.MISLED, "State", f"{TIMES} Drive OFF, one every 1.13 ms", "device_time_s in steps of 10 us")

@@ -303,4 +303,5 @@ class Stepper:
         return self._duty(DriveMode.OFF, 0.0, 0.0, ())
 
     def _duty(self, mode: DriveMode, left: float, right: float, limits: tuple[Limit, ...]) -> Duty:
+        """Return the record of these duties, with the newest request of `safety`."""
         return Duty(mode, left, right, self.safety.request, self.safety.request_number, limits)

@@ -65,6 +65,7 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
 
 
 def _armed(config: Config, core: Core) -> ClosedLoop:
+    """Return a new loop of `core` on the simulated PLANT, armed. Raises RuntimeError where it does not arm."""
     loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
     loop.arm()
     return loop

@@ -22,6 +22,7 @@ class _Carriage:
         self.position_mm = self.speed_mm_s = self.integral = 0.0
 
     def drive(self, duty: float) -> tuple[float, float]:
+        """Move for a millisecond with this duty, and return the new place, mm, and speed, mm/s."""
         self.speed_mm_s += (38.0 * duty - self.speed_mm_s) * 0.06
         self.position_mm += self.speed_mm_s * 0.001
         return self.position_mm, self.speed_mm_s

@@ -210,6 +210,7 @@ class Forecast:
         return [base_N + at_step((since_s + begins_after_s + later_s) / GRID_S, changes) for later_s in after_s]
 
     def _begin(self, stamp_s: float, force_N: float, time_s: float, history: bytes) -> None:
+        """Set all fields: these, no forecast, no guesses, and skills and errors as before the first judgement."""
         self.stamp_s, self.force_N, self.time_s, self.history = stamp_s, force_N, time_s, history
         self.from_s, self.changes_N, self.awaited = -math.inf, [], NOTHING_SAID
         self.long, self.short = UNJUDGED, UNJUDGED_SHORT

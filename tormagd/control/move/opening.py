@@ -124,12 +124,14 @@ class Opening:
             self._judge_by_places(measurement)
 
     def _begin(self, measurement: Measurement) -> None:
+        """Begin to watch: nothing is late yet; note when the device was heard, and where its carriages are."""
         self.is_watching = True
         self.left_late_s = self.right_late_s = self.waits_s = 0.0
         self.reported_s = measurement.reported_s
         self._place(measurement)
 
     def _place(self, measurement: Measurement) -> None:
+        """Note the carriages' places and the device's time."""
         self.device_s = measurement.device_time_s
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
 
