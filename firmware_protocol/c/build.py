@@ -85,7 +85,8 @@ def build(target: Target) -> Path:
     Raises BuildError where there is no compiler, where it fails or takes too long, and where the cache is not writable.
     """
     command = [debian_tool(target.needs) if target.needs else compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
-    path = _cache_folder() / f"{target.name.lower()}-{_fingerprint(command)}"
+    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    path = user_cache / "tormagd" / f"{target.name.lower()}-{_fingerprint(command)}"
     if path.exists():
         return path
     try:
@@ -108,10 +109,6 @@ def load_library() -> ctypes.CDLL:
         return ctypes.CDLL(str(path))
     except OSError as error:
         raise BuildError(f"cannot load {path}: {error}; delete it to have it built again") from error
-
-
-def _cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tormagd"
 
 
 def _fingerprint(command: list[str]) -> str:

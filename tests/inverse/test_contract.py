@@ -297,12 +297,6 @@ def test_parameters_that_cannot_work_are_refused(
         make(**options)
 
 
-def attainable(model: ForceModel, displacement_mm: float, rate_mm_s: float, share: float) -> float:
-    """Return the force at `share` of the way from the least to the greatest at that point."""
-    low, high = (model.predict_one(displacement_mm, rate_mm_s, field, CIP) for field in RANGE_MT)
-    return low + share * (high - low)
-
-
 @pytest.mark.parametrize(("neighbours", "keeps"), [(1, False), (2, False), (16, True)])
 def test_neighbours_decide_where_the_force_falls(neighbours: int, keeps: bool) -> None:
     """Steep up, gently down: of the points nearest in force the first few are all on the gentle side."""
@@ -331,9 +325,9 @@ def test_on_a_plateau_the_field_moves_as_little_as_possible() -> None:
 
 
 def test_the_thesis_search_stops_at_the_first_row_within_epsilon_or_has_the_nearest_of_all(rising: ForceModel) -> None:
-    force = attainable(rising, 0.5, 10, 0.7)
     curve, grid = rising.curve(0.5, 10, CIP), field_grid(RANGE_MT, 1.0)
     rows = [curve.force_N(field) for field in grid.tolist()]
+    force = rows[0] + 0.7 * (rows[-1] - rows[0])
     first = next(index for index, predicted in enumerate(rows) if abs(force - predicted) <= 0.2)
     solution = row_by_row(0.2).solve(curve, force, None)
     assert solution == FieldSolution(100.0 + first, rows[first], solution.confidence, first + 1, Reach.INSIDE)

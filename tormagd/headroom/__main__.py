@@ -34,8 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     `arguments` None takes those of the process. The code is 0, or 1 where stdout cannot be written. It is 2 for a
     configuration that is refused, or whose scene does not fit it: stderr names why, and stdout stays empty. It takes
-    some seconds. Wrong usage raises SystemExit(2), a simulated device that does not arm RuntimeError. What else
-    `measured` raises passes.
+    some seconds. Wrong usage raises SystemExit(2). What else `measured` raises passes.
     """
     parser = argparse.ArgumentParser(prog="python -m tormagd.headroom", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's configuration")
@@ -57,8 +56,8 @@ def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
     sentence for each thing that the kernel refused. `step_us`, `plan_us` and `lateness_us` are as `quantiles`.
 
     Gives this thread the daemon's scheduling, and freezes the collector's objects, for good. Raises ConfigError where
-    scene and configuration do not fit each other, RuntimeError and DomainError as `calls`, OSError where the kernel
-    gives no timer. A `core_s` under half a period gives no calls, and raises IndexError.
+    scene and configuration do not fit each other, OSError where the kernel gives no timer, and what `calls` raises. A
+    `core_s` under half a period gives no calls, and raises IndexError.
     """
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority

@@ -42,7 +42,7 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
     `config` is the core's, which is not checked. The device is the simulated PLANT, armed before the `seconds`; the
     pulse is that of SWING_SHARE. The calls act on the stages of a second loop, armed in the same way. So make each
     once, in their order, a tick's plan before its step. `core` itself does not change. Less than half a period gives no
-    calls. Raises RuntimeError if a device does not arm, DomainError as `ClosedLoop.tick`.
+    calls. Raises RuntimeError or RefusedError if a device does not arm, DomainError as `ClosedLoop.tick`.
     """
     period_s = 1.0 / config.rates.control_hz
     # stages change in place, so the calls are repeated on those of another loop, which has come as far
@@ -65,7 +65,10 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
 
 
 def _armed(config: Config, core: Core) -> ClosedLoop:
-    """Return a new loop of `core` on the simulated PLANT, armed. Raises RuntimeError where it does not arm."""
+    """Return a new loop of `core` on the simulated PLANT, armed.
+
+    Raises RuntimeError or RefusedError where it does not arm.
+    """
     loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
     loop.arm()
     return loop
