@@ -68,8 +68,8 @@ def embedding(delays: tuple[int, ...]) -> Array:
 
     `delays` are TAPS rising whole numbers, at most BEAT_DELAYS' last; they are not checked. The result has the shape
     (TAPS + 1 + HORIZON, n), whole numbers. A column holds one stretch: the points at `delays` before its end, the
-    nearest first, then its end, then the points that followed. Columns go back in time by STRIDE. The first one is the
-    newest stretch, after which its own end is repeated.
+    nearest first, then its end, then the points that followed. The first column is the newest stretch, after which its
+    own end is repeated. The others end HORIZON points before it or earlier, STRIDE apart.
     """
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
     ends = np.arange(-1 - HORIZON, _LONGEST - HISTORY - 1, -STRIDE)
