@@ -1,5 +1,6 @@
 """Commissioning simulated devices in virtual time: healthy draws pass, and what a fault changes turns red."""
 
+import math
 import random
 
 import msgspec
@@ -9,6 +10,7 @@ from rendering.device_draws import drawn_device
 from firmware_protocol.codec import Sense, State
 from tormagd.assembly.build import build_core
 from tormagd.commission.calibration import calibration
+from tormagd.commission.finding import finding
 from tormagd.commission.page import page_of
 from tormagd.commission.report import Report, begun
 from tormagd.commission.sequence import STEPS, Stopped
@@ -20,6 +22,7 @@ from tormagd.simulation.parameters import load_plant, with_insert
 CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
 SAMPLE = load_plant("sample_1")
 AT_REST = ("link and host", "homing")
+NEW = begun(None, 7, 0, None, CONFIG.motor)
 
 
 def with_part(name, **changes):
@@ -35,20 +38,23 @@ def red(found):
     return [each.name for row in found.values() for each in row if not each.is_fine]
 
 
+def reread(report):
+    return msgspec.json.decode(msgspec.json.encode(report), type=Report)
+
+
 def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench, tmp_path):
     device, run = drawn_device(44), bench(drawn_device(44))
     found, stopped = run.commission()
-    report = msgspec.structs.replace(begun(None, 7, 0, None), findings=found, stopped=stopped)
+    report = msgspec.structs.replace(NEW, findings=found, stopped=stopped)
     assert (red(found), stopped, report.is_sound) == ([], None, True)
     page = page_of(report)
     assert "Every row passed" in page
     assert "No report was given" in page
     assert page.count("<td>pass</td>") == sum(map(len, found.values())) > 30
-    kept = msgspec.json.decode(msgspec.json.encode(report), type=Report)
-    after = begun(msgspec.structs.replace(kept, began_ns=5), 7, 6, None)
+    after = begun(msgspec.structs.replace(reread(report), began_ns=5), 7, 6, None, CONFIG.motor)
     assert "<td>+0</td>" in page_of(msgspec.structs.replace(after, findings=found))
     # one that found nothing is no last one
-    assert begun(after, 7, 8, None).last_ns == after.last_ns == 5
+    assert begun(after, 7, 8, None, CONFIG.motor).last_ns == after.last_ns == 5
     # what a pulse would teach of the lag; fast sines teach three times as much
     assert run.loop.planner.believe.carriages.lag_s < 0.008
     # the daemon begins from it, and a core can be built: gains for the motor as it is
@@ -120,12 +126,15 @@ def test_the_row_of_what_a_fault_changes_turns_red(bench, steps, device, expecte
     assert (expected in red(found), stopped) == (True, None)
 
 
-WEAK_MAGNET = {"plant": with_part("field", coefficient=0.72 * SAMPLE.field.coefficient)}
-WRONG_INSERT = {"plant": with_insert(SAMPLE, "MRE-10-10")}
-LOW_GAIN = {"alters": sensing(lambda force_N: 0.55 * force_N)}
-
-
-@pytest.mark.parametrize("device", [WEAK_MAGNET, WRONG_INSERT, LOW_GAIN], ids=["magnet", "insert", "gain"])
+@pytest.mark.parametrize(
+    "device",
+    [
+        {"plant": with_part("field", coefficient=0.72 * SAMPLE.field.coefficient)},
+        {"plant": with_insert(SAMPLE, "MRE-10-10")},
+        {"alters": sensing(lambda force_N: 0.55 * force_N)},
+    ],
+    ids=["magnet", "insert", "gain"],
+)
 def test_weak_magnet_wrong_insert_and_sensor_gain_share_a_row_that_names_them(bench, device):
     found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen("force over gap"))
     assert stopped is None or stopped.code == "SENSOR"
@@ -162,7 +171,7 @@ def test_a_weight_tells_the_sensors_gain(bench, gain):
 def test_a_device_that_cannot_go_on_stops_with_its_fault_on_the_page(bench, steps, device, step, code):
     found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
     assert (stopped.step, stopped.code) == (step, code)
-    page = page_of(msgspec.structs.replace(begun(None, 7, 0, None), findings=found, stopped=stopped))
+    page = page_of(msgspec.structs.replace(NEW, findings=found, stopped=stopped))
     assert code in page
     assert stopped.remedy.split()[0] in page
 
@@ -176,5 +185,25 @@ def test_an_abort_at_any_time_opens_the_gap(bench):
             device.commission(chosen("steps", "carriages"))
         last = [device.loop.tick() for _ in range(3000)][-1]
         assert last.truth.gap_mm > 94.0
-    page = page_of(msgspec.structs.replace(begun(None, 7, 0, None), stopped=Stopped("steps", "interrupted", "x", "y")))
+    page = page_of(msgspec.structs.replace(NEW, stopped=Stopped("steps", "interrupted", "x", "y")))
     assert "The gap was told to open" in page
+
+
+def test_a_step_with_a_row_that_was_not_measured_is_run_again():
+    """As one is left that the host stalled; its half width is none, so that the report can be read again."""
+    seen = finding("supply", 12.0, "V", (11.0, 13.0), "look")
+    unseen = finding("drag", math.nan, "N", (0.0, 1.0), "look", half_width=math.nan)
+    findings = {"link and host": [seen], "homing": [seen], "steps": [seen, unseen], "memory": [seen]}
+    before = reread(msgspec.structs.replace(NEW, findings=findings, stopped=Stopped("memory", "SKEW", "x", "y")))
+    after = before.resumed(None)
+    assert (list(after.findings), after.stopped) == (["link and host", "homing"], None)
+
+
+def test_the_last_time_of_another_motor_is_told_in_shares_of_todays():
+    share, force = "left resistance over motor.resistance_ohm", "sensor's zero"
+    found = [
+        finding(name, 1.2, "", (0.0, 2.0), "look") for name in (share, "right friction over the configured", force)
+    ]
+    todays = msgspec.structs.replace(CONFIG.motor, resistance_ohm=1.2 * CONFIG.motor.resistance_ohm, coulomb_V=0.0)
+    after = begun(msgspec.structs.replace(NEW, findings={"steps": found}), 7, 6, None, todays)
+    assert after.last == {share: pytest.approx(1.0), force: 1.2}

@@ -6,6 +6,7 @@ import math
 import msgspec
 
 from tormagd.commission.gains import Corners, stiffest, tunings
+from tormagd.commission.of_carriages import BACK_EMF, FRICTION, INERTIA, RESISTANCE, nominals
 from tormagd.commission.report import Report
 from tormagd.config import Config
 
@@ -18,22 +19,23 @@ DIGITS = "{:.4g}"
 
 
 def calibration(report: Report, config: Config) -> str:
-    """Return the TOML that `load_calibration` reads: [motor], [position], [trim]; `config` was in force.
+    """Return the TOML that `load_calibration` reads: serial_number, [motor], [position] and [trim].
 
-    A table is left out where its findings are not known, or where no gain is robust; [position] also goes with [motor].
-    The first line is a comment, and without tables the only one.
+    `config` was in force, and what the report has as shares is of its motor. [motor] is the mean of both sides; it is
+    left out where one of its eight findings is not known. [position] is left out then, too, and where no gain is
+    robust; [trim] where the device's force over the model's is not known. Rows that failed are not left out: the first
+    line, a comment, counts them.
     """
     motor, values = config.motor, report.values
-
-    def share(name: str) -> float:
-        return (values.get(f"left {name}", math.nan) + values.get(f"right {name}", math.nan)) / 2.0
-
-    resistance, back_emf = share("resistance over motor.resistance_ohm"), share("voltage for speed over the configured")
+    found = {
+        name: nominal * (values.get(f"left {name}", math.nan) + values.get(f"right {name}", math.nan)) / 2.0
+        for name, nominal in nominals(motor).items()
+    }
     measured = {
-        "resistance_ohm": motor.resistance_ohm * resistance,
-        "back_emf_V_s": motor.back_emf_V_s * back_emf,
-        "inertia_kg_m2": motor.inertia_kg_m2 * share("inertia over motor.inertia_kg_m2"),
-        "coulomb_V": motor.coulomb_V * share("friction over the configured") * resistance / back_emf,
+        "resistance_ohm": found[RESISTANCE],
+        "back_emf_V_s": found[BACK_EMF],
+        "inertia_kg_m2": found[INERTIA],
+        "coulomb_V": found[FRICTION] * found[RESISTANCE] / found[BACK_EMF],
     }
     lines = [
         f"# by `tormagctl commission`; {len(report.failed)} rows failed",
@@ -51,9 +53,10 @@ def calibration(report: Report, config: Config) -> str:
 
 
 def _position(config: Config) -> list[str]:
-    """Return the table [position], in lines, with the stiffest gains that are robust around the motor of `config`.
+    """Return the lines of the table [position], with the stiffest gains that are robust around the motor of `config`.
 
-    Empty where none are.
+    Before them goes a comment with the margins. Robust is at the control rate, with resistance and inertia off by
+    SURELY. An empty list where no gains are.
     """
     position = config.position
     grid = itertools.product(DERIVATIVE_TIMES_S, (position.derivative_filter_s,), (position.integral_time_s,))

@@ -14,9 +14,10 @@ SURE = 2.0
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One row of a commissioning. `value` None: it could not be measured, and counts as failed.
+    """One row of a commissioning: a value in `unit`, which passes from `least` to `most`, these included.
 
-    The value lies within `half_width` of what was measured, 95 times of 100. It passes from `least` to `most`.
+    The truth lies within `half_width` of the value, 95 times of 100; 0 where no interval is known. `value` None: it
+    could not be measured, and counts as failed. `remedy` says what to do where it fails.
     """
 
     name: str
@@ -47,17 +48,25 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 def finding(
-    name: str, values: Array | float, unit: str, allowed: tuple[float, float], remedy: str, scale: float = 1.0
+    name: str,
+    values: Array | float,
+    unit: str,
+    allowed: tuple[float, float],
+    remedy: str,
+    scale: float = 1.0,
+    half_width: float = 0.0,
 ) -> Finding:
-    """Return the finding of a mean, or of one number, times `scale`; without finite values it is not measured.
+    """Return the finding of the mean of `values`, or of one number, times `scale`, which turns it into `unit`.
 
-    The interval is of the means of BLOCKS parts of `values`, in their order. Fewer than 2 * BLOCKS finite ones have
-    none: its half width is 0.
+    Values that are not finite are left out; where none is left it is not measured. `allowed` are least and most, in
+    `unit`. The interval is of the means of BLOCKS parts of `values`, in their order. Fewer than 2 * BLOCKS finite ones
+    have `half_width`, which is in `unit`, too.
     """
     known = np.atleast_1d(np.asarray(values, dtype=np.float64)) * scale
     known = known[np.isfinite(known)]
-    value = float(known.mean()) if known.size else None
-    width = 0.0
+    if not known.size:
+        return Finding(name, None, 0.0, unit, *allowed, remedy)
     if known.size >= 2 * BLOCKS:
-        width = SURE * float(np.std([part.mean() for part in np.array_split(known, BLOCKS)])) / math.sqrt(BLOCKS - 1)
-    return Finding(name, value, width, unit, *allowed, remedy)
+        means = [part.mean() for part in np.array_split(known, BLOCKS)]
+        half_width = SURE * float(np.std(means)) / math.sqrt(BLOCKS - 1)
+    return Finding(name, float(known.mean()), half_width, unit, *allowed, remedy)

@@ -23,9 +23,6 @@ JUMP_S = 0.6
 SLOW_S = 6.0
 "Time of the slow way, to and fro each."
 SMOOTH_S, SLOWEST_MM_S = 0.2, 0.5
-FRICTION = (0.7, 1.16)
-"""Most of it is the gearbox's: a screw that runs dry adds a fifth. One that is dry by half adds 3 to 6 %: it is not
-told from other gains, which add up to 10, and other gearboxes."""
 SINES_HZ = (24.0, 16.0, 8.0, 4.0, 2.0, 1.0)
 "The slow ones last: what they teach of the carriages' lag stays, and forces of a scene are slow."
 SINE_S = 3.0
@@ -46,18 +43,48 @@ PLUG = "look at the motor's plugs, wires and brushes"
 SCALE = "compare motor, gear ratio, screw lead and the encoder's counts with [motor]: one of them is another"
 COUPLED = "look at gearbox and coupling, and compare the motor with [motor]"
 GREASE = "grease the screw; look what rubs, and at the gearbox. A device that is right: take its calibration"
+RESISTANCE = "resistance over motor.resistance_ohm"
+BACK_EMF = "voltage for speed over the configured"
+INERTIA = "inertia over motor.inertia_kg_m2"
+FRICTION = "friction over the configured"
+ALLOWED = {RESISTANCE: (0.75, 1.25), BACK_EMF: (0.88, 1.12), INERTIA: (0.6, 2.2), FRICTION: (0.7, 1.16)}
+"""By the name of a finding. Most friction is the gearbox's: a screw that runs dry adds a fifth. One that is dry by half
+adds 3 to 6 %: it is not told from other gains, which add up to 10, and other gearboxes."""
+REMEDIES = {RESISTANCE: PLUG, BACK_EMF: SCALE, INERTIA: COUPLED, FRICTION: GREASE}
 
 
 class Driven(NamedTuple):
-    """What one carriage's motor shows: ohm, V s and kg m2 as in `[motor]`, with the half widths of their intervals."""
+    """What one carriage's motor shows: ohm, V s and kg m2 as in `[motor]`, each with the half width of its interval.
+
+    Both numbers of a pair are NaN where it does not show.
+    """
 
     resistance_ohm: tuple[float, float]
     back_emf_V_s: tuple[float, float]
     inertia_kg_m2: tuple[float, float]
 
 
+def nominals(motor: Motor) -> dict[str, float]:
+    """Return what the findings on a motor are shares of, by their names, which a side goes before: `left NAME`.
+
+    These are resistance, ohm, back EMF, V s, inertia, kg m2, and the torque of the dry friction, N m; NaN for none.
+    """
+    return {
+        RESISTANCE: motor.resistance_ohm,
+        BACK_EMF: motor.back_emf_V_s,
+        INERTIA: motor.inertia_kg_m2,
+        FRICTION: motor.coulomb_V / motor.resistance_ohm * motor.back_emf_V_s or math.nan,
+    }
+
+
 def carriages(known: Known) -> Course[list[Finding]]:
-    """Jump and swing over the range: each carriage's gain and lag, its motor, and the loop's margin with that motor."""
+    """Go slowly, jump and swing over the range, with the device enabled and its handle moved, and return 15 findings.
+
+    For each side they are gain, lag, ms, and bandwidth, Hz, of the answer to sines. Then come, for each side,
+    resistance, back EMF, inertia and friction, as shares of those in [motor]. Last is the loop's gain margin, dB, with
+    the motor that was found. The device stays ENABLED. Raises StoppedError for a fault, or a handle that stands at
+    first.
+    """
     levels_N = [known.force_N(share) for share in JUMP_SHARES]
     yield from ready(levels_N[0])
     times_s, forces_N = (0.0, SLOW_S, 2.0 * SLOW_S), (levels_N[0], known.most_N, levels_N[0])
@@ -72,7 +99,7 @@ def carriages(known: Known) -> Course[list[Finding]]:
     ticks = {name: np.concatenate([each[name] for each in (jumps, *swings.values())]) for name in jumps}
     driven = [_driven(known, ticks, side) for side in SIDES]
     for side, motor in zip(SIDES, driven, strict=True):
-        found += [*_motor_findings(known, side, motor), _friction(known, slow, side, motor)]
+        found += _motor_findings(known, slow, side, motor)
     margin_dB = margins(identified(known.config.motor, driven), known.config.position, known.period_s).gain_margin_dB
     return [*found, finding("gain margin of the position loop", margin_dB, "dB", (6.0, 200.0), GAINS)]
 
@@ -82,7 +109,10 @@ def _sine(middle_N: float, swing_N: float, at_Hz: float) -> Callable[[float], fl
 
 
 def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
-    """Return how one carriage answers the sines: its gain and lag at AT_HZ, and up to which frequency it follows."""
+    """Return how one carriage, `left` or `right`, answers the sines: gain and lag at AT_HZ, and its bandwidth.
+
+    `swings` are the ticks of each sine by its frequency, Hz, AT_HZ among them. The lag is in ms, the bandwidth in Hz.
+    """
     ratios = {at_Hz: _ratio(sine, side, at_Hz) for at_Hz, sine in swings.items()}
     lag_s = -cmath.phase(ratios[AT_HZ]) / (math.tau * AT_HZ)
     most_Hz = max(SINES_HZ)
@@ -100,9 +130,11 @@ def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
 
 
 def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
-    """Return up to which frequency a carriage follows, by its ratio at each; the highest tried where it follows all.
+    """Return up to which frequency, Hz, a carriage follows, by its ratio at each; the highest where it follows all.
 
-    In between, what it lacks counts as linear over the logarithm of the frequency. 0 where it follows none.
+    `ratios` are those of `_ratio` by frequency, Hz; NaN counts as not followed. A carriage follows with at least
+    MIN_RATIO of the swing, at most MAX_BEHIND late. Between two frequencies what it lacks counts as linear over the
+    logarithm of the frequency. 0 where it does not follow the lowest.
     """
     lacks = [
         (at_Hz, max(MIN_RATIO / max(abs(it), 1e-9), abs(cmath.phase(it)) / MAX_BEHIND))
@@ -117,9 +149,9 @@ def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
 
 
 def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
-    """Return how a carriage swings at `at_Hz` over half of the gap's reference, by both Fourier coefficients.
+    """Return a carriage's swing at `at_Hz` over half of the gap reference's: its size and, as its angle, its lead, rad.
 
-    Of the whole turns after the first. NaN where the reference stands.
+    Counted are whole turns after the first. A carriage that lags has a negative angle. NaN where the reference stands.
     """
     times_s = ticks["monotonic_s"] - ticks["monotonic_s"][0]
     whole = (times_s >= 1.0 / at_Hz) & (times_s < math.floor(SINE_S * at_Hz) / at_Hz)
@@ -132,10 +164,10 @@ def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
 
 
 def _driven(known: Known, ticks: Columns, side: str) -> Driven:
-    """Return what a motor shows of itself, in the units of [motor], each with its half width; NaN where it is not told.
+    """Return what a side's motor shows of itself while its carriage moves; NaN where that is too little.
 
-    Two regressions in the units of the carriage give it. Windings: V = R i + L di/dt + K v + V0. Gearbox:
-    i = m a + sign(v) c + p(x) + d v, where p is as the magnets' pull over the gap.
+    Two regressions in the units of the carriage give it. Windings: V = R i + L di/dt + K v + V0. Gearbox: i = m a +
+    sign(v) c + p(x) + d v, where p is as the magnets' pull over the gap.
     """
     motor, period_s = known.config.motor, known.period_s
     volts, current_A, slope_A_s, speed_m_s, acceleration, moves, window = smoothed(period_s, ticks, side)
@@ -157,9 +189,10 @@ def _driven(known: Known, ticks: Columns, side: str) -> Driven:
 
 
 class Smoothed(NamedTuple):
-    """One carriage's columns (n) without the encoder's steps, all smoothed alike; `window` ticks blur both ends.
+    """One carriage's columns, a row for each of n ticks, without the encoder's steps; all are smoothed alike.
 
-    `moves` is where the carriage has gone one way all the time. Opening is positive.
+    `moves` is True where the carriage has gone one way for the whole window. Opening is positive. The first and the
+    last `window` rows are blurred by the ends.
     """
 
     volts: Array
@@ -172,7 +205,11 @@ class Smoothed(NamedTuple):
 
 
 def smoothed(period_s: float, ticks: Columns, side: str) -> Smoothed:
-    """Return how a carriage moved, and by which voltage and current, from control ticks that are `period_s` apart."""
+    """Return how the carriage `side`, `left` or `right`, moved, and by which voltage and current.
+
+    `ticks` are columns (n) that are `period_s` apart, which is not checked: SIDE_duty, SIDE_current_A, SIDE_mm and
+    supply_V. NaN in one of them makes the rows around it NaN, and not moving.
+    """
     window = max(round(WINDOW_S / period_s), 1) | 1
     # a tick's duty acts until the next tick's measurement
     volts = smooth(np.roll(ticks[f"{side}_duty"], 1) * ticks["supply_V"], window)
@@ -185,51 +222,44 @@ def smoothed(period_s: float, ticks: Columns, side: str) -> Smoothed:
 
 
 def smooth(values: Array, window: int) -> Array:
-    """Return values (n) after two running means over `window` of them; both ends fall off."""
+    """Return values (n) after two running means over `window` of them; towards both ends they fall to 0.
+
+    Where n is under 2 * window - 1, that many come back.
+    """
     kernel = np.convolve(np.full(window, 1.0 / window), np.full(window, 1.0 / window))
     return np.convolve(values, kernel, "same")
 
 
-def _motor_findings(known: Known, side: str, driven: Driven) -> list[Finding]:
-    """Return three findings on a carriage's motor: resistance, voltage for speed and inertia over the configured.
+def _motor_findings(known: Known, slow: Columns, side: str, driven: Driven) -> list[Finding]:
+    """Return a motor's resistance, back EMF, inertia and dry friction as shares of those in [motor], four findings.
 
-    A finding has no value where `driven` has NaN.
+    `slow` are the ticks of the slow way, which shows the friction. What is NaN is not measured.
     """
-    motor = known.config.motor
-
-    def over(
-        name: str, seen: tuple[float, float], nominal: float, allowed: tuple[float, float], remedy: str
-    ) -> Finding:
-        value = seen[0] / nominal if math.isfinite(seen[0]) else None
-        return Finding(f"{side} {name}", value, seen[1] / nominal, "", *allowed, remedy)
-
+    torque_Nm = _friction_A(known.period_s, slow, side) * driven.back_emf_V_s[0]
+    seen = zip(nominals(known.config.motor).items(), (*driven, (torque_Nm, 0.0)), strict=True)
     return [
-        over("resistance over motor.resistance_ohm", driven.resistance_ohm, motor.resistance_ohm, (0.75, 1.25), PLUG),
-        over("voltage for speed over the configured", driven.back_emf_V_s, motor.back_emf_V_s, (0.88, 1.12), SCALE),
-        over("inertia over motor.inertia_kg_m2", driven.inertia_kg_m2, motor.inertia_kg_m2, (0.6, 2.2), COUPLED),
+        finding(f"{side} {name}", value / nominal, "", ALLOWED[name], REMEDIES[name], half_width=width / nominal)
+        for (name, nominal), (value, width) in seen
     ]
 
 
-def _friction(known: Known, ticks: Columns, side: str, driven: Driven) -> Finding:
-    """Return a carriage's dry friction over the configured: half of what opening takes more of force than closing.
+def _friction_A(period_s: float, ticks: Columns, side: str) -> float:
+    """Return the current, A, that a carriage's dry friction takes: half of what opening takes more than closing.
 
-    It is of the closer half of a slow way to and fro, where the magnets press most on the screw.
+    It is of the closer half of a slow way to and fro, where the magnets press most on the screw. `ticks` are `period_s`
+    apart. NaN where the carriage did not go both ways there.
     """
-    motor, window = known.config.motor, max(round(SMOOTH_S / known.period_s), 1)
+    window = max(round(SMOOTH_S / period_s), 1)
     flat = np.full(window, 1.0 / window)
     current_A, place_mm = (np.convolve(ticks[f"{side}_{name}"], flat, "same") for name in ("current_A", "mm"))
-    speed = np.gradient(place_mm) / known.period_s
+    speed = np.gradient(place_mm) / period_s
     speed[:window] = speed[-window:] = 0.0
     close = place_mm < np.median(place_mm)
     opening, closing = (current_A[close & (goes > SLOWEST_MM_S)] for goes in (speed, -speed))
-    if not opening.size or not closing.size:
-        return finding(f"{side} friction over the configured", math.nan, "", FRICTION, GREASE)
-    nominal = motor.coulomb_V / motor.resistance_ohm * motor.back_emf_V_s
-    share = (opening.mean() - closing.mean()) / 2.0 * driven.back_emf_V_s[0] / nominal
-    return finding(f"{side} friction over the configured", float(share), "", FRICTION, GREASE)
+    return float(opening.mean() - closing.mean()) / 2.0 if opening.size and closing.size else math.nan
 
 
 def identified(motor: Motor, driven: Sequence[Driven]) -> Motor:
-    """Return `motor` with the means of what the carriages show, where that is known."""
+    """Return `motor` with the means of what its carriages show; what one of them does not show stays as it is."""
     means = {name: float(np.mean([getattr(each, name)[0] for each in driven])) for name in Driven._fields}
     return msgspec.structs.replace(motor, **{name: value for name, value in means.items() if math.isfinite(value)})

@@ -2,10 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from tormagd.commission.course import (
     MOVING_MM_S,
@@ -29,6 +27,8 @@ SLIDING_MM_S = 20.0
 MIN_SLIDING = 0.3
 "A handle that moves for less than this share of the time has taught little."
 HOLD_S = 10.0
+PARTS = 5
+"In so many parts of that time the force is compared both ways."
 RAMPS_S = (6.0, 4.0, 4.0)
 "Time from the least to the most force; then the same time back."
 STEP_SHARES = (1.0, 0.0, 0.5, 1.0, 0.25, 0.75)
@@ -50,7 +50,10 @@ ELEMENT = (
 
 
 def enabled(force_N: float) -> Course[None]:
-    """Enable a device that is not, with `force_N` as the setpoint. Raises StoppedError as `given`."""
+    """Enable a device that is not, with `force_N` as the setpoint; return nothing.
+
+    It waits for the first tick, however long that takes. Raises StoppedError as `given`, after ENABLE_S.
+    """
     rows: Sequence[Row] = ()
     while not rows:
         _, rows = yield Asked(force_N)
@@ -59,26 +62,31 @@ def enabled(force_N: float) -> Course[None]:
 
 
 def ready(force_N: float) -> Course[None]:
-    """Enable a device that is not, at `force_N`, and wait until its handle moves. Raises StoppedError."""
+    """Enable a device that is not, at `force_N`, and wait until its handle moves. Raises as `enabled`,
+    `handle_moved`."""
     yield from enabled(force_N)
     yield from handle_moved(force_N)
 
 
 def sensor(known: Known) -> Course[list[Finding]]:
-    """Hold one force on a handle that moves both ways: the sensor's zero, noise and resolution, and force over rate."""
+    """Hold one force for HOLD_S on a handle that is moved both ways, and return four findings on the sensor.
+
+    They are its zero, noise and resolution, mN, and the force when slow over that at speed, as a share of the model's.
+    The first fifth of the time does not count. A finding that the handle's motion does not show is not measured. The
+    device stays ENABLED. Raises StoppedError for a fault, or a handle that hardly moves.
+    """
     held_N = known.force_N(0.4)
     yield from ready(held_N)
     ticks = yield from watch(HOLD_S, lambda t_s: held_N)
     later = {name: values[len(values) // 5 :] for name, values in ticks.items()}
     require_sliding(later)
     raw_N, speed = later["device_force_N"], np.abs(later["handle_rate_mm_s"])
-    way = _way(known, later)
-    halves = [
-        (np.mean(force[goes > 0]) + np.mean(force[goes < 0])) / 2.0
-        for force, goes, fast in _blocks(raw_N, way, speed > SLIDING_MM_S)
-        if (goes[fast] > 0).any() and (goes[fast] < 0).any()
-        for force, goes in [(force[fast], goes[fast])]
-    ]
+    way = np.where(speed > SLIDING_MM_S, _way(known, later), 0.0)
+    both_ways = (
+        (force_N[goes > 0], force_N[goes < 0])
+        for force_N, goes in zip(np.array_split(raw_N, PARTS), np.array_split(way, PARTS), strict=True)
+    )
+    halves = [(np.mean(up_N) + np.mean(down_N)) / 2.0 for up_N, down_N in both_ways if up_N.size and down_N.size]
     jumps_N = np.abs(np.diff(raw_N))
     over_model = later["measured_cf"] / later["predicted_cf"]
     slow, fast = (over_model[(speed > low) & (speed <= high)] for low, high in ((MOVING_MM_S, 25.0), (40.0, np.inf)))
@@ -100,7 +108,12 @@ def sensor(known: Known) -> Course[list[Finding]]:
 
 
 def force_over_gap(known: Known) -> Course[list[Finding]]:
-    """Go slowly over the whole range and back: the device's force over the model's, and the screws' friction."""
+    """Go slowly over the whole range and back as RAMPS_S says, while the handle is moved, and return two findings.
+
+    They are the device's force over the model's, and by how much, mN RMS, it is off the learned curve. The device stays
+    ENABLED. Raises StoppedError for a fault, and then has the first finding in `found`; also for a handle that hardly
+    moves.
+    """
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
     times_s = np.cumsum([0.0, *(lasts_s for lasts_s in RAMPS_S for _ in range(2))])
@@ -123,14 +136,22 @@ def force_over_gap(known: Known) -> Course[list[Finding]]:
 
 
 def _strength(ticks: Columns) -> Finding:
-    """Return the device's force over the model's: what magnets, insert and the sensor's gain share."""
+    """Return the device's force over the model's: what magnets, insert and the sensor's gain share.
+
+    It is the mean of the ticks at over SLIDING_MM_S; without any it is not measured.
+    """
     slides = (np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S) & (ticks["predicted_cf"] > 0.0)
     over_model = (ticks["trim"] * ticks["measured_cf"] / ticks["predicted_cf"])[slides]
     return finding("force over the model's: magnets, insert, or sensor's gain", over_model, "", STRENGTH, ELEMENT)
 
 
 def steps(known: Known) -> Course[list[Finding]]:
-    """Step over the range: how exactly steps are followed, and how far carriages overshoot and stand apart."""
+    """Step over the range as STEP_SHARES says, while the handle is moved, and return four findings.
+
+    They are the mean error, measured less asked, and the greatest, mN; the carriages' overshoot, % of a step; and how
+    far apart they stand, mm. Errors count from ARRIVED_S after each step on. The device stays ENABLED. Raises
+    StoppedError for a fault, or a handle that hardly moves.
+    """
     levels_N = [known.force_N(share) for share in STEP_SHARES]
     yield from ready(levels_N[1])
     yield from watch(ARRIVED_S, lambda t_s: levels_N[1])
@@ -159,7 +180,11 @@ def steps(known: Known) -> Course[list[Finding]]:
 
 
 def memory(known: Known) -> Course[list[Finding]]:
-    """Step up, hold that gap, and see how much of the force dies away between 0.5 and 5 s after the step."""
+    """Step up, hold that gap, and return one finding: the force that dies away from 0.5 to 5 s after the step, %.
+
+    It is a share of the force at 0.5 s; not measured where the handle is not moved both ways at over FAST_MM_S. The
+    device is paused for HELD_S, then ENABLED again. Raises StoppedError for a fault, or a handle that stands at first.
+    """
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
     yield from watch(RESTED_S, lambda t_s: low_N)
@@ -173,13 +198,15 @@ def memory(known: Known) -> Course[list[Finding]]:
     rows = np.column_stack([np.ones_like(since_s), np.log(since_s / RISEN_S), _way(known, ticks)])[slides]
     values, widths = fitted(rows, ticks["measured_cf"][slides], np.floor(since_s[slides]))
     share = -math.log(10.0) / values[0]
-    dies = None if math.isnan(values[1]) else float(100.0 * share * values[1])
-    width = float(100.0 * abs(share * widths[1]))
-    return [Finding("force that dies away from 0.5 to 5 s", dies, width, "%", -2.0, 4.5, WORN)]
+    dies, width = 100.0 * share * values[1], float(100.0 * abs(share * widths[1]))
+    return [finding("force that dies away from 0.5 to 5 s", dies, "%", (-2.0, 4.5), WORN, half_width=width)]
 
 
 def require_sliding(ticks: Columns) -> None:
-    """Raise StoppedError where the handle moved for less than MIN_SLIDING of the ticks."""
+    """Raise StoppedError where the handle moved, either way, for less than MIN_SLIDING of the ticks, or there are none.
+
+    Moving is at MOVING_MM_S or more; a rate of NaN is none.
+    """
     rates = ticks["handle_rate_mm_s"]
     share = float(np.mean(np.abs(rates) >= MOVING_MM_S)) if rates.size else 0.0
     if share < MIN_SLIDING:
@@ -191,7 +218,7 @@ def require_sliding(ticks: Columns) -> None:
 
 
 def _way(known: Known, ticks: Columns) -> Array:
-    """Return which way the handle goes on its encoder, 1 or -1."""
+    """Return which way the handle goes on its encoder in each tick, 1, -1, or 0 where it stands."""
     return np.sign(np.gradient(_smooth(ticks["device_handle_mm"], round(0.02 / known.period_s))))
 
 
@@ -200,8 +227,3 @@ def _smooth(values: Array, window: int) -> Array:
     window = max(window, 1) | 1
     padded = np.pad(values, window // 2, mode="edge")
     return np.convolve(padded, np.full(window, 1.0 / window), "valid")
-
-
-def _blocks(*columns: npt.NDArray[Any]) -> list[tuple[npt.NDArray[Any], ...]]:
-    """Return columns in five equal parts."""
-    return list(zip(*(np.array_split(column, 5) for column in columns), strict=True))

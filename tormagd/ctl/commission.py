@@ -88,10 +88,9 @@ def commission(
                 raise usage_error(f"{path}: [motor] has changed since, in the daemon", "leave --resume out")
             report = before.resumed(weight_N)
         else:
-            report = begun(before, serial_number, time.time_ns(), weight_N)
+            report = begun(before, serial_number, time.time_ns(), weight_N, config.motor)
         if not is_agreed:
             agree()
-        report = msgspec.structs.replace(report, motor=config.motor)
         kept = Kept(path, report if checks is None else msgspec.structs.replace(report, conformance=checks))
         with connected(endpoints, client) as run:
             kept.follow(run, known)
