@@ -22,7 +22,11 @@ SWITCH = "look at the switch, its cable and the coupling between motor and screw
 
 
 def link(known: Known) -> Course[list[Finding]]:
-    """Watch a device that nobody drives: its link, its clock, its supply, and the periods that the host keeps."""
+    """Watch a device for REST_S without a setpoint, in any state but FAULT, and judge what carries every other step.
+
+    Six findings: round trip, periods with the device's answer, messages lost, periods that the host kept, supply and
+    temperature. What no tick says is not measured. Raises StoppedError for a fault.
+    """
     ticks = yield from watch(REST_S, states=ANY_STATE)
     steps_s = np.diff(ticks["monotonic_s"])
     lost = ticks["link_unanswered"] + ticks["link_damaged"]
@@ -59,9 +63,13 @@ def link(known: Known) -> Course[list[Finding]]:
     ]
 
 
-def homing(known: Known) -> Course[list[Finding]]:
-    """Home the device, and look where its switches are."""
-    del known
+def homing(_known: Known) -> Course[list[Finding]]:
+    """Disable the device, wait until its gap is open, home it, and return three findings.
+
+    They are how long homing takes, s, and where the left and the right switch then are, mm by the device's encoders.
+    The device is left homed and DISABLED. Raises StoppedError for a fault, and where it takes longer than BEGINS_S,
+    OPENING_S or HOMING_S allow.
+    """
     yield from given("disable", lambda row: bool(row[_STATE] == "DISABLED"), BEGINS_S)
     yield from watch(TOLD_S, states=ANY_STATE)
     yield from given("", _is_idle, OPENING_S)
@@ -75,9 +83,11 @@ def homing(known: Known) -> Course[list[Finding]]:
 
 
 def weight(known: Known) -> Course[list[Finding]]:
-    """Read the force sensor without and with a weight on it: its gain.
+    """Read the force sensor without and with a weight on it, and return one finding: its gain, read over hung.
 
-    Raises StoppedError where no weight shows within HUNG_S.
+    `known.weight_N` may not be None. The weight shows once the reading has changed by 0.4 of it, either way; it then
+    swings out for SWINGS_S. Raises StoppedError where none shows within HUNG_S, and for a fault. Without a reading
+    before, none ever shows.
     """
     assert known.weight_N is not None, "the step is left out without one"
     before = yield from watch(REST_S, states=ANY_STATE)
@@ -85,7 +95,7 @@ def weight(known: Known) -> Course[list[Finding]]:
     hung_N = 0.4 * known.weight_N
 
     def is_hung(row: Row) -> bool:
-        return bool(abs((row[_FORCE] or 0.0) - begins_N) > hung_N)
+        return row[_FORCE] is not None and bool(abs(row[_FORCE] - begins_N) > hung_N)
 
     yield from given("", is_hung, HUNG_S)
     yield from watch(SWINGS_S, states=ANY_STATE)
@@ -94,9 +104,13 @@ def weight(known: Known) -> Course[list[Finding]]:
     return [finding("sensor's gain, by the weight", share, "", (0.95, 1.05), "calibrate the sensor, or replace it")]
 
 
-def way_back(known: Known) -> Course[list[Finding]]:
-    """Open the gap, and look whether both carriages meet their switches where they left them."""
-    del known
+def way_back(_known: Known) -> Course[list[Finding]]:
+    """Disable the device, which opens the gap, and look whether the carriages meet their switches where they left them.
+
+    Four findings: how long opening takes, s; where the left and the right switch first closed, mm; how fast the
+    device's clock runs, ppm. A switch that did not close is not measured. The device is left DISABLED. Raises
+    StoppedError for a fault, and after OPENING_S.
+    """
     ticks = yield from given("disable", _is_idle, OPENING_S)
     at = []
     for side in SIDES:

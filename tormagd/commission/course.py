@@ -80,13 +80,12 @@ Course: TypeAlias = Generator[Asked, Heard, Found]
 class StoppedError(Exception):
     """A course that cannot go on: a code, the cause in a sentence, what to do.
 
-    `rows` are the ticks until then, `found` the findings that they still give.
+    `rows` are the ticks that `watch` had until then, `found` the findings that they still give; both may be empty.
     """
 
-    def __init__(self, code: str, cause: str, remedy: str) -> None:
+    def __init__(self, code: str, cause: str, remedy: str, rows: Sequence[Row] = ()) -> None:
         super().__init__(cause)
-        self.code, self.cause, self.remedy = code, cause, remedy
-        self.rows: Sequence[Row] = ()
+        self.code, self.cause, self.remedy, self.rows = code, cause, remedy, rows
         self.found: Sequence[Finding] = ()
 
 
@@ -101,9 +100,11 @@ class Device(Protocol):
 
 
 def drive(course: Course[Found], device: Device) -> Found:
-    """Run `course` on `device` to its end, and return what it found. However it ends early, the gap is told to open.
+    """Run `course` on `device` to its end, and return what it found.
 
-    Raises what the course and the device raise.
+    A command goes out before the force that is asked with it. Raises what the course (StoppedError) and the device
+    raise. Whatever is raised, KeyboardInterrupt too, the device is first given `disable`, which opens the gap. At a
+    regular end nothing is commanded: the gap stays where it is.
     """
     try:
         asked = next(course)
@@ -120,7 +121,11 @@ def drive(course: Course[Found], device: Device) -> Found:
 
 
 def columns_of(rows: Iterable[Row]) -> Columns:
-    """Return the ticks as an array for each of COLUMNS: floats, NaN where a number is not known, or words."""
+    """Return the ticks as one array for each of COLUMNS, by name; without ticks all are empty.
+
+    NUMBERS are floats, NaN where a value is None. WORDS are objects as they came: text, None, or a sequence of texts.
+    Raises ValueError for rows of different lengths; that they are as long as COLUMNS is not checked.
+    """
     by_name = zip(*rows, strict=True)
     table = dict(zip(COLUMNS, by_name, strict=False)) or dict.fromkeys(COLUMNS, ())
     return {
@@ -138,10 +143,11 @@ def watch(
     *,
     is_told_ahead: bool = False,
 ) -> Course[Columns]:
-    """Ask for a force over the time, s, for `lasts_s`, and return all ticks; None publishes nothing.
+    """Ask for a force, N, over the time, s, for `lasts_s`, and return all ticks as `columns_of`.
 
-    `is_told_ahead` also tells the forces that follow. Raises StoppedError for a tick in another operating state than
-    `states`.
+    `force_N` is called with the time since the first ticks came; None: no setpoint is published. `is_told_ahead` also
+    tells the PREVIEW_STEPS forces that follow. Raises StoppedError for a tick in another operating state than `states`;
+    its `rows` are the ticks before.
     """
     rows: list[Row] = []
     ahead_s = [PREVIEW_STEP_S * number for number in range(1, 1 + PREVIEW_STEPS)] if is_told_ahead else []
@@ -149,11 +155,7 @@ def watch(
     while t_s < lasts_s:
         asked = Asked() if force_N is None else Asked(force_N(t_s), "", tuple(force_N(t_s + it) for it in ahead_s))
         now_s, fresh = yield asked
-        try:
-            _require_state(fresh, states)
-        except StoppedError as error:
-            error.rows = rows
-            raise
+        _require_state(fresh, states, rows)
         rows += fresh
         begun_s = now_s if math.isnan(begun_s) else begun_s
         t_s = now_s - begun_s
@@ -161,10 +163,11 @@ def watch(
 
 
 def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: float | None = None) -> Course[Columns]:
-    """Give `command`, and return all ticks until the newest `is_done`. Asks for `force_N`, N, meanwhile; None for none.
+    """Give `command` once, and wait until the newest tick `is_done`; return all ticks heard as `columns_of`.
 
-    An empty `command` gives none. Raises StoppedError for a fault in any but the first ticks heard, and where it takes
-    over `most_s`.
+    An empty `command` gives none, and only waits. `force_N` is asked for meanwhile; None: no setpoint is published.
+    Raises StoppedError where it takes over `most_s`, and for a tick in FAULT. A fault in the first ticks heard, which
+    may be from before the command, is not looked at.
     """
     begun_s, fresh = yield Asked(force_N, command)
     rows = list(fresh)
@@ -179,9 +182,10 @@ def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: 
 
 
 def handle_moved(force_N: float) -> Course[None]:
-    """Ask for `force_N` until the handle moves at MOVING_MM_S or more, either way.
+    """Ask for `force_N` until a tick shows the handle moving at MOVING_MM_S or more, either way; return nothing.
 
-    Raises StoppedError after HANDLE_PATIENCE_S, and for a later tick in another operating state than ENABLED.
+    Raises StoppedError after HANDLE_PATIENCE_S, and for a tick in another operating state than ENABLED; the first ticks
+    heard are not looked at for that.
     """
     begun_s, fresh = yield Asked(force_N)
     while not any(abs(row[PLACES["handle_rate_mm_s"]] or 0.0) >= MOVING_MM_S for row in fresh):
@@ -195,13 +199,18 @@ def handle_moved(force_N: float) -> Course[None]:
             )
 
 
-def _require_state(rows: Sequence[Row], states: Sequence[str]) -> None:
-    """Raise StoppedError for a tick in another operating state than `states`, with its fault's cause and remedy."""
-    for row in rows:
+def _require_state(fresh: Sequence[Row], states: Sequence[str], before: Sequence[Row] = ()) -> None:
+    """Raise StoppedError, with `before` as its `rows`, for a tick in another operating state than `states`.
+
+    Its code is the tick's first fault by name, STOPPED last, with that fault's cause and remedy. Without a fault it is
+    `not_enabled`. Raises ValueError for a fault that `Fault` does not know.
+    """
+    for row in fresh:
         state = row[PLACES["operating_state"]]
         if state not in states:
             codes = sorted(row[PLACES["faults"]] or (), key=lambda code: bool(code == "STOPPED"))
             if not codes:
-                raise StoppedError("not_enabled", f"the device went {state}: somebody gave a command", "run it again")
+                cause = f"the device went {state}: somebody gave a command"
+                raise StoppedError("not_enabled", cause, "run it again", before)
             known = FAULTS[Fault(codes[0])]
-            raise StoppedError(codes[0], f"{', '.join(codes)}: {known.cause}", known.remedy)
+            raise StoppedError(codes[0], f"{', '.join(codes)}: {known.cause}", known.remedy, before)

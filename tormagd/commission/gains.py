@@ -47,9 +47,10 @@ class Tuning(NamedTuple):
 
 
 def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, float]:  # noqa: B008  # immutable
-    """Return the smallest gain margin, dB, and phase margin, degrees, over every corner, and the number of corners.
+    """Return the least margins of the position loop over every corner: `gain_margin_dB`, `phase_margin_deg`, `corners`.
 
-    The loop's periods are those of `corners`, whatever rate `config` has.
+    `corners` is their number. Motor and gains are those of `config`; the loop's periods are those of `corners`,
+    whatever rate `config` has. Both margins may come from different corners.
     """
     gain, phase = [], []
     factors = (1.0 - corners.share, 1.0 + corners.share)
@@ -68,7 +69,9 @@ def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, fl
 def tunings(config: Config, grid: Grid, corners: Corners = Corners()) -> Iterator[Tuning]:  # noqa: B008  # immutable
     """Yield the largest robust proportional gain for every point of the grid that has one, with its margins.
 
-    The gain is rounded down to a tenth. The motor is that of `config`, which stays as it is.
+    Robust is with MIN_GAIN_MARGIN_DB and MIN_PHASE_MARGIN_DEG or more at every corner. The gain, duty per mm, is
+    rounded down to a tenth and at most LARGEST_GAIN_PER_MM. A point that has none under that is left out. The motor is
+    that of `config`, which stays as it is. A point is searched when it is asked for.
     """
     for derivative_s, filter_s, integral_s in grid:
         position = msgspec.structs.replace(

@@ -6,9 +6,9 @@ from tormagd.config import Config
 
 
 class Known(NamedTuple):
-    """The daemon's configuration, its control period, s, and the forces that it gives, N.
+    """The daemon's configuration, its control period, s, and the least and most force that it gives, N.
 
-    `weight_N` is the weight that a person hangs up; None: none is at hand.
+    `weight_N` is the weight that a person hangs up; None: none is at hand. No value is checked.
     """
 
     config: Config
@@ -18,7 +18,7 @@ class Known(NamedTuple):
     weight_N: float | None = None
 
     def force_N(self, share: float) -> float:
-        """Return the force at a share of the range, which begins CLEAR_N over the device's least force."""
+        """Return the force at a share, 0 to 1, of the range, which begins CLEAR_N over the device's least force."""
         low_N = self.least_N + CLEAR_N
         return low_N + share * (self.most_N - low_N)
 

@@ -14,10 +14,15 @@ KIT = "python -m firmware_protocol.conformance PORT --json > FILE, then --confor
 
 
 def page_of(report: Report) -> str:
-    """Return the HTML page of `report`."""
+    """Return the HTML page of `report`: how it ended, the kit's checks that did not pass, and a row for each finding.
+
+    A step without findings has one row, which says that it was not done. What the report says is escaped.
+    """
+    title = f"Commissioning of device {report.serial_number}"
+    before = f"; the last one began {_date(report.last_ns)}" if report.last_ns else ""
     parts = [
-        f"<h1>Commissioning of device {report.serial_number}</h1>",
-        f"<p>Begun {_date(report.began_ns)}{_before(report)}.</p>",
+        f"<h1>{title}</h1>",
+        f"<p>Begun {_date(report.began_ns)}{before}.</p>",
         _verdict(report),
         "<h2>Conformance of the firmware</h2>",
         _conformance(report),
@@ -26,11 +31,14 @@ def page_of(report: Report) -> str:
         ("" if number else step.name, *row) for step in STEPS for number, row in enumerate(_rows(report, step.name))
     ]
     parts += ["<h2>The device</h2>", table(HEADS, rows, [row[4] == FAIL for row in rows])]
-    return page(f"Commissioning of device {report.serial_number}", parts)
+    return page(title, parts)
 
 
 def _verdict(report: Report) -> str:
-    """Say how it ended, and what failed."""
+    """Return how it ended, and what failed, as HTML paragraphs.
+
+    Of a report that is not whole they also say what to do next. Checks of the kit do not count.
+    """
     said = []
     if report.stopped is not None:
         stopped = report.stopped
@@ -48,7 +56,10 @@ def _verdict(report: Report) -> str:
 
 
 def _conformance(report: Report) -> str:
-    """Show what did not pass of the kit's report, or say that none was given."""
+    """Return the checks of the kit's report that did not pass, as an HTML table.
+
+    Where all passed, or no report was given, it is one paragraph that says so.
+    """
     if report.conformance is None:
         return f"<p>No report was given. The kit owns the device, so it runs without the daemon: {escape(KIT)}</p>"
     if not report.conformance:
@@ -57,7 +68,7 @@ def _conformance(report: Report) -> str:
 
 
 def _rows(report: Report, step: str) -> list[list[str]]:
-    """Return the cells of a step's findings, under HEADS without the first."""
+    """Return the cells of a step's findings, under HEADS without the first; one row where it was not done."""
     if step not in report.findings:
         is_without = step == "weight" and report.weight_N is None
         return [["--weight-N was not given" if is_without else "not done", *[""] * 6]]
@@ -74,7 +85,3 @@ def _row(each: Finding, last: float | None) -> list[str]:
 
 def _date(time_ns: int) -> str:
     return f"{datetime.fromtimestamp(time_ns * 1e-9, UTC):%Y-%m-%d %H:%M} UTC"
-
-
-def _before(report: Report) -> str:
-    return f"; the last one began {_date(report.last_ns)}" if report.last_ns else ""

@@ -58,14 +58,16 @@ def sequence(
     begins: Callable[[Step], object],
     ends: Callable[[Step, Findings], object],
 ) -> Course[Stopped | None]:
-    """Run the `steps` that are not `done`, and return why it stopped early, None where all were done.
+    """Run the `steps` that are not `done`, in order, and return why it stopped early; None where all were done.
 
-    `begins` is told each step, `ends` each step's findings. A device that stops is told to open the gap.
+    `done` are findings by step; of them only the names count. Steps that are `always` run are run again, and `weight`
+    is left out without one. `begins` is called before each step, `ends` behind it with its findings. A StoppedError
+    ends the sequence: `ends` gets the findings that it still has, if any, and the gap is told to open. What a device
+    raises is raised.
     """
     for step in steps:
-        if step.name in done and not step.always:
-            continue
-        if step.name == "weight" and known.weight_N is None:
+        is_done = step.name in done and not step.always
+        if is_done or (step.name == "weight" and known.weight_N is None):
             continue
         begins(step)
         try:
