@@ -13,13 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.lab.characterisation.compression import (
-    Sample,
-    StressStretch,
-    deviations,
-    evaluated_cycle,
-    read_compression,
-)
+from tormagd.lab.characterisation.compression import CYCLES, Sample, StressStretch, evaluated_cycle, read_compression
 from tormagd.lab.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
 from tormagd.lab.characterisation.relaxation import RelaxationRecord, fit_relaxation
 from tormagd.lab.main import Found
@@ -27,47 +21,49 @@ from tormagd.lab.tables import read_columns
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab characterise`."""
+    """Add the options of `tormag-lab characterise`: a kind of record, and for each kind its own.
+
+    `handle` of the parsed options is the function for that kind, which `run` calls.
+    """
     kinds = parser.add_subparsers(required=True)
-    for name, handle in (("compression", compression), ("tension", tension), ("relaxation", relaxation)):
-        kind = kinds.add_parser(name)
+    pressed, pulled, held = (kinds.add_parser(name) for name in ("compression", "tension", "relaxation"))
+    for kind, handle in ((pressed, compression), (pulled, tension), (held, relaxation)):
         kind.add_argument("file", type=Path)
         kind.set_defaults(handle=handle)
-        if name == "compression":
-            kind.add_argument("--diameter-mm", type=float, default=30.0)
-            kind.add_argument("--height-mm", type=float, default=12.5)
-            kind.add_argument("--cycle", type=int, default=4, help="the cycle evaluated, counted from 1")
-        elif name == "tension":
-            kind.add_argument("--strain", default="Engineering Strain", help="column of engineering strain")
-            kind.add_argument("--stress-mpa", default="Engineering Stress (MPa)", help="column of engineering stress")
-            kind.add_argument("--delimiter", default=",", choices=(",", ";", "\t", "|", " "))
-            kind.add_argument("--from-strain", type=float, default=0.05, help="leaves out the slack of the grips")
-            kind.add_argument("--to-strain", type=float, default=0.5)
-        else:
-            kind.add_argument("--branches", type=int, default=3)
-        if name != "relaxation":
-            kind.add_argument("--terms", type=int, default=1, help="terms of the Ogden law")
+    pressed.add_argument("--diameter-mm", type=float, default=30.0)
+    pressed.add_argument("--height-mm", type=float, default=12.5)
+    pressed.add_argument("--cycle", type=int, default=CYCLES, help="the cycle evaluated, counted from 1")
+    pulled.add_argument("--strain", default="Engineering Strain", help="column of engineering strain")
+    pulled.add_argument("--stress-mpa", default="Engineering Stress (MPa)", help="column of engineering stress")
+    pulled.add_argument("--delimiter", default=",", choices=(",", ";", "\t", "|", " "))
+    pulled.add_argument("--from-strain", type=float, default=0.05, help="leaves out the slack of the grips")
+    pulled.add_argument("--to-strain", type=float, default=0.5)
+    for kind in (pressed, pulled):
+        kind.add_argument("--terms", type=int, default=1, help="terms of the Ogden law")
+    held.add_argument("--branches", type=int, default=3)
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the constants of one record. Raises LabError and DomainError."""
+    """Return the constants of one record, by the function for its kind. Raises LabError and DomainError."""
     return Found(options.handle(options))
 
 
 def compression(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the moduli from the evaluated cycle, as `moduli`, its number `cycle`, and `deviations` from the standard.
+    """Return the keys of `moduli` for the evaluated cycle of a compression test, and that cycle's number, `cycle`.
 
-    The options name the file, diameter and height, mm, cycle and terms. Raises LabError and DomainError.
+    Options read: `file`, `diameter_mm`, `height_mm`, `cycle`, from 1, and `terms`. Raises LabError as
+    `read_compression`, `evaluated_cycle` and `moduli`, and DomainError as `Sample` and `moduli`.
     """
     record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
-    curve = evaluated_cycle(record, sample, options.cycle)
-    return {"cycle": options.cycle, "deviations": deviations(record, sample), **moduli(curve, options.terms)}
+    return {"cycle": options.cycle, **moduli(evaluated_cycle(record, sample, options.cycle), options.terms)}
 
 
 def tension(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the moduli, as `moduli`, from the part of a tension test between `from_strain` and `to_strain`.
+    """Return the keys of `moduli` for the rows of a tension test from `from_strain` to `to_strain`, these included.
 
-    The options name the file and its columns. Raises LabError and DomainError as `read_columns` and the fits.
+    Options read: `file`, `delimiter`, the columns `strain`, a fraction, and `stress_mpa`, MPa, both bounds, and
+    `terms`. Raises LabError as `read_columns` and `moduli`, DomainError as `moduli`. Rows of other strains are read,
+    too, and refused alike.
     """
     names = (options.strain, options.stress_mpa)
     columns = read_columns(options.file, names, delimiter=options.delimiter)
@@ -77,11 +73,11 @@ def tension(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
-    """Return the shear moduli of three laws, kPa, and how well each fits, as R2.
+    """Fit three laws to a curve and return each one's shear modulus, `shear_modulus_kPa`, and R2, `r2`.
 
-    The laws are neo-Hookean, Ogden's with up to `terms` terms, and Eq. 3 of the thesis as printed; the latter two also
-    with their own constants. Besides, `points` counts the curve's, and `stretch` is its range. Raises LabError and
-    DomainError as the fits.
+    Keys: `points`, their number; `stretch`, least and most; `neo_hookean`; `ogden`, up to `terms` terms, also with
+    `moduli_kPa` and `exponents`; `thesis_eq_3`, Eq. 3 as printed, also with `G_o_kPa` and `alpha`. Raises LabError and
+    DomainError as `fit_ogden`.
     """
     neo_hookean, ogden = fit_neo_hookean(*curve), fit_ogden(*curve, terms=terms)
     thesis = fit_thesis_ogden(*curve)
@@ -107,9 +103,9 @@ def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
 def relaxation(options: argparse.Namespace) -> dict[str, Any]:
     """Return the fit of the relaxation record in `options.file`, with up to `options.branches` time constants.
 
-    Keys: `fractions` and `times_s` of the series, the shortest time first; `scale_N`, the instant force per unit of
-    driving force; `r2`; `rms_N` of the residual. Raises LabError and DomainError as `read_columns` and
-    `fit_relaxation`.
+    Keys: `fractions` and `times_s` of the series, lists with the shortest time first. Also `scale_N`, the instant force
+    per unit of driving force, `r2`, and `rms_N` of the residual. Raises LabError as `read_columns` and
+    `fit_relaxation`, DomainError as the latter.
     """
     record = RelaxationRecord(**read_columns(options.file, RelaxationRecord._fields))
     fit = fit_relaxation(record, options.branches)

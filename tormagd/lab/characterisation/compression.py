@@ -20,15 +20,6 @@ from tormagd.physics.errors import require
 CYCLES = 4
 """Three conditioning cycles and the one that counts."""
 
-STRAIN = 0.25
-"""Engineering strain that each cycle goes to."""
-
-RATE_MM_MIN = 10.0
-
-STRAIN_TOLERANCE = 0.02
-RATE_TOLERANCE = 0.25
-"""How far strain (absolute) and rate (relative) may be off before `deviations` says so."""
-
 
 @dataclass(frozen=True, slots=True)
 class Sample:
@@ -63,7 +54,8 @@ class StressStretch(NamedTuple):
 
 
 def read_compression(path: Path) -> CompressionRecord:
-    """Read a CSV file with `time_s,displacement_mm,force_N`. Raises `LabError`, also where time does not rise."""
+    """Read a CSV file with `time_s,displacement_mm,force_N`. Raises `LabError` as `read_columns`, and where time does
+    not rise strictly."""
     record = CompressionRecord(**read_columns(path, CompressionRecord._fields))
     if not (np.diff(record.time_s) > 0.0).all():
         raise LabError(f"{path}: time_s does not rise strictly")
@@ -71,24 +63,24 @@ def read_compression(path: Path) -> CompressionRecord:
 
 
 def loading_halves(record: CompressionRecord) -> list[slice]:
-    """Return the loading half of each cycle, as a slice of rows, from the smallest displacement before it to the
-    largest in it.
+    """Return the loading half of each cycle, in order, as a slice of rows; empty where the plates only opened.
 
-    Raises `LabError` if the plates hardly moved.
+    It goes from the smallest displacement before the cycle to the largest in it, which is included. A cycle passes
+    three quarters of the record's whole stroke, and then one quarter or the end. Raises `LabError` if the plates moved
+    by 1 um or less.
     """
     displacement = record.displacement_mm
     low, high = float(displacement.min()), float(displacement.max())
     if not high - low > 1e-3:
         raise LabError(f"displacement_mm goes from {low:g} to {high:g}: that is no cycle")
-    # a cycle passes three quarters of the stroke and then one quarter: noise and a set make none
+    # so noise and a set make no cycle
     quarter = 0.25 * (high - low)
-    compressed = _latched(displacement, low + quarter, high - quarter)
-    edges = np.flatnonzero(np.diff(compressed.astype(np.int8)))
-    rises = [int(edge) + 1 for edge in edges if compressed[edge + 1]]
-    falls = [int(edge) + 1 for edge in edges if not compressed[edge + 1]]
+    compressed = _latched(displacement, low + quarter, high - quarter).astype(np.int8)
+    turns = np.diff(compressed, prepend=compressed[0], append=0)
+    rises = np.flatnonzero(turns > 0).tolist()
+    falls = np.flatnonzero(turns < 0).tolist()[-len(rises) :]
     halves, start = [], 0
-    for rise in rises:
-        end = next((fall for fall in falls if fall > rise), len(displacement))
+    for rise, end in zip(rises, falls, strict=False):
         bottom = start + int(np.argmin(displacement[start : rise + 1]))
         top = rise + int(np.argmax(displacement[rise:end]))
         halves.append(slice(bottom, top + 1))
@@ -97,9 +89,9 @@ def loading_halves(record: CompressionRecord) -> list[slice]:
 
 
 def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCLES) -> StressStretch:
-    """Return stress and stretch while loading in `cycle`, counted from 1; compression is negative.
+    """Return stress and stretch while loading in `cycle`, counted from 1; stress is negative in compression.
 
-    Raises `LabError` if the record has no such cycle, the plates hardly moved, or they reach the sample's height.
+    Raises `LabError` if the record has no such cycle, the plates hardly moved, or they reach the sample's height in it.
     """
     halves = loading_halves(record)
     if not 1 <= cycle <= len(halves):
@@ -109,30 +101,6 @@ def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCL
     if not (stretch > 0.0).all():
         raise LabError(f"displacement_mm reaches the sample's height, {sample.height_mm:g} mm")
     return StressStretch(stretch, -record.force_N[half] / sample.area_m2)
-
-
-def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
-    """Return where a test differs from the standard's method with lubricated plates, one sentence each; empty if
-    nowhere.
-
-    Test piece A is 29 +- 0.5 mm by 12.5 +- 0.5 mm. The thesis's 30 mm is outside, which matters little: the shear
-    modulus from lubricated plates does not depend on the diameter. Raises `LabError` if the plates hardly moved.
-    """
-    halves = loading_halves(record)
-    found = []
-    for name, value, nominal in (("diameter", sample.diameter_mm, 29.0), ("height", sample.height_mm, 12.5)):
-        if abs(value - nominal) > 0.5:
-            found.append(f"{name} {value:g} mm: test piece A has {nominal:g} +- 0.5 mm")
-    if len(halves) != CYCLES:
-        found.append(f"{len(halves)} cycles: the method has {CYCLES} and evaluates the last")
-    for number, half in enumerate(halves, start=1):
-        strain = float(record.displacement_mm[half].max()) / sample.height_mm
-        if abs(strain - STRAIN) > STRAIN_TOLERANCE:
-            found.append(f"cycle {number} goes to {strain:.1%} strain: the method goes to {STRAIN:.0%}")
-        rate = 60.0 * float(np.ptp(record.displacement_mm[half])) / float(np.ptp(record.time_s[half]))
-        if abs(rate / RATE_MM_MIN - 1.0) > RATE_TOLERANCE:
-            found.append(f"cycle {number} loads at {rate:.3g} mm/min: the method loads at {RATE_MM_MIN:g} mm/min")
-    return found
 
 
 def _latched(values: Array, low: float, high: float) -> Mask:

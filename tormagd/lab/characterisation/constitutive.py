@@ -38,10 +38,11 @@ def stretches(radial: float, circumferential: float) -> Array:
 
 
 def cauchy_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressure_Pa: float) -> Array:
-    """Return the true stress T, Pa (3 x 3), of a stretch (3) and a field b (3) (Eq. 25 and 27); tension is positive.
+    """Return the true stress T, Pa (3 x 3), of a stretch (3) and a field b (3), T (Eq. 25 and 27); tension is positive.
 
-    `pressure_Pa` is the multiplier p of the incompressibility, which only the boundary settles: see
-    `pressure_for_free_ends_Pa`. Without strain and field, p = 2 C10 + 4 C01 makes the stress zero.
+    The order is radial, circumferential, axial. `b_T` is the field per undeformed area. `pressure_Pa` is the multiplier
+    p of the incompressibility, which only the boundary settles: see `pressure_for_free_ends_Pa`. Without strain and
+    field, p = 2 C10 + 4 C01 makes the stress zero. No value is checked, nor that the stretch keeps the volume.
     """
     square, flux_T = stretch**2, stretch * b_T
     # I1 - lambda_i^2 is the sum of the two other squares

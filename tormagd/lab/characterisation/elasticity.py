@@ -47,17 +47,6 @@ def ogden_shape(stretch: FloatArray, exponent: float) -> FloatArray:
     return thesis_shape(stretch, exponent) / stretch
 
 
-def stress_Pa(
-    shape: Shape, stretch: FloatArray, moduli_Pa: tuple[float, ...], exponents: tuple[float, ...]
-) -> FloatArray:
-    """Return the stress of a law at these stretches, Pa, as the type of `stretch`; 0 without terms.
-
-    Moduli and exponents come in pairs: different counts raise ValueError. Stretches are above 0, which is not checked.
-    """
-    terms = zip(moduli_Pa, exponents, strict=True)
-    return sum((modulus_Pa * shape(stretch, exponent) for modulus_Pa, exponent in terms), 0.0 * stretch)
-
-
 class Fit(NamedTuple):
     """A fitted law: its moduli mu, Pa, its exponents, and r2, the share of the stress's variance that it explains."""
 
@@ -78,11 +67,11 @@ def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit:
 
 
 def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit:
-    """Fit Ogden's law with up to `terms` terms, 1..3, of positive exponents; a term whose best modulus is zero is
-    dropped.
+    """Fit Ogden's law with up to `terms` terms, 1..3, to stretch and engineering stress, Pa (n each), in any order.
 
-    Negative exponents are left out, because one direction of loading cannot tell them from positive ones. Under tension
-    alpha = -2 (alpha' - 1) grows like alpha', but the two differ widely under compression.
+    A term whose best modulus is zero is dropped. Exponents are from 0.05 to 30, terms in no set order. Negative
+    exponents are left out, because one direction of loading cannot tell them from positive ones. Under tension alpha =
+    -2 (alpha' - 1) grows like alpha', but the two differ widely under compression.
 
     Raises `LabError` for fewer than 2 points a term and one more, and for stress of the wrong sign, which no positive
     modulus fits. Raises `DomainError` for stretches outside 0.05..20.
@@ -98,21 +87,21 @@ def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit:
 
 
 def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit:
-    """Return the best fit of `shape` with up to `terms` terms, searched from the best few points of a grid of
-    exponents.
+    """Return the best fit of a law of `shape` with up to `terms` terms, which is not checked.
 
-    Raises LabError and DomainError as `fit_ogden`.
+    It is searched from the best _STARTS points of a grid of exponents, and no worse than any of them. Raises LabError
+    and DomainError as `fit_ogden`.
     """
     _check(stretch, stress_Pa, 2 * terms + 1)
 
     def norm(exponents: tuple[float, ...]) -> float:
-        return _moduli(shape, stretch, stress_Pa, exponents)[1]
+        return float(np.linalg.norm(_moduli(shape, stretch, stress_Pa, exponents)[1]))
 
     starts = sorted(combinations(_GRID, terms), key=norm)[:_STARTS]
     tried = [starts[0]]
     for start in starts:
         found = least_squares(
-            lambda log: _residual(shape, stretch, stress_Pa, tuple(np.exp(log).tolist())),
+            lambda log: _moduli(shape, stretch, stress_Pa, tuple(np.exp(log).tolist()))[1],
             np.log(start),
             bounds=(np.log(MIN_EXPONENT), np.log(MAX_EXPONENT)),
             x_scale=0.3,
@@ -123,34 +112,38 @@ def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit
     return _fitted(shape, stretch, stress_Pa, min(tried, key=norm))
 
 
-def _moduli(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> tuple[Array, float]:
-    """Return the best moduli >= 0 for given exponents, and the norm of the residual over that of the stress."""
+def _moduli(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> tuple[Array, Array]:
+    """Return the best moduli >= 0, Pa, for given exponents, in their order, and the residual (n).
+
+    The residual is the law's stress less `stress_Pa`, over the norm of `stress_Pa`.
+    """
     columns = np.column_stack([shape(stretch, exponent) for exponent in exponents])
     # columns and stress to unit size: the shapes differ by many orders of magnitude
     sizes, size_Pa = np.linalg.norm(columns, axis=0), float(np.linalg.norm(stress_Pa))
-    scaled, norm = nnls(columns / sizes, stress_Pa / size_Pa)
-    return scaled * size_Pa / sizes, float(norm)
-
-
-def _residual(shape: Shape, stretch: Array, measured_Pa: Array, exponents: tuple[float, ...]) -> Array:
-    moduli, _ = _moduli(shape, stretch, measured_Pa, exponents)
-    difference = stress_Pa(shape, stretch, tuple(moduli.tolist()), exponents) - measured_Pa
-    return difference / float(np.linalg.norm(measured_Pa))
+    scaled, _ = nnls(columns / sizes, stress_Pa / size_Pa)
+    return scaled * size_Pa / sizes, columns / sizes @ scaled - stress_Pa / size_Pa
 
 
 def _fitted(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> Fit:
-    """Return the law with these exponents, without terms of modulus 0. Raises LabError where no modulus is positive."""
-    moduli, norm = _moduli(shape, stretch, stress_Pa, exponents)
+    """Return the law of `shape` with these exponents and its best moduli, without terms of modulus 0.
+
+    Raises LabError where no modulus is positive. The curve is not checked: a stress that does not vary makes r2 NaN.
+    """
+    moduli, residual = _moduli(shape, stretch, stress_Pa, exponents)
     if not (moduli > 0.0).any():
         raise LabError("the stress does not rise with the stretch: no positive modulus fits")
     kept = [pair for pair in zip(moduli.tolist(), exponents, strict=True) if pair[0] > 0.0]
     kept_Pa, kept_exponents = zip(*kept, strict=True)
-    left = norm**2 * float(np.sum(stress_Pa**2))
+    left = float(residual @ residual * (stress_Pa @ stress_Pa))
     return Fit(kept_Pa, kept_exponents, 1.0 - left / float(np.sum((stress_Pa - stress_Pa.mean()) ** 2)))
 
 
 def _check(stretch: Array, stress_Pa: Array, least: int) -> None:
-    """Raise LabError or DomainError unless stretch and stress are `least` pairs or more, in range and not constant."""
+    """Refuse stretch and stress unless they are `least` pairs or more, in range and not constant.
+
+    Raises LabError for too few, other shapes, and what does not vary. Raises DomainError for a stretch outside
+    MIN_STRETCH to MAX_STRETCH, a stress beyond 1e12 Pa, and NaN.
+    """
     if stretch.ndim != 1 or stretch.shape != stress_Pa.shape or len(stretch) < least:
         raise LabError(f"stretch {stretch.shape}, stress_Pa {stress_Pa.shape}: wanted are {least} pairs or more")
     require("stretch", stretch, MIN_STRETCH, MAX_STRETCH)

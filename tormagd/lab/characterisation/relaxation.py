@@ -11,6 +11,7 @@ every fraction at or above zero and their sum at or below one, whatever the nois
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +48,7 @@ class RelaxationFit:
 
 
 def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit:
-    """Fit a series of up to `branches` (1..6) time constants.
+    """Fit a series of up to `branches` (1..6) time constants; the fit has them in rising order.
 
     The element counts as rested at the first row. The driving force is linear between rows, so a step is two rows close
     together. Time constants are sought from a third of the shortest time step to three times the record. A slower one
@@ -100,19 +101,21 @@ def _columns(record: RelaxationRecord, times_s: Array) -> Array:
     columns = np.zeros((len(record.time_s), len(times_s) + 1))
     columns[:, 0] = record.driving
     for branch in range(len(times_s)):
-        response = 0.0
-        responses = [response]
-        for decay, change in zip(decays[:, branch].tolist(), changes[:, branch].tolist(), strict=True):
-            response = response * decay + change
-            responses.append(response)
-        columns[:, branch + 1] = responses
+        steps = zip(decays[:, branch].tolist(), changes[:, branch].tolist(), strict=True)
+        columns[:, branch + 1] = list(accumulate(steps, _responded, initial=0.0))
     return columns
+
+
+def _responded(response: float, step: tuple[float, float]) -> float:
+    decay, change = step
+    return response * decay + change
 
 
 def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
     """Return the coefficients (1 + branches) for the time constants `times_s`, s, and the residual (n), N.
 
-    A coefficient is a force, N, per unit of driving force, 0 or more; the first is that of equilibrium.
+    A coefficient is a force, N, per unit of driving force, 0 or more: that of equilibrium, then one for each time
+    constant. The residual is fitted less measured. `record` is not checked.
     """
     columns = _columns(record, times_s)
     coefficients, _ = nnls(columns, record.force_N)
