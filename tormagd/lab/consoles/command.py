@@ -53,10 +53,10 @@ KINDS = {
 
 
 def write_parquet(summaries: dict[str, Summary], url: str) -> None:
-    """Write one row for each recording, `file` and the fields of `Summary`, as Parquet to `url`; a file there is
-    replaced.
+    """Write `summaries`, by file name, as Parquet to `url`, a file or a URL; what is there is replaced.
 
-    Raises OSError; ValueError for an unknown kind of URL, ImportError where its package is missing.
+    A row has `file` and the fields of a Summary. Without summaries the table has no rows. Raises OSError, also where
+    its folder does not exist; ValueError for an unknown kind of URL, ImportError where its package is missing.
     """
     fields = msgspec.structs.fields(Summary)
     columns = [("file", pyarrow.string()), *((field.name, KINDS[field.type]) for field in fields)]
@@ -69,7 +69,8 @@ def write_parquet(summaries: dict[str, Summary], url: str) -> None:
 def _cells(console: Console) -> tuple[str, ...]:
     """Return a console's texts for a person, one under each of HEADINGS.
 
-    `unknown` stands for what no recording says; limits under MIN_SHARE of the time are left out.
+    `unknown` stands for what no recording says. At most MAX_LIMITS limits are told, those of most time, none under
+    MIN_SHARE of it; every fault is. What recordings say is made printable.
     """
     errors_N = (console.tracking_rms_N, console.worst_rms_N)
     held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= MIN_SHARE][:MAX_LIMITS]
@@ -89,9 +90,9 @@ def _cells(console: Console) -> tuple[str, ...]:
 
 
 def _shown(drift: Drift | None, form: str) -> str:
-    """Return the first and newest value, with the change per day where it is known; `unknown` for None.
+    """Return the first and newest value in `form`, a format of floats, and the change per day where it is known.
 
-    Two values that look alike in `form` are shown once, without a change.
+    As `1.000..1.080 (+0.04/day)`; `unknown` for None. Two values that look alike are shown once, without a change.
     """
     if drift is None:
         return "unknown"
@@ -116,11 +117,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the consoles of all recordings in `options.recordings`, a folder or a URL, for a person as a table.
+    """Sum up all recordings in `options.recordings`, a folder or a URL; for a person as a table of consoles.
 
-    `options.out`, if given, gets one row for each recording, as Parquet. The exit code is 1 where a file was left out,
-    and 2 where `out` could not be written. Both are told on stderr. Raises LabError where there are no recordings, for
-    an unknown kind of URL, and where its package is missing. Raises OSError where the place cannot be reached.
+    Figures: `consoles`, a list of Console; `recordings`, a Summary by file name; `left_out`, reasons by file name.
+    `options.out`, unless None, gets a Parquet file of the recordings. The exit code is 1 where a file was left out, and
+    2 where `out` could not be written; both are told on stderr. Raises LabError where there is nothing to read, for an
+    unknown kind of URL, and where its package is missing. Raises OSError where the place cannot be reached, and as
+    `executors.chosen`.
     """
     try:
         urls = files(options.recordings)

@@ -26,7 +26,10 @@ class Drift(msgspec.Struct, frozen=True):
 
 
 class Console(msgspec.Struct, frozen=True, kw_only=True):
-    """All recordings of one device with one insert. Errors are over all time ENABLED, and of the worst recording."""
+    """All recordings of one device with one insert; unknown is None, or an empty text for the insert.
+
+    `tracking_rms_N` is over all time ENABLED, `worst_rms_N` of the worst recording.
+    """
 
     serial_number: int | None
     insert: str
@@ -46,9 +49,10 @@ class Console(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Console]:
-    """Return one console for each device and insert, sorted by both; unknown devices count as one and come first.
+    """Return one console for each device and insert, sorted by serial number and insert.
 
-    A device that was only commissioned has one, too, without an insert.
+    Recordings of unknown devices count as one device, which comes first. A device that was only commissioned has a
+    console, too, without an insert. Of several reports of a device the newest is kept. Empty for no input.
     """
     groups: dict[tuple[int, str], list[Summary]] = defaultdict(list)
     for each in summaries:
@@ -63,9 +67,10 @@ def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Co
 
 
 def _console(serial_number: int, insert: str, group: list[Summary], commissioned: Report | None) -> Console:
-    """Return the console of a group of recordings in order of time; what none of them says is None.
+    """Return the console of a group of recordings; what none of them says is None.
 
-    A `serial_number` below 0 is unknown. The error over all is weighted by the time ENABLED.
+    The group is in order of time, which is not checked, and may be empty. A `serial_number` below 0 is unknown. The
+    error over all is weighted by the time ENABLED. `commissioned` is taken as it is.
     """
     enabled_s = sum(each.enabled_s for each in group)
     errors = [(each.enabled_s, each.tracking_rms_N) for each in group if each.tracking_rms_N is not None]
@@ -100,7 +105,10 @@ def _pooled(errors: list[tuple[float, float]]) -> float | None:
 
 
 def _drift(values: list[tuple[float, float | None]]) -> Drift | None:
-    """Return the drift of (start, value) pairs in order of time, ignoring None; None where no value is known."""
+    """Return the drift of (start, s, value) pairs in order of time, ignoring None; None where no value is known.
+
+    Its `per_day` is None for under MIN_RECORDINGS known values or MIN_DAYS from the first to the newest.
+    """
     known = [(start_s, value) for start_s, value in values if value is not None]
     if not known:
         return None

@@ -16,10 +16,11 @@ READ = re.compile(r"(.*\.mcap|(.*/)?[0-9a-f]{8}\.json)", re.IGNORECASE)
 
 
 def files(url: str) -> dict[str, str]:
-    """Return the full address of every file of READ in a folder or under a URL, by its path there; or of that one file.
+    """Return the full address of every file of READ in and under a folder or URL, by its path there, sorted by that.
 
-    Empty for a folder without one. Raises FileNotFoundError where there is no such folder or file, and OSError where it
-    cannot be read. Raises ValueError for an unknown kind of URL, and ImportError for one whose package is missing.
+    `url` may also be one file, which is then returned by its name. Empty where no name fits. Nothing is read. Raises
+    FileNotFoundError where there is no such folder or file, and OSError where it cannot be listed. Raises ValueError
+    for an unknown kind of URL, and ImportError for one whose package is missing.
     """
     system, root = fsspec.core.url_to_fs(url)
     if not system.exists(root):
@@ -30,10 +31,11 @@ def files(url: str) -> dict[str, str]:
 
 
 def read(url: str) -> Summary | Report | str:
-    """Read the file at `url` and return a recording's summary, a commissioning's report, or the reason why there is
-    none.
+    """Read the file at `url`; return a recording's summary, a commissioning's report, or the reason why there is none.
 
-    Raises ImportError for a kind of address whose package is missing.
+    A name that ends with SUFFIX is a recording, any other a report, of which MAX_BYTES are read. A reason is one
+    sentence for a person: the file is missing, not regular, damaged, or says nothing. Raises ImportError for a kind of
+    address whose package is missing.
     """
     name = url.rpartition("/")[2]
     try:
@@ -49,10 +51,10 @@ def read(url: str) -> Summary | Report | str:
 
 
 def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summary], dict[str, Report], dict[str, str]]:
-    """Read all files of `urls`, addresses by name, by `executor`: return summaries, reports and reasons by name.
+    """Read all files of `urls`, addresses by name, by `executor`; return summaries, reports and reasons, each by name.
 
-    A reason says why a file has neither. All have the order of `urls`. A failed worker makes a reason, not an
-    error.
+    Every name is in one of the three, which have the order of `urls`. A reason says why a file has neither; a failed
+    worker makes one, too, and no error. The progress is shown on stderr.
     """
     found: dict[str, Summary | Report | str] = {}
     for url, future in finished(executor, read, urls.values(), "recording"):

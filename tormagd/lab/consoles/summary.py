@@ -57,11 +57,12 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(file: BinaryIO, name: str) -> Summary:
-    """Return the summary of the recording in `file`, which errors call `name`.
+    """Return the summary of the recording in `file`, open and seekable, which errors call `name`.
 
     Figures of the device and lateness are of ticks while ENABLED, or of no stated operating state. Limits and faults
-    are of the whole recording. What the recording does not say is None. Raises RecordingError and OSError where it
-    cannot be read, and ValueError for one without messages.
+    are of the whole recording. What the recording does not say, or says as another type, is None or an empty text.
+    Raises RecordingError and OSError where it cannot be read, and ValueError for one without messages. A recording that
+    was cut is summed up as far as it goes, with `is_complete` False.
     """
     builder, enabled = OverviewBuilder(), {name: array("d") for name in FIGURES}
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tormagd.lab.design.force_law import d_force_d_gap, radial_moment_for_force_Tm
-from tormagd.physics.errors import DomainError, Real, require
+from tormagd.physics.errors import Real, require, require_that
 from tormagd.physics.field import FieldLaw, PowerFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
 
@@ -30,17 +30,16 @@ class Brake:
     def __post_init__(self) -> None:
         for name in ("closed_mm", "open_mm"):
             require(name, getattr(self, name), *self.field.gap_range_mm)
-        if not self.closed_mm < self.open_mm:
-            raise DomainError("open_mm", self.open_mm, f"above closed_mm, {self.closed_mm:g}")
+        require_that(self.closed_mm < self.open_mm, "open_mm", self.open_mm, f"above closed_mm, {self.closed_mm:g}")
         strongest_Tm = max_radial_moment_Tm(self.elastomer, self.geometry)
         require("radial_moment_Tm", self.field.radial_moment_Tm(self.closed_mm), 0.0, strongest_Tm)
 
     @classmethod
     def as_built(cls, elastomer: Elastomer, field: FieldLaw | None = None) -> "Brake":
-        """Return the thesis's device with this elastomer, and the power law of the field unless `field` is given.
+        """Return the thesis's device with this elastomer: geometry TORMAG, gaps CLOSED_MM to OPEN_MM.
 
-        Raises `DomainError` where the elastomer does not bear the field of the closed gap, or `field` does not reach to
-        both end positions.
+        `field` None: the power law of the field. Raises `DomainError` where the elastomer does not bear the field of
+        the closed gap, or `field` does not reach to both end positions.
         """
         return cls(field or PowerFieldLaw(), elastomer, TORMAG, CLOSED_MM, OPEN_MM)
 
@@ -70,8 +69,10 @@ class Brake:
         return abs(d_force_d_gap(gap_mm, self.field, self.elastomer, self.geometry))
 
     def gap_mm(self, force_N: Real) -> Real:
-        """Return the gap, within the end positions, that gives `force_N`. Raises `DomainError` for a force that no gap
-        gives."""
+        """Return the gap, mm, within the end positions, that gives `force_N`; a float or an array as `force_N` is.
+
+        Raises `DomainError` for a force, or any of an array, that no gap between the end positions gives.
+        """
         require("force_N", force_N, self.least_N, self.most_N)
         moment_Tm = radial_moment_for_force_Tm(force_N, self.elastomer, self.geometry)
         # the forces of the end positions must come back as those, not as a rounding beyond them

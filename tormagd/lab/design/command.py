@@ -19,7 +19,10 @@ from tormagd.lab.options import GAP_SPEED, SEED, whole, within
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab optimise-design`."""
+    """Add the options of `tormag-lab optimise-design`; numbers outside their ranges are refused with exit code 2.
+
+    The four numbers of `--region` are only checked where the region is made.
+    """
     parser.add_argument(
         "--region",
         required=True,
@@ -48,11 +51,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Find the best design from each start that `options` ask for, and return all, best first.
+    """Find the best design from each random start that `options` ask for, and return all, best first.
 
-    The best has the greatest coverage, with the measure `corners` the least corner cost; then the least volume. Each
-    row also tells the coverage with dimensions off by `options.off` percent. Raises DomainError for a region that is no
-    task, and where a solver finds no design. Raises what `executors.chosen` raises, too.
+    Figures: `outcomes`, a list of dicts with the fields of Outcome, `design` as a dict, and `coverage_as_made`, the
+    least with dimensions off by `options.off` percent. The best has the greatest coverage, with the measure `corners`
+    the least corner cost; then the least volume. Raises DomainError for a region that is no task, and where a solver
+    finds no design. Raises as `executors.chosen`.
     """
     with executors.chosen(options) as executor:
         outcomes = sweep(_runs(options), executor)
@@ -66,9 +70,10 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _runs(options: argparse.Namespace) -> list[Run]:
-    """Return one run from each random start, drawn by the seed between the problem's bounds.
+    """Return `options.starts` runs on one problem, each from a random start between the problem's bounds.
 
-    Raises DomainError for a region that is no task.
+    The starts are drawn by `options.seed`, which the solver gets, too: the same options make the same runs. Raises
+    DomainError for a region that is no task.
     """
     problem = Problem(Region(*options.region), options.measure, options.gap_speed)
     low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))

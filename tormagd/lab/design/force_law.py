@@ -24,7 +24,7 @@ def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Ge
 
 
 def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the slope of the force over the radial moment, N / (T m), >= 0.
+    """Return the slope of the brake force over the radial moment, N / (T m), >= 0; 0 without field.
 
     Raises `DomainError` unless 0 <= radial_moment_Tm <= `max_radial_moment_Tm`.
     """
@@ -41,7 +41,7 @@ def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry:
 
 
 def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the radial moment that gives the force, T m: inverse of `brake_force_N`.
+    """Return the radial moment, T m, that gives the force: inverse of `brake_force_N`; 0 for 0 N.
 
     Raises `DomainError` unless 0 <= force_N <= the force at `max_radial_moment_Tm`.
     """
@@ -62,10 +62,11 @@ def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
 
 
 def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
-    """Return the eps at which phi(eps) is `force`, for 0 <= force <= phi(0.95): inverse of the curve along eps.
+    """Return the compression eps = 1 - lambda1 at which the reduced force phi(eps) is `force`; 0 for 0.
 
-    Newton's method on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside a
-    shrinking bracket. It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
+    `force` is without unit, from 0 to phi(0.95), which is not checked: NaN or more gives no solution. Newton's method
+    on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside a shrinking bracket.
+    It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
     """
     fn = functions(force)
     rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)

@@ -64,7 +64,7 @@ class Problem(msgspec.Struct, frozen=True):
     friction_coefficient: float = 0.2
 
     def geometry(self, design: Design) -> Geometry:
-        """Return the geometry of a design. Raises `DomainError` for lengths that no brake can have."""
+        """Return the geometry of a design, m; the open gap does not count. Raises `DomainError` as `Geometry`."""
         return Geometry(
             inner_radius_m=1e-3 * self.inner_radius_mm,
             outer_radius_m=1e-3 * design.outer_radius_mm,
@@ -83,9 +83,9 @@ class Problem(msgspec.Struct, frozen=True):
         return PhasePortrait(brake, self.gap_speed_mm_s)
 
     def load_margin(self, design: Design) -> float:
-        """Return 1 - field of the closed gap over the largest that the elastomer bears; admissible where not negative.
+        """Return 1 - the closed gap's field over the largest that the elastomer bears: under 0 it does not bear it.
 
-        Raises `DomainError` for lengths that no brake can have; the open gap does not count.
+        The open gap does not count. Raises `DomainError` as `geometry`.
         """
         moment_Tm = PowerFieldLaw().radial_moment_Tm(self.closed_mm)
         return 1.0 - moment_Tm / max_radial_moment_Tm(self.elastomer, self.geometry(design))
@@ -123,10 +123,10 @@ class Run(msgspec.Struct, frozen=True):
 
 
 def coverage(problem: Problem, design: Design) -> float:
-    """Return the share of the problem's region that the design covers, 0..1.
+    """Return the share of the problem's region, by area, that the design covers, 0..1.
 
-    Counted is what the true boundary covers where `problem.measure` is "true", else what the trapezoid covers. Raises
-    `DomainError` for an impossible design.
+    Counted is what the true boundary covers where `problem.measure` is "true", else what the trapezoid covers. The
+    problem's bounds do not count. Raises `DomainError` as `Problem.portrait`, also for an elastomer too soft.
     """
     portrait = problem.portrait(design)
     if problem.measure == "true":
@@ -135,11 +135,11 @@ def coverage(problem: Problem, design: Design) -> float:
 
 
 def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
-    """Return the least coverage of the design, 0..1, where each dimension may be off by `share`, down, not at all, or
-    up.
+    """Return the least coverage of the design, 0..1, where each dimension may be off by `share` of it, or not at all.
 
-    All 27 combinations are tried. The result is 0 where the elastomer of one of them does not bear the field. Raises
-    `DomainError` for a combination that no brake can have, such as an open gap under the closed one.
+    All 27 combinations of less, exact and more are tried. The result is 0 where the elastomer of one of them does not
+    bear the field. Raises `DomainError` for a combination that no brake can have, such as an open gap under the closed
+    one. `share` is a fraction, 0.01 for a percent, and not checked.
     """
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
     made = [
@@ -150,9 +150,10 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
 
 
 def corner_cost(problem: Problem, design: Design) -> float:
-    """Return the thesis's cost, Eq. 39: sum of the squared distances of all four corners, N and N/s taken as equal.
+    """Return the thesis's cost, Eq. 39: the sum of squared distances of the trapezoid's four corners from the region's.
 
-    Raises `DomainError` for an impossible design.
+    N and N/s count as equal; 0 is a perfect match. Raises `DomainError` as `Problem.portrait`, also for an elastomer
+    too soft.
     """
     offered, wanted = problem.portrait(design).trapezoid(), problem.region
     # the lower corners mirror the upper ones
@@ -165,10 +166,12 @@ def corner_cost(problem: Problem, design: Design) -> float:
 
 
 def solve(run: Run) -> Outcome:
-    """Return the design that the run's solver finds from its start; the same run gives the same design anywhere.
+    """Return the design that the run's solver finds from its start, with its figures.
 
-    Where "global" maximises coverage, a second search takes the smallest design within SLACK of the best. Raises
-    `DomainError` where the solver finds no design whose elastomer bears the field.
+    By the measure it has the greatest coverage or the least corner cost that the solver reaches within the problem's
+    bounds. With "global" and a coverage, a second search takes the smallest design within SLACK of the best. The same
+    run gives the same design anywhere. Raises `DomainError` where the solver finds no design whose elastomer bears the
+    field. A start outside the bounds is not refused.
     """
     began_s = time.thread_time()
     search = _Search(run.problem)
@@ -223,9 +226,10 @@ class _Search:
     def global_minimum(
         self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
     ) -> Array:
-        """Return the point of least `cost` by differential evolution from `start`, refined by COBYQA.
+        """Return the point (3) of least `cost` by differential evolution, which `start` takes part in, then COBYQA.
 
-        Points are coordinates from 0 to 1. `also` are constraints besides that of the elastomer's load.
+        Points are coordinates from 0 to 1. `also` are constraints besides that of the elastomer's load. Where no point
+        meets them all, the one that comes nearest is returned.
         """
         limits = [*also, self._margin]
         result = differential_evolution(

@@ -16,7 +16,7 @@ import numpy as np
 
 from tormagd.lab.arrays import Mask
 from tormagd.lab.design.brake import Brake
-from tormagd.physics.errors import DomainError, FloatArray, require
+from tormagd.physics.errors import FloatArray, require, require_that
 
 MAX_FORCE_N = 1e6
 MAX_RATE_N_S = 1e9
@@ -39,10 +39,9 @@ class Region(msgspec.Struct, frozen=True):
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             require(name, float(getattr(self, name)), 0.0, MAX_RATE_N_S if name.endswith("_s") else MAX_FORCE_N)
-        if not self.least_N < self.most_N:
-            raise DomainError("most_N", self.most_N, f"above least_N, {self.least_N:g}")
-        if not self.least_rate_N_s + self.most_rate_N_s > 0.0:
-            raise DomainError("most_rate_N_s", self.most_rate_N_s, "above 0 where least_rate_N_s is 0")
+        require_that(self.least_N < self.most_N, "most_N", self.most_N, f"above least_N, {self.least_N:g}")
+        is_moving = self.least_rate_N_s + self.most_rate_N_s > 0.0
+        require_that(is_moving, "most_rate_N_s", self.most_rate_N_s, "above 0 where least_rate_N_s is 0")
 
     @property
     def half_area(self) -> float:
@@ -50,9 +49,9 @@ class Region(msgspec.Struct, frozen=True):
         return 0.5 * (self.least_rate_N_s + self.most_rate_N_s) * (self.most_N - self.least_N)
 
     def rate_N_s(self, force_N: FloatArray) -> FloatArray:
-        """Return the rate that is required at each force (n), N/s, inside the region.
+        """Return the greatest rate, N/s, that the region requires at each force (n): its upper edge.
 
-        Outside, the straight line goes on, and may fall below 0.
+        Outside least_N to most_N the straight line goes on, and may fall below 0. NaN stays NaN.
         """
         share = (force_N - self.least_N) / (self.most_N - self.least_N)
         return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
@@ -87,9 +86,10 @@ class PhasePortrait:
         require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
 
     def outline(self, points: int = 201) -> tuple[FloatArray, FloatArray]:
-        """Return the true boundary's upper half: (force_N, rate_N_s), both of `points` elements, force falling.
+        """Return the true boundary's upper half as two arrays of `points` elements: force, N, falling, and rate, N/s.
 
-        It goes from the closed gap to the open one, in equal shares of the gap. The lower half is its mirror image.
+        It goes from the closed gap to the open one; each gap is the one before times the same factor. The lower half is
+        its mirror image.
         """
         gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, points)
         # a geometric series may end a rounding beyond its ends
@@ -97,7 +97,10 @@ class PhasePortrait:
         return self.brake.force_N(gap_mm), self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)
 
     def trapezoid(self) -> Region:
-        """Return the thesis's portrait: the end points of the true boundary, joined by a straight line."""
+        """Return the thesis's portrait: the end points of the true boundary, joined by a straight line.
+
+        It is a Region: from the open gap's force and rate to the closed gap's.
+        """
         speed, brake = self.gap_speed_mm_s, self.brake
         return Region(
             brake.least_N,
@@ -107,7 +110,7 @@ class PhasePortrait:
         )
 
     def true_coverage(self, region: Region) -> float:
-        """Return the share of the region's area inside the true boundary, 0..1, by an integral over the gap.
+        """Return the share of the region's area inside the true boundary, 0..1, good to 1e-5.
 
         0 where the brake gives none of the region's forces.
         """
@@ -145,9 +148,10 @@ class PhasePortrait:
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge points of a task, force and force rate (n), by the true boundary.
+        """Judge the points of a task, force, N, and force rate, N/s, of either sign (n each), by the true boundary.
 
-        NaN is not refused: a point with a rate of NaN and a possible force counts as covered.
+        On the boundary counts as covered. NaN is not refused: a point with a rate of NaN and a possible force counts as
+        covered. One with a force of NaN is too fast, unless its rate is 0 or NaN.
         """
         inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
         limit = np.zeros_like(force_N)

@@ -44,7 +44,8 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
     """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N.
 
     The field grows with the permeability to the power `exponent`; it is 1 in the thesis. The permeability is always
-    that of Eq. 5, the friction of the insert does not count. Raises `DomainError` outside Eq. 5's range.
+    that of Eq. 5, the friction of the insert does not count. Raises `DomainError` outside Eq. 5's range, for a `field`
+    that does not reach to both gaps, and for an elastomer that does not bear the closed one.
     """
     mu_r = relative_permeability(insert.cip_fraction)
     elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
@@ -55,10 +56,11 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
 
 
 def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
-    """Fit the friction of each matrix for the least mean relative error of range; the fit has it by Shore 00 hardness.
+    """Fit one friction coefficient for each matrix (Shore 00 hardness), for the least mean relative error of range.
 
-    The field grows with the permeability to the power `exponent`, which is not fitted. Raises `DomainError` for an
-    insert whose range has not been measured, and as `frictionless_range_N`.
+    The mean is over the matrix's `inserts`. The field grows with the permeability to the power `exponent`, which is not
+    fitted. Raises `DomainError` for an insert whose range has not been measured, and as `frictionless_range_N`. Without
+    inserts the fit has no friction.
     """
     ratios: dict[int, list[float]] = {}
     for item in inserts:
@@ -68,11 +70,11 @@ def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1
 
 
 def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
-    """Fit the friction of each matrix and the permeability exponent, the latter to 1e-4.
+    """Fit the friction of each matrix, as `fit_friction`, and one permeability exponent, from 0 to 3, to 1e-4.
 
-    The mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point. Raises
-    `DomainError` as `fit_friction`.
+    Both are for the least mean relative error over all `inserts`. Raises `DomainError` as `fit_friction`.
     """
+    # the mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point
     low, high = MIN_EXPONENT, MAX_EXPONENT
     while True:
         exponents = np.linspace(low, high, _GRID)
@@ -90,10 +92,10 @@ def mean_relative_error(fit: RangeFit, inserts: Sequence[Insert]) -> float:
 
 
 def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
-    """Return each insert's relative error under the fit to all the others, by name.
+    """Return each insert's relative error, as `RangeFit.relative_error`, under the fit to all the others, by name.
 
     `free_exponent` also fits the permeability exponent. Raises KeyError for an insert that is the only one of its
-    matrix.
+    matrix, and `DomainError` as `fit_friction`.
     """
     fit = fit_exponent if free_exponent else fit_friction
     return {
@@ -103,9 +105,10 @@ def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: 
 
 
 def _friction(ratios: list[float]) -> float:
-    """Return the friction coefficient with the least mean relative error of range.
+    """Return the friction coefficient with the least mean relative error of range over the inserts of one matrix.
 
-    `ratios`, all over 0: each insert's range at a friction coefficient of 1, over its measured range.
+    `ratios` are each insert's range at a friction coefficient of 1 over its measured range: one or more, all over 0.
+    Neither is checked.
     """
     # the minimum of sum |mu r - 1| = sum r |mu - 1/r| is the median of 1/r, weighted by r
     ordered = sorted(ratios, reverse=True)

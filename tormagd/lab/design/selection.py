@@ -42,13 +42,13 @@ class Verdict:
 
 
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
-    """Judge one insert for a task, where the gap is placed in steps of `gap_resolution_mm`.
+    """Return the verdict on one insert, a name, in its brake, for a task; the gap goes in steps of `gap_resolution_mm`.
 
-    Returns its forces, the largest force step, and the share of the task that it reaches, 0 to 1. Also the gap that is
-    open enough for the task, and the reasons why it does not serve. The step is the largest within that part of the
-    task. Where the insert reaches none, or the task is one force, it is the open gap's. A passive brake never reaches 0
-    N. A least force that is missed by no more than the task's resolution counts as reached: the task could not tell the
-    difference. Raises DomainError where the task tolerates only forces under 0 N.
+    It serves where it reaches the task's forces in steps no larger than the task's resolution. Else the reasons say
+    what is missed, one sentence each. A least force that is missed by no more than the resolution counts as reached,
+    but not in `served_share`. Where the insert reaches no force of the task, or the task is one force, the share is 0.
+    The step is then the open gap's. The task is not checked. Raises DomainError where it tolerates only forces under 0
+    N.
     """
     least, most = brake.least_N, brake.most_N
     low, high = max(least, task.least_N), min(most, task.most_N)
@@ -71,9 +71,10 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
 
 
 def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
-    """Judge all inserts and return them best first: those that serve by resolution, the others by the share they serve.
+    """Judge all inserts, brakes by name, and return the verdicts, best first; empty without any.
 
-    `inserts` are brakes by name. Empty without any. Raises as `judge`.
+    First come those that serve, finest force step first; then the others, greatest share served first. Raises as
+    `judge`.
     """
     verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
     return sorted(verdicts, key=lambda v: (bool(v.reasons), -v.served_share if v.reasons else 0.0, v.resolution_N))
@@ -83,6 +84,7 @@ def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:
     """Return the gap, mm, at which the brake's force is as low as the task tolerates, at least the open gap.
 
     The task tolerates its least force and its resolution more. NaN where this gap is beyond the field law's range.
+    Raises DomainError where only forces under 0 N are tolerated.
     """
     tolerated_N = task.least_N + task.resolution_N
     if tolerated_N >= brake.least_N:

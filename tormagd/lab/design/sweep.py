@@ -11,9 +11,10 @@ from tormagd.lab.executors import finished
 
 
 def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
-    """Solve every run and return the outcomes in the order of the runs; equal runs are solved once.
+    """Solve every run on `executor` and return the outcomes by run, in the order of the runs.
 
-    Raises what the first run to fail, in time, raised; runs that have not begun are then cancelled.
+    Equal runs are solved once. The progress is shown on stderr. Raises what the first run to fail, in time, raised,
+    DomainError as `solve`; runs that have not begun are then cancelled. `executor` is left open.
     """
     wanted = list(dict.fromkeys(runs))
     outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}
