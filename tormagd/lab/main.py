@@ -55,10 +55,11 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that the first argument names and return its exit code.
+    """Run the command that the first argument names and return its exit code, as `run` with the other arguments.
 
-    None takes the arguments of the process. Without a command the commands are listed. The code is 2 for usage and
-    refused input, 1 where the result could not be written, else the command's own.
+    None takes the arguments of the process. Without arguments, and for `--help`, the commands are listed on stdout, and
+    the code is 0. For an unknown name they are listed on stderr, with what may have been meant; the code is 2. Output
+    is from then on written in any encoding.
     """
     write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -74,11 +75,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
-    """Run the command `name` of COMMANDS, print what it found and return its exit code.
+    """Run the command `name`, a key of COMMANDS, print what it found on stdout and return its exit code.
 
-    Refused input, an OSError and a missing package become one sentence on stderr and exit code 2; so does usage, by
-    SystemExit. An answer that stdout does not take makes the code NOT_TOLD, where it would be 0. A ValueError that is
-    none of REFUSALS, and a missing module of tormagd itself, are raised.
+    REFUSALS, an OSError and a missing package become one sentence on stderr and exit code 2. Wrong usage is told on
+    stderr, and raises SystemExit with code 2, `--help` with 0. An answer that stdout does not take makes the code
+    NOT_TOLD, where it would be 0. What else a command raises is raised, another ValueError and a missing module of
+    tormagd too.
     """
     try:
         module = import_module(f"tormagd.lab.{COMMANDS[name][0]}")

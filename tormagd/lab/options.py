@@ -7,7 +7,10 @@ from tormagd.ctl.commands import Within
 
 
 def whole(least: int, most: int) -> Callable[[str], int]:
-    """Return the type of a whole number in this range. It raises ArgumentTypeError for any other text."""
+    """Return a type for argparse: it reads a whole number from `least` to `most`, as `int` does.
+
+    It raises ArgumentTypeError, which names the text and the range, for anything else.
+    """
 
     def number(text: str) -> int:
         try:

@@ -14,10 +14,10 @@ KEY = "Figures"
 
 
 def stamp(figures: object) -> dict[str, str | None]:
-    """Return the metadata of a PNG drawn from `figures`, which are plain data: their SHA-256 digest, under KEY.
+    """Return the metadata of a PNG drawn from `figures`, for matplotlib's `savefig`: their SHA-256 digest, under KEY.
 
-    Nothing in it changes with time or version, so the same figures make the same file. Raises TypeError for what
-    msgspec cannot encode.
+    `figures` are plain data, and keys of dicts in any order. `Software` is None, which leaves matplotlib's version out:
+    the same figures make the same file. Raises TypeError for what msgspec cannot encode.
     """
     return {KEY: hashlib.sha256(msgspec.json.encode(figures, order="sorted")).hexdigest(), "Software": None}
 
@@ -29,10 +29,11 @@ def figures_of(page: str) -> list[str]:
 
 
 def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Figure", Any]:
-    """Return a new matplotlib figure of `size`, inches, and its axes: one for a single cell, else an array of them.
+    """Return a new matplotlib figure of `size`, width and height in inches, and its axes.
 
-    `grid`, rows and columns, and `options` go to `Figure.subplots`; without a grid it is one cell. Raises
-    ModuleNotFoundError without matplotlib.
+    `grid`, rows and columns, and `options` go to `Figure.subplots`; without a grid it is one cell. The axes are one
+    object for one cell, else an array, of one dimension for one row or column. Nothing is shown, and pyplot does not
+    keep the figure. Raises ModuleNotFoundError without matplotlib.
     """
     from matplotlib.figure import Figure  # not every installation draws
 
@@ -41,11 +42,11 @@ def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Fi
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
-    """Write a page to `path`, and its pictures into `folder`, as PNG files of their names in `pictures`, without an
-    ending.
+    """Write a page, `sections` of Markdown with an empty line between, to `path`, and its pictures into `folder`.
 
-    `folder` is made where missing, that of `path` is not. Files of these names are replaced; pictures of earlier names
-    stay. Pictures are stamped with the rows of the page's tables, and written before the page. Raises OSError.
+    `pictures` are figures by name, without the ending `.png`. `folder` is made where missing, that of `path` is not.
+    Files of these names are replaced; pictures of earlier names stay. Pictures are stamped with the rows of the page's
+    tables, and written before the page. Raises OSError.
     """
     page = "\n".join(section.rstrip() + "\n" for section in sections)
     folder.mkdir(parents=True, exist_ok=True)
@@ -55,9 +56,9 @@ def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapp
 
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table in Markdown, with a line end behind each row; without rows its head alone.
+    """Return a table in Markdown, with a line end behind each row; without rows its head and rule alone.
 
-    Cells are not escaped, and `|` begins another cell. That rows are as long as `columns` is not checked.
+    `rows` are texts, one for each of `columns`, which is not checked. Cells are not escaped: `|` begins another cell.
     """
     head = list(columns)
     lines = [head, ["---"] * len(head), *rows]

@@ -65,11 +65,11 @@ class WireLog:
         self._log.stop()
 
     def add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
-        """Log the frames that `data` completes, each stamped with `time_s`: frames of the device if `is_rx`, else of
-        the host.
+        """Log the frames that `data` completes, each stamped with `time_s`, s by the caller's clock.
 
-        An incomplete frame waits for the next call of its direction. `time_s` is by the caller's clock, in seconds.
-        Counts the logged frames in `frames`, all else in `damaged`. Raises OSError where the file cannot be written.
+        `is_rx`: bytes of the device, else of the host. An incomplete frame waits for the next call of its direction.
+        The logged frames are counted in `frames`, all else in `damaged`. Raises OSError where the file cannot be
+        written.
         """
         for frame in self._decoders[is_rx].feed(data):
             if not 1 <= frame.function <= 0x7F:
@@ -92,10 +92,10 @@ class WireLog:
         self.add(now_s, raw, is_rx=True)
 
     def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
-        """Log what a connection wrote to the device: frames of a serial line; none logs nothing, and `unsent` is not
-        used.
+        """Log what a connection wrote to the device, frames of a serial line as bytes; an empty list logs nothing.
 
-        Raises TypeError for a bus's frames, and as `add`.
+        `unsent`, what did not go out, is not used: it is logged all the same. Raises TypeError for a bus's frames, and
+        OSError as `add`.
         """
         self.add(now_s, b"".join(raw), is_rx=False)
 
@@ -104,10 +104,11 @@ class WireLog:
 
 
 def virtual_session(seconds: float, log: WireLog) -> None:
-    """Run a session of the virtual device for `seconds` of virtual time, and log its frames in `log`.
+    """Run a session of the virtual device, sample 1, and log its frames in `log`, which is left open.
 
-    The host connects, homes, enables and follows a swinging force. All of that is logged, and the seconds count from
-    enabling on. Raises RuntimeError if the device does not arm.
+    The host connects, homes, enables and follows a swinging force for `seconds` of virtual time, which count from
+    enabling on. All of that is logged, stamped with seconds since the start. Raises RuntimeError if the device does not
+    arm, and OSError as `WireLog.add`.
     """
     config = load_config(None)
     core = build_core(config)
@@ -128,8 +129,9 @@ def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stop
     """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames in `log`.
 
     `announce` is called once, with the pseudo-terminal's path. `stopped` is asked at least every POLL_MS. Frames are
-    stamped with seconds since 1970. Bytes that either side does not fetch are lost, but logged. Raises OSError when the
-    port goes away, where no pseudo-terminal can be made, and where the log cannot be written.
+    stamped with seconds since 1970. Bytes that either side does not fetch are lost, but logged. `port` and `log` are
+    left open. Raises OSError when the port goes away, where no pseudo-terminal can be made, and where the log cannot be
+    written.
     """
     with contextlib.closing(Pty()) as line:
         announce(line.address)
@@ -151,9 +153,10 @@ def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stop
 
 
 def viewer_formats() -> list[str]:
-    """Return `ID:FORMAT:DIVISOR...` of each message, as `python -m can.viewer -d FILE` reads them.
+    """Return a line `ID:FORMAT:DIVISOR...` for each message, as `python -m can.viewer -d FILE` reads them.
 
-    The identifiers are hexadecimal, those of node NODE.
+    The identifiers are hexadecimal, those of node NODE. FORMAT is that of `struct`. A value on the wire over its
+    DIVISOR is in the signal's unit; 1 stands for whole numbers and for what protects a message.
     """
     lines = []
     for layout in LAYOUTS:
@@ -164,7 +167,10 @@ def viewer_formats() -> list[str]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab wire-log`."""
+    """Add the options of `tormag-lab wire-log`: a way, `virtual`, `tap` or `viewer`, and its own.
+
+    That the ending of the file is known is checked by `run`.
+    """
     ways = parser.add_subparsers(dest="way", required=True)
     virtual = ways.add_parser("virtual", help="log a session in virtual time")
     tapped = ways.add_parser("tap", help="log what passes between the daemon and a serial device")
@@ -177,11 +183,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Log until the session or a signal ends it, or with the way `viewer` return the formats for python-can's viewer.
+    """Log to `options.file` by the way `virtual` or `tap`, or return the lines of `viewer_formats` by `viewer`.
 
-    With the way `tap` prints where the daemon finds the line. Returns the file, and how many frames were logged and
-    damaged. Raises LabError for a file type that is not known, OSError for a file or port that cannot be used, and
-    RuntimeError as `virtual_session`.
+    `tap` prints where the daemon finds the line, and ends by SIGINT or SIGTERM. A log gives `file`, and the numbers
+    `frames`, logged, and `damaged`. A file that is there is replaced. Raises LabError for a file type that is not
+    known, OSError for a file or port that cannot be used, and RuntimeError as `virtual_session`.
     """
     if options.way == "viewer":
         formats = viewer_formats()
@@ -199,7 +205,11 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:
-    """Tap the port at `path` until SIGINT or SIGTERM, printing where the daemon finds it. Raises OSError."""
+    """Tap the serial port at `path` until SIGINT or SIGTERM, and print where the daemon finds the line.
+
+    Both signals have their old handlers again at the end. `log` is left open. Raises OSError as `tap`, and where the
+    port cannot be opened or another process holds it.
+    """
     with (
         interrupted_by(signal.SIGINT, signal.SIGTERM) as is_stopped,
         serial.Serial(path, baud, timeout=0, exclusive=True) as port,

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.signal import butter, decimate, sosfiltfilt
 from scipy.stats import t as student
 
-from tormagd.commission.regression import sandwich
+from tormagd.commission.regression import solved
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd.lab.motor.log import Log
@@ -65,8 +65,8 @@ class Estimate(NamedTuple):
 class Motion(NamedTuple):
     """Motion of a log at its own rate: position from its mean, m; speed, m/s; acceleration, m/s^2; sign of the speed.
 
-    Each column has a row for each of the log's; the sign is 0 where the log rests or is slower than SLOW_M_S.
-    `factor` is the number of rows for one thinned row.
+    Each column has a row for each of the log's; the sign is 0 where the log rests or is slower than SLOW_M_S. `factor`
+    is the number of rows for one thinned row.
     """
 
     x: Array
@@ -76,10 +76,9 @@ class Motion(NamedTuple):
     factor: int
 
     def thin(self, column: Array) -> Array:
-        """Return a column (n) as the equations use it: low-passed, thinned by `factor`, without EDGE rows at either
-        end.
+        """Return a column (n) as the equations use it: low-passed, thinned by `factor`, without EDGE rows at both ends.
 
-        Empty where no more than these are left.
+        That are about n / `factor` - 2 EDGE values; empty where no more than EDGE at each end are left.
         """
         thinned = decimate(column, self.factor, ftype="fir", zero_phase=True) if self.factor > 1 else column
         return np.asarray(thinned[EDGE:-EDGE])
@@ -101,7 +100,7 @@ class Fit(NamedTuple):
     def half_widths_of(self, function: Callable[[Array], Array]) -> Array:
         """Return the half widths (m) of the 95% intervals of m functions of the values, linearised about these.
 
-        `function` takes values (k) and returns an array (m); it is called twice for each value.
+        `function` takes values (k) and returns all m as an array; it is called twice for each of the k.
         """
         steps = np.maximum(1e-3 * np.sqrt(np.diag(self.covariance)), np.finfo(np.float64).tiny)
         rises = [function(self.values + shift) - function(self.values - shift) for shift in np.diag(steps)]
@@ -110,11 +109,10 @@ class Fit(NamedTuple):
 
 
 def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
-    """Return the motion of a log, low-passed at CUTOFF_HZ without lag.
+    """Return the motion of a log, low-passed at CUTOFF_HZ without lag, at the log's own rate.
 
-    Each column has the log's n rows: position from its mean, m, speed, m/s, acceleration, m/s^2, and sign of the speed.
-    Slower than SLOW_M_S the sign is 0. `Motion.thin` goes to about `thinned_Hz`. Raises LabError where that leaves
-    under MIN_BLOCKS * BLOCK_S seconds, or the log does not move both ways.
+    Its `thin` goes to about `thinned_Hz`. Raises LabError where that leaves under MIN_BLOCKS * BLOCK_S seconds, or the
+    log does not move both ways at over SLOW_M_S.
     """
     smooth = _low_pass(log)
     position = smooth(log.position_m)
@@ -145,23 +143,18 @@ def block_numbers(seen: Motion, period_s: float) -> Array:
 
 
 def linear(rows: Array, target: Array, blocks: Array) -> Fit:
-    """Fit `target` (n) by `rows` (n, k) in least squares; rows of one number in `blocks` (n) may be correlated.
+    """Fit `target` (n) by `rows` (n, k) in least squares; the fit has k values, in the order of the columns.
 
-    Raises LabError for under MIN_BLOCKS blocks or columns that depend on each other.
+    `blocks` (n) numbers each row's block: rows of one block may be correlated. Raises LabError for under MIN_BLOCKS
+    blocks or columns that depend on each other. A target of 0 makes the relative residual NaN.
     """
-    scale = np.linalg.norm(rows, axis=0)
-    if (
-        len(np.unique(blocks)) < MIN_BLOCKS
-        or not (scale > 0.0).all()
-        or np.linalg.matrix_rank(rows / scale) < rows.shape[1]
-    ):
+    values, covariance = solved(rows, target, blocks)
+    count = len(np.unique(blocks))
+    if count < MIN_BLOCKS or not np.isfinite(values).all():
         raise LabError("the log moves too little: mass, friction and offset cannot be told apart")
-    scaled = rows / scale
-    values, *_ = np.linalg.lstsq(scaled, target, rcond=None)
-    residual = target - scaled @ values
-    covariance = sandwich(scaled, residual, blocks) / np.outer(scale, scale)
-    deviations = float(student.ppf(0.975, max(len(np.unique(blocks)) - len(values), 1)))
-    return Fit(values / scale, covariance, deviations, float(np.linalg.norm(residual) / np.linalg.norm(target)))
+    deviations = float(student.ppf(0.975, max(count - len(values), 1)))
+    left = np.linalg.norm(target - rows @ values) / np.linalg.norm(target)
+    return Fit(values, covariance, deviations, float(left))
 
 
 class Volts(NamedTuple):
@@ -177,16 +170,18 @@ class Volts(NamedTuple):
     def voltage(self, log: Log) -> tuple[Array, Array]:
         """Return the applied and the predicted voltage, V (n each), for the thinned rows of `log` in motion.
 
-        Raises LabError as `motion`.
+        `log` need not be the one that was fitted. Rows where the carriage stands are left out. Raises LabError as
+        `motion`.
         """
         _, measured, predicted = self.over_time(log)
         known = np.isfinite(measured)
         return measured[known], predicted[known]
 
     def over_time(self, log: Log) -> tuple[Array, Array, Array]:
-        """Return thinned times, s, applied and predicted voltage, V; both NaN where the carriage stands.
+        """Return the thinned times of `log`, s by its clock, and applied and predicted voltage, V (n each).
 
-        Raises LabError as `motion`.
+        Both voltages are NaN where the carriage stands. The applied one is that of `delay` earlier, low-passed. `log`
+        need not be the one that was fitted. Raises LabError as `motion`.
         """
         seen = motion(log)
         values = np.array([self.mass.value, self.viscous.value, self.coulomb.value, self.offset.value])
@@ -208,9 +203,10 @@ def _voltage(log: Log, seen: Motion, delay_s: float) -> tuple[Array, Array]:
 
 
 def fit_volts(log: Log) -> Volts:
-    """Fit mass, friction, offset and delay in volts, from the log's voltage and position alone.
+    """Fit mass, friction, offset and delay in volts, from the log's voltage and position alone; a current is not used.
 
-    Raises LabError where the log moves too little, or the voltage fits best with a delay over LONGEST_DELAY_S.
+    Intervals also cover what terms that the model leaves out would change. Raises LabError where the log moves too
+    little, or the voltage fits best with a delay over LONGEST_DELAY_S, either way.
     """
     seen = motion(log)
     kept = moving(seen, MOSTLY)
@@ -235,11 +231,11 @@ def fit_volts(log: Log) -> Volts:
 
 
 def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array) -> tuple[Fit, float]:
-    """Fit `rows` to the delayed voltage, and return the fit and the delay, s, which Gauss-Newton steps find.
+    """Fit the delayed voltage by `rows` (n, k); return the fit, and the delay, s, which DELAY_TURNS steps find.
 
-    `kept` is the mask of the thinned rows that count, `blocks` their blocks. The voltage's slope is the last column of
-    the fit, so that the others' intervals include the delay's. Raises LabError for a delay over LONGEST_DELAY_S of
-    either sign, and as `linear`.
+    `kept` is the mask of the thinned rows of `log` that count, n of them, and `blocks` (n) are their blocks. The fit
+    has k + 1 values: the last, of the voltage's slope, is what is left of the delay, and widens the others' intervals.
+    Raises LabError for a delay over LONGEST_DELAY_S of either sign, and as `linear`.
     """
     delay_s = 0.0
     for _ in range(DELAY_TURNS):
@@ -272,14 +268,14 @@ OTHER_WAYS = (
 
 
 def _estimates(fit_in: Callable[[Variant], tuple[Array, Array]]) -> list[Estimate]:
-    """Return the values of the plain way to fit, with intervals that cover what the other ways make of them.
+    """Return n estimates: the values of the plain way to fit, with intervals that cover what OTHER_WAYS make of them.
 
-    `fit_in` fits in one way, and gives values and half widths (n each).
+    `fit_in` fits in one way, and gives values and half widths (n each). Of each group of ways the one that differs most
+    widens the interval. Raises what `fit_in` raises, in any way.
     """
     values, widths = fit_in(Variant())
-    widths = widths.copy()
-    for group in OTHER_WAYS:
-        widths += np.max([np.abs(fit_in(variant)[0] - values) for variant in group], axis=0)
+    apart = [np.max([np.abs(fit_in(variant)[0] - values) for variant in group], axis=0) for group in OTHER_WAYS]
+    widths = np.sum([widths, *apart], axis=0)
     return [Estimate(float(value), float(width)) for value, width in zip(values, widths, strict=True)]
 
 
@@ -295,7 +291,8 @@ class Windings(NamedTuple):
 def fit_windings(log: Log) -> Windings:
     """Fit resistance, inductance, back-EMF and delay from voltage, current and position.
 
-    Raises LabError where the log moves too little, has no current, or fits best with a delay over LONGEST_DELAY_S.
+    Raises LabError where the log moves too little, has no current, or fits best with a delay over LONGEST_DELAY_S. It
+    does so, too, where only one of the other ways to fit fails. Signs are not checked.
     """
 
     def fit_in(variant: Variant) -> tuple[Array, Array]:
@@ -327,9 +324,10 @@ class Gearbox(NamedTuple):
 
 
 def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
-    """Fit inertia, friction and gear losses from current and position; `force_N_A` is the motor's force per current.
+    """Fit inertia, friction and gear losses from current and position; the voltage is not used.
 
-    Raises LabError where the log moves too little, or has no current.
+    `force_N_A` is the motor's force at the carriage per current, as a number without an interval; it is not checked.
+    Raises LabError where the log moves too little, also in one of the other ways to fit, or has no current.
     """
 
     def fit_in(variant: Variant) -> tuple[Array, Array]:
@@ -368,10 +366,10 @@ def _current(log: Log, variant: Variant) -> Array:
 
 
 def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
-    """Return the force, N, with which the motor moves the carriage slowly at positions `x` (n).
+    """Return the force, N (n), with which the motor moves the carriage slowly at positions `x` (n); positive opens.
 
-    `direction` is 1, opening, or -1. Positive opens. `values` are those of the fit in `fit_gearbox`, and `x` is scaled
-    as there: over its standard deviation. `idle_N` is the force that the gears take idling.
+    `direction` is 1, opening, or -1. `values` are those of the fit in `fit_gearbox`, 8 or 10 of them, and `x` is scaled
+    as there: over its standard deviation. `idle_N` is the force that the gears take idling; it counts with 10 values.
     """
     lost = float(values[2])
     idling = float(values[8]) if len(values) > 8 else 0.0

@@ -15,14 +15,16 @@ BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 
 
 def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
-    """Identify a motor and return parameters, ratios to the gain, the time constant, residuals and notes as plain data.
+    """Identify a motor from its log; return estimates, residuals and notes as plain data.
 
-    Keys: `parameters` has PARAMETERS, `delay_s`, and `backlash_um`, which is always None. `ratios_to_gain` has RATIOS,
-    `motor` the names of `motor_parameters`. Besides `time_constant_s`, `gain_N_V`, `relative_residual`,
-    `holdout_voltage_nrmse` and `notes`. An estimate is a dict of `value` and `ci95`, the half width of its 95%
-    interval. With `gain_N_V` the parameters are scaled from volts. With None they come from the log's current, which
-    also gives `motor` and the gain; without one they are None. `holdout_voltage_nrmse` is of the second half, by a fit
-    of the first. Raises LabError for a gain that is not allowed, or a log that does not move enough to show anything.
+    An estimate is a dict of `value` and `ci95`, the half width of its 95% interval. `parameters` has PARAMETERS and
+    `delay_s`, and `backlash_um`, which is always None. `ratios_to_gain` has RATIOS, `motor` the names of
+    `motor_parameters`; `time_constant_s` is an estimate, too. Numbers are `gain_N_V`, `relative_residual`, and
+    `holdout_voltage_nrmse`: of the second half, by a fit of the first. `notes` are sentences.
+
+    With `gain_N_V` the parameters are scaled from volts, and a current is not used. With None they come from the
+    current, which also gives `motor` and the gain. Without one all of these are None. `log.gain_N_V` is not used.
+    Raises LabError for a gain that is not above 0, or a log, or half of one, that moves too little.
     """
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
@@ -74,7 +76,8 @@ def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate
     """Return by name what only a log with a current shows of windings and gearbox; all are referred to the carriage.
 
     The names end in their units: `gain_N_V`, `resistance_ohm`, `inductance_mH`, `back_emf_V_s_m`,
-    `friction_viscous_N_s_m`, `gear_efficiency`, `mass_kg`, `coulomb_N`.
+    `friction_viscous_N_s_m`, `gear_efficiency`, a share, `mass_kg`, `coulomb_N`. A resistance of 0 raises
+    ZeroDivisionError.
     """
     return {
         "gain_N_V": _product((windings.back_emf, 1), (windings.resistance, -1)),
