@@ -99,6 +99,7 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
     (("twin", *["given"] * 11), "no recording", "11 recordings: allowed are 10"),
     (("identify-motor", "absent"), "", "absent: cannot be read"),
     (("identify-motor", "given"), "t_s,input_V\n0,1\n", "position_mm"),
+    (("identify-motor", "given", "--plot", "x.mp3"), MOTOR, "allowed is a name that ends with .png"),
     *(
         (("identify-motor", "given"), MOTOR + text, reason)
         for text, reason in (

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -30,16 +30,21 @@ COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "operating_state", "limits", "f
 SCENE = json.dumps({"insert": {"name": "MRE-50-40"}})
 
 
+def put(path: Path, columns: tuple[str, ...], rows: Iterable[tuple[object, ...]], **about: str) -> None:
+    """A recording of these ticks, with `about` as its metadata."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with RecordingWriter(path, about) as writer:
+        writer.ticks(TickBatch(v=1, columns=columns, rows=tuple(rows)))
+
+
 def write(path: Path, serial_number: int, day: int, error_N: float, trim: float) -> None:
     """2 s: RATE for the first half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     begin_ns = (START_S + day * DAY_S) * 10**9
-    rows = tuple(
+    rows = (
         (begin_ns + k * 20 * 10**6, 1.5, 1.5 + error_N, "ENABLED", ("RATE",) if k < 50 else (), (), trim, 0.5)
         for k in range(100)
     )
-    with RecordingWriter(path, {"serial_number": str(serial_number), "scene": SCENE}) as writer:
-        writer.ticks(TickBatch(v=1, columns=COLUMNS, rows=rows))
+    put(path, COLUMNS, rows, serial_number=str(serial_number), scene=SCENE)
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +102,6 @@ def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
     for error_N in (0.01, 0.03):
         write(tmp_path / f"{error_N}.mcap", 1, 0, error_N, 1.0)
     first, second = (read(str(tmp_path / f"{error_N}.mcap")) for error_N in (0.01, 0.03))
-    assert isinstance(first, Summary)
-    assert isinstance(second, Summary)
     (console,) = consoles([msgspec.structs.replace(first, enabled_s=6.0), second], [])
     assert (console.tracking_rms_N, console.worst_rms_N) == pytest.approx((((3 * 0.01**2 + 0.03**2) / 4) ** 0.5, 0.03))
     assert console.trim == Drift(1.0, 1.0, None)
@@ -164,17 +167,9 @@ def tick(k):
     return *row, 1.52, state, limits, faults, 1.1, 2e-5, 0.3 if k % 2 else -0.3, 0.4, 30.0, 70.0
 
 
-@pytest.fixture
-def written(tmp_path: Path) -> Path:
-    path = tmp_path / "a.mcap"
-    about = {"serial_number": "1234", "scene": PULSE}
-    with RecordingWriter(path, about) as writer:
-        writer.ticks(TickBatch(v=1, columns=ALL_COLUMNS, rows=tuple(tick(k) for k in range(120))))
-    return path
-
-
-def test_the_time_enabled_is_what_counts(written):
-    found = read(str(written))
+def test_the_time_enabled_is_what_counts(tmp_path):
+    put(tmp_path / "a.mcap", ALL_COLUMNS, map(tick, range(120)), serial_number="1234", scene=PULSE)
+    found = read(str(tmp_path / "a.mcap"))
     assert (found.serial_number, found.insert, found.scene, found.is_complete, found.start_s) == (
         1234,
         "MRE-50-40",
@@ -194,9 +189,7 @@ def test_the_time_enabled_is_what_counts(written):
 
 
 def test_metadata_of_another_making_are_not_known(tmp_path):
-    path = tmp_path / "a.mcap"
-    with RecordingWriter(path, {"serial_number": "none", "scene": '{"insert": 3}'}) as writer:
-        writer.ticks(TickBatch(v=1, columns=("t_ns",), rows=((START_NS,),)))
-    found = read(str(path))
+    put(tmp_path / "a.mcap", ("t_ns",), [(START_NS,)], serial_number="none", scene='{"insert": 3}')
+    found = read(str(tmp_path / "a.mcap"))
     assert (found.serial_number, found.insert, found.scene) == (None, "", "")
     assert (found.tracking_rms_N, found.trim, found.enabled_s, found.limits_s) == (None, None, 0.0, {})

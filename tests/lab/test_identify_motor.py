@@ -25,8 +25,10 @@ from tormagd.simulation.static_laws import pull_of_magnets_N
 MASS, VISCOUS, COULOMB, OFFSET, GAIN, DELAY_S = 80.0, 150.0, 12.0, -2.0, 30.0, 0.003
 
 
-def write_log(path):
-    """A mass with friction on a multi-sine path, the voltage that it takes, and noise on it."""
+@pytest.fixture(scope="module")
+def computed_log(tmp_path_factory):
+    """A mass with friction on a multi-sine path, the voltage that it takes, and noise on it; read from a file."""
+    path = tmp_path_factory.mktemp("log") / "log.csv"
     t = np.arange(0.0, 20.0, 1e-3)
     tones = ((0.23, 0.06), (0.61, 0.02), (1.7, 0.004))
     position = sum(size * np.sin(2 * np.pi * f * t) for f, size in tones)
@@ -36,11 +38,11 @@ def write_log(path):
     sent = np.interp(t + DELAY_S, t, volts) + np.random.default_rng(0).normal(0.0, 0.05, len(t))
     rows = "\n".join(f"{a:.3f},{b:.6f},{c * 1e3:.6f}" for a, b, c in zip(t, sent, position, strict=True))
     path.write_text(f"t_s,input_V,position_mm\n{rows}\n")
+    return read_log(path)
 
 
-def test_known_parameters_are_found(tmp_path):
-    write_log(tmp_path / "log.csv")
-    result = identification.identify(read_log(tmp_path / "log.csv"), GAIN)
+def test_known_parameters_are_found(computed_log):
+    result = identification.identify(computed_log, GAIN)
     truth = {"mass_kg": MASS, "viscous_N_s_m": VISCOUS, "coulomb_N": COULOMB, "offset_N": OFFSET, "delay_s": DELAY_S}
     for name, value in truth.items():
         found = result["parameters"][name]
@@ -50,9 +52,8 @@ def test_known_parameters_are_found(tmp_path):
     assert result["holdout_voltage_nrmse"] < 0.1
 
 
-def test_without_a_gain_only_ratios(tmp_path):
-    write_log(tmp_path / "log.csv")
-    result = identification.identify(read_log(tmp_path / "log.csv"), None)
+def test_without_a_gain_only_ratios(computed_log):
+    result = identification.identify(computed_log, None)
     assert (result["parameters"]["mass_kg"], result["ratios_to_gain"]["mass_V_s2_m"]["value"]) == (
         None,
         pytest.approx(MASS / GAIN, rel=0.03),
@@ -71,9 +72,9 @@ def test_emps_is_within_the_published_values(recordings, capsys):
     assert found["holdout_voltage_nrmse"] <= 0.06
 
 
-def compare(log: Log, plant: PlantParameters, side: str) -> dict:
-    """Identified and true, by parameter. Without a current in the log the true gain is given."""
-    true = truth(plant, side, 2e3 * log.position_m[fit.motion(log).sign != 0.0])
+def compare(log: Log) -> dict:
+    """Identified and true, by parameter, of sample 3. Without a current in the log the true gain is given."""
+    true = truth(load_plant("sample_3"), "left", 2e3 * log.position_m[fit.motion(log).sign != 0.0])
     result = identification.identify(log, None if log.current_A is not None else true["gain_N_V"])
     identified = {**(result["motor"] or {}), **result["parameters"], "time_constant_s": result["time_constant_s"]}
     return {
@@ -83,16 +84,16 @@ def compare(log: Log, plant: PlantParameters, side: str) -> dict:
     }
 
 
-def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
-    """The control ticks of `tormagctl calibrate --motors` on a simulated device, in virtual time."""
+def recorded() -> Columns:
+    """The control ticks of `tormagctl calibrate --motors` on simulated sample 3, in virtual time."""
     core = build_core(Config())
-    device = VirtualDevice(load_plant(sample), SteadyHand(), seed=seed)
+    device = VirtualDevice(load_plant("sample_3"), SteadyHand(), seed=1)
     loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
     loop.arm()
     list(loop.run(1.0))
     # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
     shown = Range(loop.planner.believe.min_N, min(core.portrait.max_N, core.scene.force.most_N))
-    waveform = excitation(shown, rounds)
+    waveform = excitation(shown, 2)
     start_s = loop.now_s
 
     def newest(now_s: float) -> TimedSetpoint:
@@ -158,28 +159,25 @@ def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, fl
 
 @pytest.fixture(scope="module")
 def sample_log():
-    """What `tormagctl calibrate --motors` records, on simulated sample 3, in virtual time."""
-    columns = motor_log(record("sample_3"), "left")
+    """The log of the left motor that `tormagctl calibrate --motors` makes of what it recorded."""
+    columns = motor_log(recorded(), "left")
     return Log(columns["t_s"], columns["input_V"], columns["position_mm"] * 1e-3, None, columns["current_A"])
 
 
 def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log):
     """The plant is richer than the models: backlash, a springy screw, losses in the gears, friction under load."""
-    plant = load_plant("sample_3")
-    found = compare(sample_log, plant, "left")
-    assert {name for name, row in found.items() if not row["inside"]} == set()
+    found, without_current = compare(sample_log), compare(sample_log._replace(current_A=None))
+    for rows in (found, without_current):
+        assert {name for name, row in rows.items() if not row["inside"]} == set()
     # intervals that say something
     assert found["back_emf_V_s_m"]["ci95"] < 0.01 * found["back_emf_V_s_m"]["true"]
     for name, share in (("mass_kg", 0.15), ("gear_efficiency", 0.15), ("coulomb_N", 0.3), ("gain_N_V", 0.15)):
         assert found[name]["ci95"] < share * found[name]["true"]
-    without_current = compare(sample_log._replace(current_A=None), plant, "left")
-    assert {name for name, row in without_current.items() if not row["inside"]} == set()
     assert set(without_current) == {*identification.PARAMETERS, "delay_s", "time_constant_s"}
 
 
 def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
     result = identification.identify(sample_log, None)
-    assert result["parameters"]["backlash_um"] is None
     path = tmp_path / "motor.toml"
     command.write_config(path, result, Config())
     written, true = load_config(path).motor, load_plant("sample_3")
@@ -192,10 +190,9 @@ def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
         pytest.approx(true.gear.efficiency, abs=0.05),
     )
     assert written.supply_V == Config().motor.supply_V
-    with pytest.raises(LabError, match="exists"):
-        command.write_config(path, result, Config())
-    with pytest.raises(LabError, match="current_A"):
-        command.write_config(tmp_path / "b.toml", result | {"motor": None}, Config())
+    for file, given, said in ((path, result, "exists"), (tmp_path / "b.toml", result | {"motor": None}, "current_A")):
+        with pytest.raises(LabError, match=said):
+            command.write_config(file, given, Config())
 
 
 def test_intervals_cover_what_hangs_together():

@@ -3,10 +3,14 @@
 import contextlib
 import os
 import select
-import threading
 import tty
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from io import FileIO
 from pathlib import Path
+from queue import Queue
+from threading import Event
+from typing import NamedTuple
 
 import can
 import can.viewer
@@ -101,86 +105,61 @@ def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:
     assert (frame.timestamp, frame.arbitration_id, bytes(frame.data)) == (1.5, 0x021, drive)
 
 
-class Tap:
-    """A tap on a line whose two ends the test holds: `device` is the device's, `host` the daemon's."""
+class Tap(NamedTuple):
+    """A tap that runs on a line whose two ends the test holds: `device` is the device's, `host` the daemon's."""
 
-    def __init__(self, folder: Path) -> None:
-        self.device, self._near = os.openpty()
-        tty.setraw(self._near)
-        self.port = serial.Serial(os.ttyname(self._near), timeout=0, exclusive=True)
-        self.log = wire_log.WireLog(folder / "tapped.log")
-        self.is_stopped = False
-        self.error: OSError | None = None
-        self._path = ""
-        self._announced = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-        assert self._announced.wait(PATIENCE_S)
-        self.host = os.open(self._path, os.O_RDWR | os.O_NOCTTY)
+    device: FileIO
+    host: FileIO
+    log: wire_log.WireLog
+    stopped: Event
+    running: Future[None]
 
-    def read(self, descriptor: int, length: int) -> bytes:
-        """The next so many bytes."""
-        data = b""
-        while len(data) < length:
-            assert select.select([descriptor], [], [], PATIENCE_S)[0]
-            data += os.read(descriptor, length - len(data))
-        return data
 
-    def end(self) -> None:
-        """Stops it, once."""
-        self.is_stopped = True
-        self._thread.join(PATIENCE_S)
-        assert not self._thread.is_alive()
-
-    def close(self) -> None:
-        self.end()
-        self.port.close()
-        self.log.close()
-        for descriptor in (self.host, self._near, self.device):
-            if descriptor >= 0:
-                os.close(descriptor)
-
-    def _run(self) -> None:
-        try:
-            wire_log.tap(self.port, self.log, self._announce, lambda: self.is_stopped)
-        except OSError as error:
-            self.error = error
-
-    def _announce(self, path: str) -> None:
-        self._path = path
-        self._announced.set()
+def read(end: FileIO, length: int) -> bytes:
+    """The next so many bytes."""
+    data = b""
+    while len(data) < length:
+        assert select.select([end], [], [], PATIENCE_S)[0]
+        data += os.read(end.fileno(), length - len(data))
+    return data
 
 
 @pytest.fixture
 def tapped(tmp_path: Path) -> Iterator[Tap]:
-    tap = Tap(tmp_path)
-    yield tap
-    tap.close()
+    stopped, announced = Event(), Queue[str]()
+    with contextlib.ExitStack() as ends:
+        device, near = (ends.enter_context(FileIO(descriptor, "r+")) for descriptor in os.openpty())
+        tty.setraw(near.fileno())
+        port = ends.enter_context(serial.Serial(os.ttyname(near.fileno()), timeout=0, exclusive=True))
+        log = ends.enter_context(contextlib.closing(wire_log.WireLog(tmp_path / "tapped.log")))
+        thread = ends.enter_context(ThreadPoolExecutor(1))
+        ends.callback(stopped.set)
+        running = thread.submit(wire_log.tap, port, log, announced.put, stopped.is_set)
+        host = os.open(announced.get(timeout=PATIENCE_S), os.O_RDWR | os.O_NOCTTY)
+        yield Tap(device, ends.enter_context(FileIO(host, "r+")), log, stopped, running)
 
 
 def test_a_tap_passes_every_byte_on_and_logs_the_frames(tapped: Tap) -> None:
     down = encode_frame(FUNCTION[Drive], 0, encode(Drive(0.1, 0.2, DriveMode.RUN, 5)))
     up = encode_frame(FUNCTION[State], 0, encode(State(1.0, 2.0, 0.1, 3)))
     noise = bytes(range(256))
-    os.write(tapped.host, down + noise)
-    assert tapped.read(tapped.device, len(down + noise)) == down + noise
-    os.write(tapped.device, noise + b"\0" + up)
-    assert tapped.read(tapped.host, len(noise) + 1 + len(up)) == noise + b"\0" + up
-    tapped.end()
-    assert (tapped.error, tapped.log.frames) == (None, 2)
+    tapped.host.write(down + noise)
+    assert read(tapped.device, len(down + noise)) == down + noise
+    tapped.device.write(noise + b"\0" + up)
+    assert read(tapped.host, len(noise) + 1 + len(up)) == noise + b"\0" + up
+    tapped.stopped.set()
+    assert (tapped.running.exception(PATIENCE_S), tapped.log.frames) == (None, 2)
 
 
 def test_a_tap_does_not_wait_for_a_host_that_reads_nothing(tapped: Tap) -> None:
     state = encode_frame(FUNCTION[State], 0, encode(State(1.0, 2.0, 0.1, 3)))
     for _ in range(20):
-        os.write(tapped.device, state * 100)
+        tapped.device.write(state * 100)
     drive = encode_frame(FUNCTION[Drive], 0, encode(Drive(0.1, 0.2, DriveMode.RUN, 5)))
-    os.write(tapped.host, drive)
-    assert tapped.read(tapped.device, len(drive)) == drive
+    tapped.host.write(drive)
+    assert read(tapped.device, len(drive)) == drive
 
 
 def test_a_tap_ends_when_the_device_is_unplugged(tapped: Tap) -> None:
-    os.close(tapped.device)
-    tapped.device = -1
-    tapped._thread.join(PATIENCE_S)
-    assert isinstance(tapped.error, OSError)
+    tapped.device.close()
+    assert isinstance(tapped.running.exception(PATIENCE_S), OSError)

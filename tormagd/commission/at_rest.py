@@ -24,8 +24,8 @@ SWITCH = "look at the switch, its cable and the coupling between motor and screw
 def link(known: Known) -> Course[list[Finding]]:
     """Watch a device for REST_S without a setpoint, in any state but FAULT, and judge what carries every other step.
 
-    Six findings: round trip, periods with the device's answer, messages lost, periods that the host kept, supply and
-    temperature. What no tick says is not measured. Raises StoppedError for a fault.
+    Six findings: round trip, ms; periods with the device's answer, messages lost, and periods that the host kept, % of
+    all; supply, V; temperature, °C. What no tick says is not measured. Raises StoppedError for a fault.
     """
     ticks = yield from watch(REST_S, states=ANY_STATE)
     steps_s = np.diff(ticks["monotonic_s"])

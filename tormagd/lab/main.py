@@ -58,8 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that the first argument names and return its exit code, as `run` with the other arguments.
 
     None takes the arguments of the process. Without arguments, and for `--help`, the commands are listed on stdout, and
-    the code is 0. For an unknown name they are listed on stderr, with what may have been meant; the code is 2. Output
-    is from then on written in any encoding.
+    the code is 0. For an unknown name they are listed on stderr, with what may have been meant; the code is 2. From
+    then on stdout and stderr take any text.
     """
     write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)

@@ -94,8 +94,8 @@ class WireLog:
     def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
         """Log what a connection wrote to the device, frames of a serial line as bytes; an empty list logs nothing.
 
-        `unsent`, what did not go out, is not used: it is logged all the same. Raises TypeError for a bus's frames, and
-        OSError as `add`.
+        `unsent`, the count of frames that did not go out, is not used. Raises TypeError for a bus's frames, and OSError
+        as `add`.
         """
         self.add(now_s, b"".join(raw), is_rx=False)
 
@@ -200,23 +200,13 @@ def run(options: argparse.Namespace) -> Found:
         if options.way == "virtual":
             virtual_session(options.seconds, log)
         else:
-            _tap_until_stopped(options.port, options.baud, log)
+            with (
+                interrupted_by(signal.SIGINT, signal.SIGTERM) as is_stopped,
+                serial.Serial(options.port, options.baud, timeout=0, exclusive=True) as port,
+            ):
+                tap(port, log, _announce, is_stopped)
     return Found({"file": str(options.file), "frames": log.frames, "damaged": log.damaged})
 
 
-def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:
-    """Tap the serial port at `path` until SIGINT or SIGTERM, and print where the daemon finds the line.
-
-    Both signals have their old handlers again at the end. `log` is left open. Raises OSError as `tap`, and where the
-    port cannot be opened or another process holds it.
-    """
-    with (
-        interrupted_by(signal.SIGINT, signal.SIGTERM) as is_stopped,
-        serial.Serial(path, baud, timeout=0, exclusive=True) as port,
-    ):
-        tap(
-            port,
-            log,
-            lambda pty: print(f"{pty}  # give this to the daemon as device.port", flush=True),
-            is_stopped,
-        )
+def _announce(pty: str) -> None:
+    print(f"{pty}  # give this to the daemon as device.port", flush=True)

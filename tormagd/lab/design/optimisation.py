@@ -25,7 +25,7 @@ from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differen
 from tormagd.lab.arrays import Array
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.phase_portrait import PhasePortrait, Region
-from tormagd.physics.errors import DomainError, require
+from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
@@ -110,16 +110,12 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class Run(msgspec.Struct, frozen=True):
-    """One start of one solver on one problem: all that its outcome depends on. `DomainError` for a seed outside
-    0..2^31."""
+    """One start of one solver on one problem: all that its outcome depends on. The seed is 0 or more."""
 
     problem: Problem
     start: Design
     solver: Solver
     seed: int = 1
-
-    def __post_init__(self) -> None:
-        require("seed", float(self.seed), 0.0, 2.0**31)
 
 
 def coverage(problem: Problem, design: Design) -> float:

@@ -23,8 +23,9 @@ def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
     `holdout_voltage_nrmse`: of the second half, by a fit of the first. `notes` are sentences.
 
     With `gain_N_V` the parameters are scaled from volts, and a current is not used. With None they come from the
-    current, which also gives `motor` and the gain. Without one all of these are None. `log.gain_N_V` is not used.
-    Raises LabError for a gain that is not above 0, or a log, or half of one, that moves too little.
+    current, which also gives `motor` and the gain. Without one PARAMETERS, `motor` and the gain are None.
+    `log.gain_N_V` is not used. Raises LabError for a gain that is not above 0, or a log, or half of one, that moves too
+    little.
     """
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
@@ -32,21 +33,18 @@ def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
     measured, predicted = fit_volts(log.part(slice(None, half))).voltage(log.part(slice(half, None)))
     volts = fit_volts(log)
     ratios = (volts.mass, volts.viscous, volts.coulomb, volts.offset)
-    has_current = log.current_A is not None and gain_N_V is None
-    notes = [BACKLASH]
-    delay, motor = volts.delay, None
-    found: tuple[Estimate | None, ...]
-    if has_current:
+    notes, delay, motor = [BACKLASH], volts.delay, None
+    found: tuple[Estimate | None, ...] = (None,) * len(PARAMETERS)
+    if gain_N_V is not None:
+        found = tuple(ratio.scaled(gain_N_V) for ratio in ratios)
+        notes.append("gain: taken as given, without an interval of its own")
+    elif log.current_A is not None:
         windings = fit_windings(log)
         gearbox = fit_gearbox(log, windings.back_emf.value)
         found, delay = physical(windings, gearbox), windings.delay
         motor = motor_parameters(windings, gearbox)
         gain_N_V = motor["gain_N_V"].value
-    elif gain_N_V is not None:
-        found = tuple(ratio.scaled(gain_N_V) for ratio in ratios)
-        notes.append("gain: taken as given, without an interval of its own")
     else:
-        found = (None,) * len(PARAMETERS)
         notes.append("no gain and no current: only ratios to the gain show")
     return {
         "parameters": {
