@@ -18,7 +18,7 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.telemetry import tick_record
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.safety.operating_state import RefusedError
-from tormagd.simulation.device import MessageDevice, VirtualDevice
+from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, ReversingHand
 from tormagd.simulation.parameters import PlantParameters
@@ -37,18 +37,12 @@ class AlteringLine:
 
     def __init__(self, device: VirtualDevice, alters: Altered) -> None:
         self._device, self._alters = device, alters
+        self.messages, self.receive = device.messages, device.receive
         self._stream = FrameStream()
-
-    @property
-    def messages(self) -> MessageDevice:
-        return self._device.messages
 
     @property
     def truth(self) -> Truth:
         return self._device.truth
-
-    def receive(self, now_s: float, data: bytes) -> None:
-        self._device.receive(now_s, data)
 
     def transmit(self, now_s: float) -> bytes:
         said = self._stream.unpack(self._device.transmit(now_s))

@@ -5,6 +5,7 @@ import numpy as np
 from tormagd.commission.course import PLACES, Columns, Course, Row, given, watch
 from tormagd.commission.finding import Finding, finding
 from tormagd.commission.known import Known
+from tormagd.commission.of_carriages import SIDES
 
 REST_S = 3.0
 BEGINS_S, HOMING_S = 2.0, 15.0
@@ -13,7 +14,6 @@ HUNG_S, SWINGS_S = 60.0, 3.0
 "Time to hang the weight, and for it to swing out."
 TOLD_S = 0.3
 "By then a device that opens has said so."
-SIDES = ("left", "right")
 PLACE_MM = (-0.3, 0.3)
 "Where a switch may be: twice what the weakest motors run on while they brake."
 ANY_STATE = ("DISABLED", "ENABLED", "PAUSED")

@@ -20,8 +20,6 @@ MIN_PHASE_MARGIN_DEG = 45.0
 LARGEST_GAIN_PER_MM = 20.0
 PARAMETERS = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
 TICK_S = 1e-3
-Grid = Iterable[tuple[float, float, float]]
-"Derivative times, derivative filters and integral times, s."
 
 
 class Corners(NamedTuple):
@@ -66,12 +64,17 @@ def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, fl
     return {"gain_margin_dB": min(gain), "phase_margin_deg": min(phase), "corners": float(len(gain))}
 
 
-def tunings(config: Config, grid: Grid, corners: Corners = Corners()) -> Iterator[Tuning]:  # noqa: B008  # immutable
+def tunings(
+    config: Config,
+    grid: Iterable[tuple[float, float, float]],
+    corners: Corners = Corners(),  # noqa: B008  # immutable
+) -> Iterator[Tuning]:
     """Yield the largest robust proportional gain for every point of the grid that has one, with its margins.
 
-    Robust is with MIN_GAIN_MARGIN_DB and MIN_PHASE_MARGIN_DEG or more at every corner. The gain, duty per mm, is
-    rounded down to a tenth and at most LARGEST_GAIN_PER_MM. A point that has none under that is left out. The motor is
-    that of `config`, which stays as it is. A point is searched when it is asked for.
+    A point is derivative time, derivative filter and integral time, s. Robust is with MIN_GAIN_MARGIN_DB and
+    MIN_PHASE_MARGIN_DEG or more at every corner. The gain, duty per mm, is rounded down to a tenth and at most
+    LARGEST_GAIN_PER_MM. A point that has none under that is left out. The motor is that of `config`, which stays as it
+    is. A point is searched when it is asked for.
     """
     for derivative_s, filter_s, integral_s in grid:
         position = msgspec.structs.replace(
