@@ -172,8 +172,8 @@ def test_a_device_that_cannot_go_on_stops_with_its_fault_on_the_page(bench, step
     found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
     assert (stopped.step, stopped.code) == (step, code)
     page = page_of(msgspec.structs.replace(NEW, findings=found, stopped=stopped))
-    assert code in page
-    assert stopped.remedy.split()[0] in page
+    told = (f"Stopped in step {step}", code, stopped.remedy.split()[0], "The gap was told to open")
+    assert [words for words in told if words not in page] == []
 
 
 def test_an_abort_at_any_time_opens_the_gap(bench):
@@ -185,8 +185,6 @@ def test_an_abort_at_any_time_opens_the_gap(bench):
             device.commission(chosen("steps", "carriages"))
         last = [device.loop.tick() for _ in range(3000)][-1]
         assert last.truth.gap_mm > 94.0
-    page = page_of(msgspec.structs.replace(NEW, stopped=Stopped("steps", "interrupted", "x", "y")))
-    assert "The gap was told to open" in page
 
 
 def test_a_step_with_a_row_that_was_not_measured_is_run_again():

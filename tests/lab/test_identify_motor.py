@@ -60,8 +60,10 @@ def test_without_a_gain_only_ratios(computed_log):
     )
 
 
-def test_emps_is_within_the_published_values(recordings, capsys):
-    assert main(["identify-motor", str(recordings / "emps" / "DATA_EMPS.mat"), "--json"]) == 0
+def test_emps_is_within_the_published_values_and_drawn(recordings, capsys, tmp_path):
+    picture = tmp_path / "emps.png"
+    assert main(["identify-motor", str(recordings / "emps" / "DATA_EMPS.mat"), "--json", "--plot", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
     found = json.loads(capsys.readouterr().out)
     values = {name: item["value"] for name, item in found["parameters"].items() if item is not None}
     assert (values["mass_kg"], values["viscous_N_s_m"]) == pytest.approx((95.1089, 203.5034), rel=0.02)

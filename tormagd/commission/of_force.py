@@ -148,10 +148,10 @@ def _strength(ticks: Columns) -> Finding:
 def steps(known: Known) -> Course[list[Finding]]:
     """Step over the range as STEP_SHARES says, while the handle is moved, and return four findings.
 
-    They are the mean error, measured less asked, and the greatest, mN; the carriages' greatest overshoot, % of a step;
-    and how far apart they stand 99 % of the time, mm. Errors count from ARRIVED_S after each step on. Where the handle
-    stood after one step, both errors are not measured. The device stays ENABLED. Raises StoppedError for a fault, or a
-    handle that hardly moves.
+    They are the mean error and the greatest, measured less asked, mN. Then come the carriages' greatest overshoot, % of
+    a step, and how far apart they stand 99 % of the time, mm. Errors count from ARRIVED_S after each step on. Where the
+    handle stood after one step, both errors are not measured. The device stays ENABLED. Raises StoppedError for a
+    fault, or a handle that hardly moves.
     """
     levels_N = [known.force_N(share) for share in STEP_SHARES]
     yield from ready(levels_N[1])

@@ -167,7 +167,7 @@ def solve(run: Run) -> Outcome:
     By the measure it has the greatest coverage or the least corner cost that the solver reaches within the problem's
     bounds. With "global" and a coverage, a second search takes the smallest design within SLACK of the best. The same
     run gives the same design anywhere. Raises `DomainError` where the solver finds no design whose elastomer bears the
-    field. A start outside the bounds is not refused.
+    field. From a start outside the bounds "local" goes to the nearest within, "global" raises ValueError.
     """
     began_s = time.thread_time()
     search = _Search(run.problem)
