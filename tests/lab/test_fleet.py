@@ -101,7 +101,8 @@ def test_a_console_is_summed_up_over_its_days(folder, scheduler, capsys):
 def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
     for error_N in (0.01, 0.03):
         write(tmp_path / f"{error_N}.mcap", 1, 0, error_N, 1.0)
-    first, second = (read(str(tmp_path / f"{error_N}.mcap")) for error_N in (0.01, 0.03))
+    read_of_each = [read(str(tmp_path / f"{error_N}.mcap")) for error_N in (0.01, 0.03)]
+    first, second = (found for found in read_of_each if isinstance(found, Summary))
     (console,) = consoles([msgspec.structs.replace(first, enabled_s=6.0), second], [])
     assert (console.tracking_rms_N, console.worst_rms_N) == pytest.approx((((3 * 0.01**2 + 0.03**2) / 4) ** 0.5, 0.03))
     assert console.trim == Drift(1.0, 1.0, None)

@@ -89,7 +89,7 @@ def loading_halves(record: CompressionRecord) -> list[slice]:
 
 
 def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCLES) -> StressStretch:
-    """Return stretch, under 1, and stress, under 0, in the loading half of `cycle`, counted from 1.
+    """Return stretch and stress in the loading half of `cycle`, counted from 1: under 1 and negative in compression.
 
     Raises `LabError` if the record has no such cycle, the plates hardly moved, or they reach the sample's height in it.
     """
