@@ -15,6 +15,7 @@ from hypothesis import assume, given, settings, strategies as st
 from tormagd.lab.characterisation.compression import (
     CompressionRecord,
     Sample,
+    deviations,
     evaluated_cycle,
     loading_halves,
     read_compression,
@@ -151,11 +152,13 @@ SAMPLE = Sample()
 SOFTENING = (1.5, 1.2, 1.05, 1.0, 0.99)
 
 
-def cyclic_test(cycles: int = 4, noise: float = 0.0, set_mm: float = 0.0) -> CompressionRecord:
-    """Triangles to 25 % at 10 mm/min; stiffer in the first cycles and while loading; a set shifts later starts."""
+def cyclic_test(
+    cycles: int = 4, strain: float = 0.25, rate_mm_min: float = 10.0, noise: float = 0.0, set_mm: float = 0.0
+) -> CompressionRecord:
+    """Triangles from zero to the strain; stiffer in the first cycles and while loading; a set shifts later starts."""
     rng = np.random.default_rng(0)
-    top_mm, dt_s = 0.25 * SAMPLE.height_mm, 0.05
-    half = round(top_mm / (10.0 / 60.0) / dt_s)
+    top_mm, dt_s = strain * SAMPLE.height_mm, 0.05
+    half = round(top_mm / (rate_mm_min / 60.0) / dt_s)
     displacement, force = [0.0], [0.0]
     for cycle in range(cycles):
         low_mm = set_mm * cycle
@@ -175,6 +178,16 @@ def test_noise_and_set_make_no_cycles() -> None:
     assert len(loading_halves(record)) == 4
     curve = evaluated_cycle(record, SAMPLE)
     assert fit_ogden(curve.stretch, curve.stress_Pa).shear_modulus_Pa == pytest.approx(120e3, rel=0.05)
+
+
+def test_deviations_from_the_cycle_rules_are_told() -> None:
+    assert deviations(cyclic_test(cycles=2, strain=0.4, rate_mm_min=50.0), Sample(29.2, 12.5)) == [
+        "2 cycles: the method has 4 and evaluates the last",
+        "cycle 1 goes to 40.0% strain: the method goes to 25%",
+        "cycle 1 loads at 50 mm/min: the method loads at 10 mm/min",
+        "cycle 2 goes to 40.0% strain: the method goes to 25%",
+        "cycle 2 loads at 50 mm/min: the method loads at 10 mm/min",
+    ]
 
 
 def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
@@ -277,6 +290,7 @@ def characterised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callabl
 def test_compression_gives_the_conditioned_modulus_of_the_fourth_cycle(characterised) -> None:
     found = characterised("compression", cyclic_test(), "time_s,displacement_mm,force_N")
     assert (found["cycle"], found["stretch"]) == (4, pytest.approx([0.75, 1.0]))
+    assert found["deviations"] == ["diameter 30 mm: test piece A has 29 +- 0.5 mm"]
     assert found["ogden"]["shear_modulus_kPa"] == pytest.approx(120.0, rel=1e-3)
     assert found["thesis_eq_3"]["r2"] > 0.99
 

@@ -13,7 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.lab.characterisation.compression import CYCLES, Sample, StressStretch, evaluated_cycle, read_compression
+from tormagd.lab.characterisation.compression import (
+    CYCLES,
+    Sample,
+    StressStretch,
+    deviations,
+    evaluated_cycle,
+    read_compression,
+)
 from tormagd.lab.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
 from tormagd.lab.characterisation.relaxation import RelaxationRecord, fit_relaxation
 from tormagd.lab.main import Found
@@ -49,13 +56,14 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def compression(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the keys of `moduli` for the evaluated cycle of a compression test, and that cycle's number, `cycle`.
+    """Return the keys of `moduli` for the evaluated cycle of a compression test, its number `cycle`, and `deviations`.
 
-    Options read: `file`, `diameter_mm`, `height_mm`, `cycle`, from 1, and `terms`. Raises LabError as
+    These are sentences, as the function of that name gives them. Options read: `file`, `diameter_mm`, `height_mm`, `cycle`, from 1, and `terms`. Raises LabError as
     `read_compression`, `evaluated_cycle` and `moduli`, and DomainError as `Sample` and `moduli`.
     """
     record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
-    return {"cycle": options.cycle, **moduli(evaluated_cycle(record, sample, options.cycle), options.terms)}
+    curve = evaluated_cycle(record, sample, options.cycle)
+    return {"cycle": options.cycle, "deviations": deviations(record, sample), **moduli(curve, options.terms)}
 
 
 def tension(options: argparse.Namespace) -> dict[str, Any]:

@@ -20,6 +20,12 @@ from tormagd.physics.errors import require
 CYCLES = 4
 """Three conditioning cycles and the one that counts."""
 
+STRAIN, RATE_MM_MIN = 0.25, 10.0
+"""Engineering strain that each cycle goes to, and how fast."""
+
+STRAIN_TOLERANCE, RATE_TOLERANCE = 0.02, 0.25
+"""How far strain (absolute) and rate (relative) may be off before `deviations` says so."""
+
 
 @dataclass(frozen=True, slots=True)
 class Sample:
@@ -101,6 +107,30 @@ def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCL
     if not (stretch > 0.0).all():
         raise LabError(f"displacement_mm reaches the sample's height, {sample.height_mm:g} mm")
     return StressStretch(stretch, -record.force_N[half] / sample.area_m2)
+
+
+def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
+    """Return where a test differs from ISO 7743 with lubricated plates, one sentence each; empty if nowhere.
+
+    Judged are the sample (test piece A), the number of cycles, and each one's strain and rate while loading. The
+    thesis's 30 mm is outside, which matters little: the shear modulus from lubricated plates does not depend on the
+    diameter. Raises `LabError` if the plates hardly moved.
+    """
+    halves = loading_halves(record)
+    found = []
+    for name, value, nominal in (("diameter", sample.diameter_mm, 29.0), ("height", sample.height_mm, 12.5)):
+        if abs(value - nominal) > 0.5:
+            found.append(f"{name} {value:g} mm: test piece A has {nominal:g} +- 0.5 mm")
+    if len(halves) != CYCLES:
+        found.append(f"{len(halves)} cycles: the method has {CYCLES} and evaluates the last")
+    for number, half in enumerate(halves, start=1):
+        strain = float(record.displacement_mm[half].max()) / sample.height_mm
+        if abs(strain - STRAIN) > STRAIN_TOLERANCE:
+            found.append(f"cycle {number} goes to {strain:.1%} strain: the method goes to {STRAIN:.0%}")
+        rate = 60.0 * float(np.ptp(record.displacement_mm[half])) / float(np.ptp(record.time_s[half]))
+        if abs(rate / RATE_MM_MIN - 1.0) > RATE_TOLERANCE:
+            found.append(f"cycle {number} loads at {rate:.3g} mm/min: the method loads at {RATE_MM_MIN:g} mm/min")
+    return found
 
 
 def _latched(values: Array, low: float, high: float) -> Mask:
