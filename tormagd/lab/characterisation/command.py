@@ -58,8 +58,9 @@ def run(options: argparse.Namespace) -> Found:
 def compression(options: argparse.Namespace) -> dict[str, Any]:
     """Return the keys of `moduli` for the evaluated cycle of a compression test, its number `cycle`, and `deviations`.
 
-    These are sentences, as the function of that name gives them. Options read: `file`, `diameter_mm`, `height_mm`, `cycle`, from 1, and `terms`. Raises LabError as
-    `read_compression`, `evaluated_cycle` and `moduli`, and DomainError as `Sample` and `moduli`.
+    These are sentences, as the function of that name gives them. Options read: `file`, `diameter_mm`, `height_mm`,
+    `cycle`, from 1, and `terms`. Raises LabError as `read_compression`, `evaluated_cycle` and `moduli`, and DomainError
+    as `Sample` and `moduli`.
     """
     record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
     curve = evaluated_cycle(record, sample, options.cycle)
