@@ -32,6 +32,8 @@ from tormagd.simulation.plant import Plant, Truth
 
 PERIOD_S = 1e-3
 SETPOINT_TICKS = 2
+BURST = 25.0
+"Setpoints that are lost in a row, in the mean: 50 ms."
 MAX_N = 2.0
 "What hand and wall come to rest at."
 FREE_MM = 20.0
@@ -50,8 +52,9 @@ MASS_KG = 0.15
 
 
 class Case(NamedTuple):
-    """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without.
-    `is_known`: a law tells the wall before it was met. Hand and wall come to rest at `most_N`."""
+    """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without; jitter
+    and loss are the network's. `is_known`: a law tells the wall before it was met. Hand and wall come to rest at
+    `most_N`."""
 
     device: str
     hand_N_mm: float
@@ -59,6 +62,8 @@ class Case(NamedTuple):
     push_mm_s: float
     round_trip_ms: float
     mode: str
+    jitter_ms: float = 0.0
+    loss: float = 0.0
     is_known: bool = True
     most_N: float = MAX_N
 
@@ -90,8 +95,9 @@ class Link:
     """A patient behind the network, and the newest setpoint that has come from there."""
 
     def __init__(self, case: Case, wall: Wall, withdraw_N: float) -> None:
-        self._there: NetworkDelay[float] = NetworkDelay(5e-4 * case.round_trip_ms)
-        self._back: NetworkDelay[TimedSetpoint] = NetworkDelay(5e-4 * case.round_trip_ms)
+        one_way_s, jitter_s = 5e-4 * case.round_trip_ms, 1e-3 * case.jitter_ms
+        self._there: NetworkDelay[float] = NetworkDelay(one_way_s, jitter_s, case.loss, BURST, seed=1)
+        self._back: NetworkDelay[TimedSetpoint] = NetworkDelay(one_way_s, jitter_s, case.loss, BURST, seed=2)
         self._wall, self._withdraw_N, self._mode = wall, withdraw_N, case.mode
         self._is_known = case.is_known
         self._tip: tuple[float, float] | None = None
