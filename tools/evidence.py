@@ -24,8 +24,8 @@ FOLDER = ROOT / "docs" / "evidence"
 README = "README.md"
 HEADER = """# Evidence
 
-Written by `make evidence`: the long suites in full, on simulated devices. *Measured* stands where a part judges
-nothing. `python tools/evidence.py NAME` repeats one.
+Written by `make evidence`, on simulated devices. *Measured*: the part judges nothing. `python tools/evidence.py NAME`
+repeats one.
 
 | part | command | version, day | held | figures |
 | --- | --- | --- | --- | --- |
