@@ -80,10 +80,10 @@ def nominals(motor: Motor) -> dict[str, float]:
 def carriages(known: Known) -> Course[list[Finding]]:
     """Go slowly, jump and swing over the range, with the device enabled and its handle moved, and return 15 findings.
 
-    For each side they are gain, lag, ms, and bandwidth, Hz, of the answer to sines. Then come, for each side,
-    resistance, back EMF, inertia and friction, as shares of those in [motor]. Last is the loop's gain margin, dB, with
-    the motor that was found. The device stays ENABLED. Raises StoppedError for a fault, or a handle that stands at
-    first.
+    Enables the device first, and waits for the handle, as `ready`. For each side the findings are gain, lag, ms, and
+    bandwidth, Hz, of the answer to sines. Then come, for each side, resistance, back EMF, inertia and friction, as
+    shares of those in [motor]. Last is the loop's gain margin, dB, with the motor that was found. The device stays
+    ENABLED. Raises StoppedError as `ready`, and where a fault or a command ends ENABLED.
     """
     levels_N = [known.force_N(share) for share in JUMP_SHARES]
     yield from ready(levels_N[0])
@@ -111,7 +111,9 @@ def _sine(middle_N: float, swing_N: float, at_Hz: float) -> Callable[[float], fl
 def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
     """Return how one carriage, `left` or `right`, answers the sines: gain and lag at AT_HZ, and its bandwidth.
 
-    `swings` are the ticks of each sine by its frequency, Hz, AT_HZ among them. The lag is in ms, the bandwidth in Hz.
+    `swings` are the ticks of each sine by its frequency, Hz, AT_HZ among them, else KeyError. The gain is the
+    carriage's swing over half of the gap reference's, the lag behind that in ms. Both are not measured where the
+    reference stands. The bandwidth, Hz, is as `_bandwidth_Hz`: what a carriage follows in swing and lag.
     """
     ratios = {at_Hz: _ratio(sine, side, at_Hz) for at_Hz, sine in swings.items()}
     lag_s = -cmath.phase(ratios[AT_HZ]) / (math.tau * AT_HZ)
@@ -132,9 +134,9 @@ def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
 def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
     """Return up to which frequency, Hz, a carriage follows, by its ratio at each; the highest where it follows all.
 
-    `ratios` are those of `_ratio` by frequency, Hz; NaN counts as not followed. A carriage follows with at least
-    MIN_RATIO of the swing, at most MAX_BEHIND late. Between two frequencies what it lacks counts as linear over the
-    logarithm of the frequency. 0 where it does not follow the lowest.
+    `ratios` are those of `_ratio` by frequency, Hz. A carriage follows with at least MIN_RATIO of the swing, at most
+    MAX_BEHIND late. Between two frequencies what it lacks counts as linear over the logarithm of the frequency. 0 where
+    it does not follow the lowest, or the ratio there is NaN. NaN where all under a ratio of NaN are followed.
     """
     lacks = [
         (at_Hz, max(MIN_RATIO / max(abs(it), 1e-9), abs(cmath.phase(it)) / MAX_BEHIND))

@@ -72,8 +72,9 @@ def sensor(known: Known) -> Course[list[Finding]]:
     """Hold one force for HOLD_S on a handle that is moved both ways, and return four findings on the sensor.
 
     They are its zero, noise and resolution, mN, and the force when slow over that at speed, as a share of the model's.
-    The first fifth of the time does not count. A finding that the handle's motion does not show is not measured. The
-    device stays ENABLED. Raises StoppedError for a fault, or a handle that hardly moves.
+    The first fifth of the time does not count. A finding that the handle's motion does not show is not measured.
+    Enables the device first, as `ready`; it stays ENABLED. Raises StoppedError as `ready`, where a fault or a command
+    ends ENABLED, and for a handle that hardly moves.
     """
     held_N = known.force_N(0.4)
     yield from ready(held_N)
@@ -110,9 +111,9 @@ def sensor(known: Known) -> Course[list[Finding]]:
 def force_over_gap(known: Known) -> Course[list[Finding]]:
     """Go slowly over the whole range and back as RAMPS_S says, while the handle is moved, and return two findings.
 
-    They are the device's force over the model's, and by how much, mN RMS, it is off the learned curve. The device stays
-    ENABLED. Raises StoppedError for a fault, and then has the first finding in `found`; also for a handle that hardly
-    moves.
+    They are the device's force over the model's, and by how much, mN RMS, it is off the learned curve. Enables the
+    device first, as `ready`; it stays ENABLED. Raises StoppedError where a fault or a command ends ENABLED on the way,
+    with the first finding in `found`. Raises it without any as `ready`, and for a handle that hardly moves.
     """
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
@@ -150,8 +151,8 @@ def steps(known: Known) -> Course[list[Finding]]:
 
     They are the mean error and the greatest, measured less asked, mN. Then come the carriages' greatest overshoot, % of
     a step, and how far apart they stand 99 % of the time, mm. Errors count from ARRIVED_S after each step on. Where the
-    handle stood after one step, both errors are not measured. The device stays ENABLED. Raises StoppedError for a
-    fault, or a handle that hardly moves.
+    handle stood after one step, both errors are not measured. Enables the device first, as `ready`; it stays ENABLED.
+    Raises StoppedError as `ready`, where a fault or a command ends ENABLED, and for a handle that hardly moves.
     """
     levels_N = [known.force_N(share) for share in STEP_SHARES]
     yield from ready(levels_N[1])
@@ -183,8 +184,9 @@ def steps(known: Known) -> Course[list[Finding]]:
 def memory(known: Known) -> Course[list[Finding]]:
     """Step up, hold that gap, and return one finding: the force that dies away from 0.5 to 5 s after the step, %.
 
-    It is a share of the force at 0.5 s; not measured where the handle is not moved both ways at over FAST_MM_S. The
-    device is paused for HELD_S, then ENABLED again. Raises StoppedError for a fault, or a handle that stands at first.
+    It is a share of the force at 0.5 s; not measured where the handle is not moved both ways at over FAST_MM_S. Enables
+    the device first, as `ready`. It is paused for HELD_S, then ENABLED again. Raises StoppedError as `ready`, as
+    `given`, and where a fault or another command changes the operating state.
     """
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)

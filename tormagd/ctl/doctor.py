@@ -519,7 +519,8 @@ def _table(table: tuple[Rate, ...]) -> str:
     """Return the table of all rates, a row each: loop, Hz, share used, whether held with margin, and what would hold
     it.
 
-    An asterisk marks the configured rates. The first line is empty.
+    The share is of a period or of a processor, the larger of both. An asterisk marks the configured rates. The first
+    line is empty; then come a title and the columns' names.
     """
     lines = [
         f"\nrates (at most {MAX_USED:.0%} used is held with margin; * is configured):",

@@ -58,12 +58,13 @@ def arm(client: Client, timeout_s: float) -> Outcome:
 
 
 def operate(client: Client, command: str) -> Outcome:
-    """Give one command of DONE, which the daemon carries out or refuses at once, and return its answer.
+    """Give one command of DONE (enable, disable, pause, resume, stop, clear-fault), and return the daemon's answer.
 
-    Another command raises KeyError, after it was given. The result has `operating_state` and `is_connected`; the gap
-    may still move. `stop` without a device gives an outcome of REFUSED: the gap does not open. After a fault was
-    cleared, watches for COMES_BACK_S; where none was latched, the text says so. Raises CommandError: REFUSED where the
-    answer does not show the state, FAULT where the fault comes back. Raises as `Client.request`.
+    The daemon carries it out or refuses it at once. The result has `operating_state` and `is_connected`; the gap may
+    still move. `stop` without a device gives an outcome of REFUSED: the gap does not open. After a fault was cleared,
+    watches for COMES_BACK_S; where none was latched, it does not, and the text says so. Raises CommandError: REFUSED
+    where the answer does not show the state, FAULT where the fault comes back. Raises as `Client.request`, and KeyError
+    for another command, after it was given.
     """
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)

@@ -199,8 +199,9 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
     """Propose a scene's tables for a recorded force: its range, rounded outwards, a tolerance, a steady handle of 42
     mm/s.
 
-    The resolution is twice the tolerance; the file is named relative to `out`. There is no insert yet. Raises
-    CommandError (USAGE) for a bad file, or a force that does not change.
+    The resolution is twice the tolerance. `out` is the scene file to be: it gives the scene's name, and the recorded
+    file is named relative to its folder. Nothing is written, and there is no insert yet. Raises CommandError (USAGE)
+    for a bad file, or a force that does not change.
     """
     hint = "a CSV with the columns t_s,force_N, no force below 0; else --column, --scale, --offset"
     with as_usage_error(ConfigError, hint=hint):
@@ -297,6 +298,6 @@ def _tables(
 
 
 def _rounded(value: float, direction: Callable[[float], int]) -> float:
-    """Round to two significant digits, down by `math.floor` or up by `math.ceil`."""
+    """Return `value` >= 0, rounded to two significant digits: down by `math.floor`, or up by `math.ceil`."""
     unit = 10.0 ** (math.floor(math.log10(value or 1.0)) - 1)
     return float(f"{direction(round(value / unit, 6)) * unit:.3g}")

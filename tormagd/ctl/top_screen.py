@@ -86,8 +86,9 @@ def _below_each_other(*parts: RenderableType) -> RenderableType:
 def _head(seen: Seen, width: int) -> Text:
     """Return the first line: state, whether homed and busy, the force as torque in mNm, scene, uptime and version.
 
-    State and force are of the newest telemetry, or the status without any. Over SILENT_S it says, too, how long nothing
-    was heard. Longer text than `width` is cut.
+    State, homed, busy and force are of the newest telemetry, or of the status without any. There is no torque where the
+    force is not known, or there is no shaft. Over SILENT_S it says, too, how long nothing was heard. The line ends at
+    `width`, in characters. A longer one comes whole, and is cut where it is drawn.
     """
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state, is_silent = printable(newest.operating_state), seen.silent_s > SILENT_S

@@ -293,8 +293,8 @@ class DeviceLink:
     def _take_identity(self, identity: Identity) -> None:
         """Keep an Identity: enter RUNNING, or REFUSED for another protocol schema, from any state.
 
-        It also matches the round trips' counters. Another serial number than before is noted as a replacement of the
-        device, which the next `due` acts on.
+        Round trips learn from it, as `RoundTrip.identity`, how far Drive and State counters are apart. Another serial
+        number than before is noted as a replacement of the device, which the next `due` acts on.
         """
         self.round_trip.identity()
         known, self.identity = self.identity, identity

@@ -65,9 +65,10 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
 
 
 def _armed(config: Config, core: Core) -> ClosedLoop:
-    """Return a new loop of `core` on the simulated PLANT, armed.
+    """Return a new loop of `core` on the simulated PLANT, armed: homed and enabled, without a setpoint.
 
-    Raises RuntimeError or RefusedError where it does not arm.
+    `core` does not change, and its loops share nothing that does. `config` is the core's, which is not checked. Raises
+    RuntimeError or RefusedError where it does not arm.
     """
     loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
     loop.arm()

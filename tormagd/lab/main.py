@@ -57,9 +57,10 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that the first argument names and return its exit code, as `run` with the other arguments.
 
-    None takes the arguments of the process. Without arguments, and for `--help`, the commands are listed on stdout, and
-    the code is 0. For an unknown name they are listed on stderr, with what may have been meant; the code is 2. From
-    then on stdout and stderr take any text.
+    None takes the arguments of the process. Without arguments, and for `-h` or `--help`, the commands are listed on
+    stdout, and the code is 0. For an unknown name they are listed on stderr, with what may have been meant; the code is
+    2. Makes stdout and stderr take any text, for the whole process. Raises as `run`, such as SystemExit for wrong usage
+    of the command.
     """
     write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)

@@ -311,7 +311,7 @@ class Firmware:
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
         """Watch the resting device, and latch what shows: UNCOMMANDED_MOTION, or SUPPLY and TEMPERATURE where new.
 
-        Motion by itself also opens the gap; after the others the drives stay off.
+        Motion by itself also opens the gap. After the others the drives stay off, and the device is no longer homed.
         """
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)
@@ -340,7 +340,8 @@ class Firmware:
     def _fail(self, time_s: float, fault: DeviceFault, sensors: Sensors) -> None:
         """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves.
 
-        A device whose drives stay off is LATCHED at once; one that opens already goes on.
+        A device whose drives stay off is LATCHED at once, and no longer homed. One that opens already goes on, and is
+        LATCHED at its end.
         """
         self.faults |= fault
         if not self._motors_on and DeviceFault.UNCOMMANDED_MOTION not in fault:

@@ -264,8 +264,8 @@ _FELT: dict[str, tuple[float, float, float]] = {
 def parse_hand(spec: str) -> Hand:
     """Return the hand that the command-line word `spec`, one of KNOWN, stands for; a size not given takes its default.
 
-    A word that ends with .csv names a recording, which is read. Raises HandError for an unknown word or a size out of
-    range, with what is allowed; for a recording, as `read_recording`.
+    A word that ends with .csv names a recording, which is read. Raises HandError for an unknown word, and for a size
+    that is no number or out of range, with what is allowed. For a recording it raises as `read_recording`.
     """
     name, _, value = spec.partition("=")
     if name in _SIZED:
@@ -281,7 +281,8 @@ def parse_hand(spec: str) -> Hand:
 def _felt(spec: str, text: str) -> FeltHand:
     """Return the hand of the word `spec`, felt=KEY=VALUE,..., whose part behind `felt=` is `text`.
 
-    A size that is not given takes its default. Raises HandError for an unknown key or a size out of range.
+    A size that is not given takes its default, so an empty `text` all; of a key given twice the last counts. Raises
+    HandError for an unknown key, and for a size that is no number or out of range.
     """
     sizes = {key: usual for key, (usual, _, _) in _FELT.items()}
     for word in filter(None, text.split(",")):

@@ -39,7 +39,7 @@ LONGEST_TURN_S: Final = 10.0
 
 @final
 class Level(Value):
-    """Means over a handle's newest sliding one way: the reading along the motion, the model's force and the rate.
+    """Means over a handle's newest sliding one way: reading along the motion, model's force, and rate without sign.
 
     `heard_s` is the time of sliding in the means, and `until_s` the host time of the last reading.
     """
@@ -128,10 +128,10 @@ class SensorZero:
 
         Zero and variance have then changed. A reversal tells the zero once the handle has slid for LEVEL_S both ways.
         It does not after a turn of over LONGEST_TURN_S, or where the zero found is beyond MAX_ZERO_N. Either way the
-        level before is spent. The handle slides at `rate_mm_s` the way `direction`, 1 or -1: give no reading of a
-        handle at rest. `reading_N` is the force against this motion, the model's force `model_N`. The reading stands
-        for `dt_s` > 0. `scale` is the device's force over the model's, known to within `scale_sd`. All arguments are
-        finite.
+        level before is spent. The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1: give no reading of a
+        handle at rest. `reading_N` is the force that is read against this motion, with the zero in it. `model_N` is the
+        model's, without `scale`. The reading stands for `dt_s` > 0. `scale` is the device's force over the model's,
+        known to within `scale_sd`. All arguments are finite; nothing is checked.
         """
         level = self.level
         if level is None or direction != self.direction:

@@ -61,7 +61,10 @@ class Fit(NamedTuple):
 
 
 def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit:
-    """Fit the shear modulus of the neo-Hookean law. Raises `LabError` and `DomainError` like `fit_ogden`."""
+    """Fit the shear modulus of the neo-Hookean law to stretch and engineering stress, Pa (n each, 2 at least).
+
+    Its `exponents` are (2.0,). Raises `LabError` and `DomainError` like `fit_ogden`, but needs no third point.
+    """
     _check(stretch, stress_Pa, 2)
     return _fitted(ogden_shape, stretch, stress_Pa, (2.0,))
 
@@ -73,8 +76,9 @@ def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit:
     exponents are left out, because one direction of loading cannot tell them from positive ones. Under tension alpha =
     -2 (alpha' - 1) grows like alpha', but the two differ widely under compression.
 
-    Raises `LabError` for fewer than 2 points a term and one more, and for stress of the wrong sign, which no positive
-    modulus fits. Raises `DomainError` for stretches outside 0.05..20.
+    Raises `LabError` for other `terms`, arrays of another shape, and fewer than 2 points a term and one more. Raises it
+    for a stretch or stress that does not vary, and for stress of the wrong sign, which no positive modulus fits. Raises
+    `DomainError` for NaN, a stretch outside 0.05..20, and a stress beyond 1e12 Pa either way.
     """
     if not 1 <= terms <= MAX_TERMS:
         raise LabError(f"terms = {terms}: allowed is 1..{MAX_TERMS}")
@@ -82,7 +86,10 @@ def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit:
 
 
 def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit:
-    """Fit Eq. 3 of the thesis as printed, with alpha > 0. Raises like `fit_ogden`."""
+    """Fit Eq. 3 of the thesis as printed, one term with alpha > 0, to stretch and stress, Pa (n each, 3 at least).
+
+    Raises like `fit_ogden`.
+    """
     return _searched(thesis_shape, stretch, stress_Pa, 1)
 
 

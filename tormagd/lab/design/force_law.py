@@ -17,7 +17,11 @@ _NEWTON_STEPS = 100
 
 
 def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29)."""
+    """Return the radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29).
+
+    A float gives a float, an array one of its shape and type. Raises `DomainError` unless 0 <= radial_moment_Tm <=
+    `max_radial_moment_Tm`.
+    """
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return -law.curve.compression(law.load(radial_moment_Tm))
@@ -26,7 +30,8 @@ def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Ge
 def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
     """Return the slope of the brake force over the radial moment, N / (T m), >= 0; 0 without field.
 
-    Raises `DomainError` unless 0 <= radial_moment_Tm <= `max_radial_moment_Tm`.
+    A float gives a float, an array one of its shape and type. Raises `DomainError` unless 0 <= radial_moment_Tm <=
+    `max_radial_moment_Tm`.
     """
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
@@ -36,14 +41,19 @@ def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geo
 
 
 def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
+    """Return the slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36).
+
+    A float gives a float, an array one of its shape and type. Raises `DomainError` for a gap outside the field law's
+    range, or one whose radial moment is above `max_radial_moment_Tm`.
+    """
     return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
 
 
 def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
     """Return the radial moment, T m, that gives the force: inverse of `brake_force_N`; 0 for 0 N.
 
-    Raises `DomainError` unless 0 <= force_N <= the force at `max_radial_moment_Tm`.
+    A float gives a float, an array one of its shape and type. Raises `DomainError` unless 0 <= force_N <= the force at
+    `max_radial_moment_Tm`.
     """
     law = reduced(elastomer, geometry)
     # evaluated as any other force, so that the force of the largest moment is admitted to the last digit

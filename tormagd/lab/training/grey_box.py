@@ -52,11 +52,12 @@ class GreyBoxMemory:
         self._state, self._field_state = grey.series.relaxed(0.0), grey.field_series.relaxed(0.0)
 
     def elastic_N(self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float) -> float:
-        """Return the network's force, N, with which the pad gives `force_N` at the end of the next step.
+        """Return the force without memory, N, at which the pad gives `force_N` at the end of the next step.
 
-        The step comes to `displacement_mm` and `rate_mm_s`, on a pad with `cip_percent` of iron. The state stays:
-        `advance` takes the step. Whether any field gives this force is not checked. Raises DomainError for a motion or
-        iron that is not finite; a `force_N` of NaN gives NaN.
+        It is for the network to give: search the network for the field of this force. Whether any field gives it is not
+        checked. The step comes to `displacement_mm` and `rate_mm_s`, on a pad with `cip_percent` of iron. The state
+        stays: `advance` takes the step. Raises DomainError for a motion or iron that is not finite; a `force_N` of NaN
+        gives NaN.
         """
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         rest_N, _ = self._step.advance(self._state, free_N)

@@ -92,9 +92,10 @@ def priors_of(plant: PlantParameters) -> list[Prior]:
 def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Fitted:
     """Fit the element, under the field law of `prior`, to the forces along `ways`, one at least, and return it.
 
-    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Zero, drift and memory of each
-    recording are fitted besides. The first BURN_S of each do not count. Raises LabError for a sensor that says nothing
-    for too long, whose zero is far off, drifts or wanders.
+    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Keys that it does not have are passed
+    over. Zero, drift and memory of each recording are fitted besides. The first BURN_S of each, s, do not count: one
+    that is no longer raises ValueError. Raises LabError for a sensor that says nothing in over MAX_LOST of a recording,
+    or whose zero is far off, drifts or wanders.
     """
     shared = [each for each in priors_of(prior) if only is None or each.key in only]
     branches = [Prior(f"memory_{place}", 0.0, 0.5) for place in range(len(prior.relaxation.fractions))]
