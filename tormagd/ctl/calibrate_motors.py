@@ -49,11 +49,11 @@ LONGEST_HOLE_S = 0.02
 
 
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
-    """Return the waveform to ask for: ramps, then jumps, `rounds` times, between two forces.
+    """Return the waveform to ask for, N over s from 0: ramps, then jumps, `rounds` times, between two forces.
 
     These are CLEAR_N above the least of `forces`, and their most. Each ramp takes one of RAMPS_S up, and as long down.
-    A jump takes 1 ms, to one of JUMP_SHARES of the range, and is held for JUMP_S. A range narrower than CLEAR_N is not
-    refused: the waveform is then upside down.
+    A jump takes 1 ms, to one of JUMP_SHARES of the range, and is held for JUMP_S. `rounds` is 1 or more, which is not
+    checked. A range narrower than CLEAR_N is not refused: the waveform is then upside down.
     """
     low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]

@@ -15,7 +15,10 @@ WRITABLE = "give a file in a directory you may write to"
 
 
 def opened(config: Config, sources: list[Path]) -> list[RecordingFile]:
-    """Open recordings, checked with the configured key. Raises CommandError (USAGE) where one cannot be read."""
+    """Open recordings, checked with the configured key, in the order of `sources`; an altered one is not refused.
+
+    Raises CommandError (USAGE) where the key or a recording cannot be read.
+    """
     key = key_of(config)
     with as_usage_error(ValueError, hint="give files that tormagctl record has made"):
         return [RecordingFile(source, key) for source in sources]
@@ -39,7 +42,8 @@ def report(config: Config, sources: list[Path], target: Path) -> Outcome:
 
     The result has `file`, and the `seals`' states by path. The outcome is REFUSED where one was altered, or could not
     be checked with the configured key; the page is written all the same. Raises CommandError (USAGE) for more than two,
-    and one that cannot be read or is empty. It also does where the page cannot be written, as without its folder.
+    and one that cannot be read or is empty. It also does where the key cannot be read, or the page cannot be written,
+    as without its folder.
     """
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"
@@ -58,8 +62,9 @@ def plot(config: Config, source: Path, target: Path) -> Outcome:
     The suffix of `target` says its format: .png, .svg or .pdf. The result has `file`, `seals`, the counts `ticks` and
     `telemetry`, `is_complete`, and the codes of `limits` and `faults`. `tracking_rms_N` and `aligned_rms_N` are None
     where the force was not followed for long enough. The outcome is REFUSED where the recording was altered, or could
-    not be checked with the configured key. Raises CommandError (USAGE) for another suffix, a recording that cannot be
-    read or is empty, or a picture that cannot be written.
+    not be checked with the configured key; the picture is drawn all the same. Raises CommandError (USAGE) for another
+    suffix, and a recording that is empty. It also does where key or recording cannot be read, or the picture cannot be
+    written.
     """
     (recording,) = of = opened(config, [source])
     overview, following = recording.overview, recording.overview.following

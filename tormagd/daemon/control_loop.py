@@ -89,10 +89,10 @@ class ControlLoop:
             log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
 
     def _give(self, name: str, conditions: Conditions) -> None:
-        """Give an operator's command to the core under `conditions`, and log it if taken. Raises RefusedError if
-        refused.
+        """Give an operator's command to the core under `conditions`, note it in the journal, and log it if taken.
 
-        The journal notes it in either case.
+        `name` is one of `operating_state.COMMANDS`. Raises RefusedError for any other, and where `conditions` or the
+        state do not allow it; the journal notes that, too.
         """
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:

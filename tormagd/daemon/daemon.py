@@ -306,8 +306,9 @@ class Daemon:
     async def _open_gap(self) -> None:
         """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the beat goes on.
 
-        In FAULT or without a device nothing is commanded. Where the gap is still closed then, wait NAMED_S more: its
-        fault is then logged. Nothing is returned or raised where it stays closed.
+        In FAULT nothing is commanded: a fault has asked the device to open. Without a device there is no wait either.
+        Where the gap is still closed after the wait, wait NAMED_S more: its fault is logged by then. Nothing is
+        returned or raised where it stays closed.
         """
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())

@@ -53,10 +53,11 @@ class Tally:
         )
 
     def tell(self, now_s: float) -> None:
-        """Log, as a warning, the number of refusals since the last line, and the newest one; at most one line in
+        """Log, as a warning, the number of refusals since the last line, and the newest entry; at most one line in
         NEWS_S.
 
-        Without new refusals nothing is logged. What comes too soon for a line is told with the next one.
+        Where the newest refusal made an entry join OTHERS, these are the newest. Without new refusals nothing is
+        logged. What comes too soon for a line is told with the next one.
         """
         if self.total > self._told and now_s >= self._tell_s:
             it = self.report()[-1]

@@ -47,13 +47,15 @@ def judged(
     device: DeviceFit,
     motion: GapMotion,
 ) -> Judged:
-    """Return the judgement on the setpoint that `plan` was made for: rendered, arrives in some time, or cannot, and
+    """Return the judgement on the setpoint that `plan` was made for: RENDERED, ARRIVES in some time, or CANNOT, and
     why.
 
-    `gap_mm` is the measured gap, None without a homed device. Rendered means within the scene's tolerance. Cannot: not
-    ENABLED, no homed device, no valid setpoint, or a limit that keeps the force away for good. Why is the state, or the
-    limits; it is empty where there is no setpoint at all. The time, ms, is that of the gap's way at its speed, or of
-    the ramp where that is longer, plus the lag.
+    `gap_mm` is the measured gap, None without a homed device. RENDERED means within the scene's tolerance. CANNOT: not
+    ENABLED, no homed device, no valid setpoint, or a limit that keeps the force away for good. `why` is the state, also
+    without a homed device, or the limits. It is empty unless CANNOT, and where there is no setpoint at all.
+
+    `arrives_ms` is the time of the gap's way at its speed, or of a takeover's ramp where that is longer, plus the lag.
+    It is 0 where RENDERED, None where CANNOT.
     """
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:

@@ -156,8 +156,9 @@ class DeviceLink:
     def measurement(self) -> Measurement | None:
         """The newest State, with the newest Sense and Status; None until a State follows the first of both.
 
-        A Status that first says HOMED counts from the next State on, whose positions have the new origin. It stays
-        while the device is silent, and after `lose`: `received_s` says how old it is.
+        It is None again once `due` has acted on a reset or a replacement of the device. It stays while the device is
+        silent, and after `lose`: `received_s` says how old it is. A Status that first says HOMED counts from the next
+        State on, whose positions have the new origin.
         """
         if self._measurement is None and self._is_measured:
             self._measurement = self._measured()

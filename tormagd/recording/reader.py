@@ -175,7 +175,8 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
     `wanted` is the type to decode messages as. Returns metadata, chunk places, and whether it is complete; one cut
     short is read as far as it goes. The file stays open, and its seals are not checked. Raises RecordingError: not
     MCAP, damaged, or without ticks and snapshots; and OSError. Ticks and snapshots before the damage have then gone to
-    `each`.
+    `each`. What `each` raises ends the reading; one of UNREADABLE, such as ValueError, becomes a RecordingError as if
+    the file were damaged.
     """
     found = Contents()
     is_whole = scan(file, name, found.take, found.reading(wanted, each))
@@ -187,7 +188,8 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
 def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
     """Read the recording in `path`: each tick and snapshot, decoded as the type `wanted`, goes to `each`.
 
-    Returns and raises as `read_open`, but a file that cannot be opened or read is a RecordingError, too.
+    Returns and raises as `read_open`, but a file that cannot be opened or read is a RecordingError, too. So is an
+    OSError of `each`: it looks like one of this file.
     """
     with opened(path) as file:
         return read_open(file, str(path), wanted, each)

@@ -556,7 +556,11 @@ class VirtualDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next, s from power-on: a frame ends on the line, or an event inside the device."""
+        """When something happens next, s from power-on: a frame of the device ends on the line, or an event inside it.
+
+        At the latest it is the firmware's next tick. A frame that has ended counts until `transmit` gives it, so the
+        time may be before the last one given.
+        """
         event_s = self.messages.next_event_s
         if self._line:
             start_s, data = self._line[0]

@@ -109,9 +109,10 @@ class EmulatedFirmware:
         """Let bytes of the link arrive at `time_s` of its clock, one whole frame at most, and return what was answered
         to them.
 
-        Without bytes it does nothing and returns NONE, as for a damaged frame. A State and Sense that it answers wait
-        for `measurement`, an Identity for `identity`. Raises EmulationError, and AssertionError where more than one
-        frame has been answered.
+        `time_s` is not before the last, which is not checked; the firmware sees `sensors` then. Without bytes it does
+        not run, and NONE is returned; NONE also stands for a damaged frame. A State and Sense that it answers wait for
+        `measurement`, an Identity for `identity`. Raises EmulationError, and AssertionError where more than one frame
+        has been answered.
         """
         answer = Answer.NONE
         for start in range(0, len(data), MAX_BYTES):
@@ -124,7 +125,7 @@ class EmulatedFirmware:
         """Let it sleep until its tick at `time_s`, as `Firmware.tick`, and return a Status every twentieth time, None
         otherwise.
 
-        Raises EmulationError.
+        `time_s` is not before the last, which is not checked. Raises EmulationError.
         """
         self._answer(self._wake(time_s, sensors))
         status, self._status = self._status, None

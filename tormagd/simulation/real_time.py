@@ -30,7 +30,7 @@ class PacedDevice(Protocol):
 
     @property
     def next_event_s(self) -> float:
-        """When the device has something to do next."""
+        """When the device has something to do next, s from power-on; it may be past, and is never infinite."""
 
     def advance(self, now_s: float) -> None:
         """Let time pass until `now_s`."""

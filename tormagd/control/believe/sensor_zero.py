@@ -92,7 +92,8 @@ class SensorZero:
     def sd_N(self, now_s: float) -> float:
         """Return the zero's standard deviation at `now_s`, N, at most MAX_SD_N.
 
-        Drift counts from the first reading or the newest reversal.
+        It grows from the first reading, or the newest reversal that told the zero; at an earlier `now_s` it has not
+        grown. Before the first reading it is TARED_SD_N. After `doubt` it is MAX_SD_N until a reversal or `trust`.
         """
         since_s = max(now_s - self.told_s, 0.0)
         drifted_N2 = DRIFT_N2_S * since_s * max(since_s / WANDERS_S, 1.0)

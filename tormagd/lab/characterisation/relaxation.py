@@ -123,10 +123,11 @@ def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
 
 
 def _check(record: RelaxationRecord, branches: int) -> None:
-    """Raise LabError or DomainError unless the record has rows enough, in range and order, and shows a change.
+    """Refuse a record that is not fit for so many branches, or a wrong number of them; else do nothing.
 
-    Enough are 4 rows for each of 1 to MAX_BRANCHES branches, and 2 more. Times have to rise strictly, and both forces
-    to change.
+    Raises LabError for `branches` outside 1..MAX_BRANCHES, columns of different length, and under 4 rows a branch and 2
+    more. It is raised, too, where times do not rise strictly, or one of the two forces never changes. Raises
+    DomainError for NaN, a time beyond +-1e12 s, and a force of either column beyond +-MAX_FORCE_N.
     """
     if not 1 <= branches <= MAX_BRANCHES:
         raise LabError(f"branches = {branches}: allowed is 1..{MAX_BRANCHES}")

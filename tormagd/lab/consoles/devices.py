@@ -52,7 +52,8 @@ def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Co
     """Return one console for each device and insert, sorted by serial number and insert.
 
     Recordings of unknown devices count as one device, which comes first. A device that was only commissioned has a
-    console, too, without an insert. Of several reports of a device the newest is kept. Empty for no input.
+    console, too, with an empty text as insert and 0 recordings. Each console of a device has the newest of its reports,
+    None without one. Empty for no input.
     """
     groups: dict[tuple[int, str], list[Summary]] = defaultdict(list)
     for each in summaries:

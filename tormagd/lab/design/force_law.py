@@ -1,6 +1,7 @@
 """The force law's stretch, slopes and inverse, for design and for the thesis's numbers.
 
-Every function takes a float or an array and raises `DomainError`, as in `tormagd.physics.force`.
+Every function takes a float or an array. All raise `DomainError`, as in `tormagd.physics.force`, but `force_slope` and
+`compression_for_force`, which check nothing.
 """
 
 import sys
@@ -64,7 +65,10 @@ def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Ge
 
 
 def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
-    """Return d phi / d y, the slope of the reduced force over the load; every term is positive."""
+    """Return d phi / d y, the slope of the reduced force phi over the load y, both without unit; it is above 0.
+
+    `compression`, from 0 to 0.95, has to be that of `load`. Nothing is checked.
+    """
     stretch, w = 1.0 - compression, curve.wall
     # d phi / d eps at constant load, then d phi / d y at constant stretch
     elastic, magnetic = 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + w) * load / stretch**4
@@ -72,11 +76,14 @@ def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
 
 
 def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
-    """Return the compression eps = 1 - lambda1 at which the reduced force phi(eps) is `force`; 0 for 0.
+    """Return the compression eps = 1 - lambda1, from 0 to 0.95, at which the reduced force phi(eps) is `force`.
 
-    `force` is without unit, from 0 to phi(0.95), which is not checked: NaN or more gives no solution. Newton's method
-    on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside a shrinking bracket.
-    It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
+    `force` is a float or an array, and the result of the same shape, both without unit. It is from 0 to phi(0.95),
+    which is not checked. 0, less than 0 and NaN give 0, a finite force above phi(0.95) gives 0.95. Infinity raises
+    ValueError, but gives NaN in an array.
+
+    Newton's method on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside a
+    shrinking bracket. It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
     """
     fn = functions(force)
     rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)

@@ -405,11 +405,16 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
     """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's designs.
 
     `outcomes` holds the outcome of each of `runs`; one that is missing raises KeyError. `gap_speed_mm_s` is the
-    controller's. `starts`, `local_starts` and `corner_cost_starts` have a row for each run, in their order. A row has
-    `use_case`, `start`, `objective`, `design`, `coverage`, `corner_cost`, `volume_cm3` and `seconds`; of the thesis's
-    cost `solver`, too. `thesis_designs` has the coverage of each design by objective, `best` the greatest coverage and
-    its spread by use case and objective. Besides `gap_speed_mm_s` by objective, `max_seconds` and `note`. Raises
-    ValueError without a global run.
+    controller's. Raises ValueError where `runs` have no global run of another objective than `corners`.
+
+    `starts` are the global runs, `local_starts` the local ones, `corner_cost_starts` those of the thesis's cost by
+    either solver. They have a row for each run, in the order of `runs`. A row has `use_case`, `start`, `objective`,
+    `design`, `coverage`, `corner_cost`, `volume_cm3` and `seconds`; of the thesis's cost `solver`, too. All coverages
+    are shares, 0 to 1.
+
+    `thesis_designs` has rows of `use_case`, `name` and `design`; `thesis` is the thesis's coverage, `ours` our own by
+    objective. `best` has a row for each use case and objective: the greatest `coverage` of `starts`, and the `spread`
+    from the least to it. Besides `gap_speed_mm_s` by objective, and `note`; `max_seconds` is that of `starts`.
     """
     rows: dict[RunKey, Json] = {}
     for (use_case, start, objective, solver), run in runs.items():

@@ -441,10 +441,10 @@ def _missing(data: Dataset) -> list[str]:
 
 
 def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
-    """Write a picture of field and rate of all rows, coloured by force, to the PNG file `path`, with what is missing as
-    title.
+    """Draw field and rate of all rows, coloured by force, into the PNG file `path`.
 
-    A file there is replaced. Raises OSError, and ModuleNotFoundError without matplotlib.
+    `missing`, as of `_missing`, is the title, a line each; where it is empty, the title says that nothing lacks. A file
+    there is replaced. Raises OSError, and ModuleNotFoundError without matplotlib.
     """
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)

@@ -137,8 +137,9 @@ def _made_rising(network: ForceNetwork) -> Tensor:
     """Turn each unit of `network`, in place, so that it rises with the field; return which parameters must stay
     positive.
 
-    The result is a mask (p) in the order of `network.parameters()`: weights of the field and of the output. These are
-    MIN_POSITIVE at least. The constant output is set to the middle of the forces.
+    The result is a mask (p) of bool in the order of `network.parameters()`. It is True for the hidden units' weights of
+    the field and for the output's weights, which are MIN_POSITIVE at least. The output's constant is set so that units
+    that are all half on give the middle of the forces.
     """
     weight, output = network.hidden_weight, network.output_weight
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
