@@ -33,7 +33,10 @@ class ForceFileError(ValueError):
 
 
 def read_forces(path: Path) -> dict[str, "array[float]"]:
-    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has. Raises as `read_table`."""
+    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has, into arrays by name.
+
+    Times rise from row to row. Raises ForceFileError as `read_table`, also for any other column.
+    """
     return read_table(path, ALLOWED, OPTIONAL_COLUMNS)
 
 

@@ -83,7 +83,7 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def convert(path: Path, kind: type[T]) -> T:
-    """Read a TOML file as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line.
+    """Read a TOML file as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line's number.
 
     It also raises ConfigError for a file that cannot be read, or is no TOML.
     """
@@ -93,8 +93,8 @@ def convert(path: Path, kind: type[T]) -> T:
 def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
     """Read a TOML file as the kind that `kind_of` returns for its tables, which have been parsed, but not checked.
 
-    Raises ConfigError, as `convert` does. Where `kind_of` raises ConfigError, the file's name is put before it, and the
-    line after it.
+    Raises ConfigError, as `convert` does. Where `kind_of` raises ConfigError, the file's name is put before its
+    message, and the line's number after it, as in `placed`. Without such a line only the name is.
     """
     try:
         text = toml_text(path)
@@ -110,10 +110,11 @@ def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
 
 
 def placed(path: Path | None, message: str) -> str:
-    """Return `message`, a refusal of what the file at `path` says, with the file's name before it and the line after.
+    """Return `message`, a refusal of what the file at `path` says, as `PATH: message (line N)`.
 
-    Only where it names a key that is in the file; otherwise, and where `path` is None, `message` itself. Reads the file
-    again, and raises OSError and TomlError as `toml_text` does.
+    N, from 1, is the line of the key that the message names, or of the nearest table above it that the file has. Where
+    it has neither, the message names no key, or `path` is None, returns `message` itself. Reads the file again, and
+    raises OSError and TomlError as `toml_text` does.
     """
     where = "" if path is None else _line(toml_text(path), message)
     return f"{path}: {message}{where}" if where else message

@@ -56,9 +56,10 @@ def _verdict(report: Report) -> str:
 
 
 def _conformance(report: Report) -> str:
-    """Return the checks of the kit's report that did not pass, as an HTML table.
+    """Return `report.conformance`, the kit's checks that did not pass, as an HTML table: check, seen, expected.
 
-    Where all passed, or no report was given, it is one paragraph that says so.
+    It is one paragraph instead where the list is empty, as all passed, or None, as no report of the kit was given. What
+    the report says is escaped.
     """
     if report.conformance is None:
         return f"<p>No report was given. The kit owns the device, so it runs without the daemon: {escape(KIT)}</p>"

@@ -171,12 +171,14 @@ class Stepper:
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
         """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties.
 
-        A device that is not driven gets duties of 0 in mode OFF. A paused one is driven to hold its gap, and opens it
-        for a force over the ceiling. While the loop is blind, or after a leap of the encoders, a driven one gets 0 in
-        mode RUN: friction holds the gap. `measurement` is None when the link is lost: mode OFF, and a driven device
-        gives the fault LINK_LOST. A measurement with a number that is not finite gives the fault NOT_FINITE, and
-        measuring and driving begin anew. The result also has the newest request to the device, as a fault makes one to
-        open. Raises DomainError where `now_s` is not finite; nothing has changed then.
+        `now_s`, s, is of the host's clock. Where it is not later than the last step's, or by 10 periods or more, the
+        drive counts one period. A device that is not driven gets duties of 0 in mode OFF. A paused one is driven to
+        hold its gap, and opens it for a force over the ceiling. While the loop is blind, or after a leap of the
+        encoders, a driven one gets 0 in mode RUN: friction holds the gap. `measurement` is None when the link is lost:
+        mode OFF, and a driven device gives the fault LINK_LOST. A number in a measurement or a duty that is not finite
+        gives the fault NOT_FINITE and mode OFF; measuring and driving begin anew. The result also has the newest
+        request to the device, as a fault makes one to open. Raises DomainError where `now_s` is not finite; nothing has
+        changed then.
         """
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:

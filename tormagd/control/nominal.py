@@ -65,8 +65,9 @@ class Nominal:
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
         """Return the model's force over the field at this displacement, mm, and rate, mm/s.
 
-        Each is held within the model's range, infinity too. Where a handle slides, any displacement is replaced by the
-        mobilised one. The curve tells the values used, and is a new one for each call. Raises DomainError for NaN.
+        Each is held within the model's range, infinity too. A handle's rate is given without its sign, a finger's is
+        positive inwards. Where a handle slides, any displacement but NaN is replaced by the mobilised one. The curve
+        tells the values used, and is a new one for each call. Raises DomainError for NaN.
         """
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

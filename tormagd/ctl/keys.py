@@ -59,8 +59,9 @@ def show_keys(path: Path) -> Outcome:
 def _made(name: str, role: str, secret_in: Path, public_in: Path) -> dict[str, str]:
     """Make a key pair `name`, its secret part in one folder and its public part in the other, and describe it.
 
-    Missing folders are made. Returns `name`, `role`, which is not checked, the paths `secret` and `public`, and the
-    `fingerprint`. Raises ConfigError where a file exists or cannot be made, or the name is not allowed.
+    Files have mode 0600; missing folders are made, with 0700. Returns `name`, `role`, which is not checked, the paths
+    `secret` and `public`, and the `fingerprint`. Raises ConfigError where a file exists or cannot be made, or the name
+    is not allowed: then neither file was made, and none is overwritten.
     """
     secret, public = generate(name, secret_in, public_in)
     return {

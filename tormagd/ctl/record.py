@@ -134,10 +134,12 @@ def _record(
 ) -> Outcome:
     """Write what arrives until the time or an interrupt ends it, then what still waits, for LONGEST_END_S at most.
 
-    The result has the last `file`, `seconds`, and how many came and were lost: `telemetry`, `telemetry_lost`, `ticks`,
-    `ticks_lost`. `silent_ms` is the time since the last ticks. `unreadable` counts messages that were left out; stderr
-    tells why of the first. Silence does not end it, and `writer` stays open. The outcome is UNREACHABLE for a silence
-    of over SILENT_S at the end, else REFUSED where ticks were lost. Raises OSError where the disk takes no more.
+    `duration_s` may be infinity: then only an interrupt ends it. The result has the last `file`, `seconds`, and how
+    many came and were lost: `telemetry`, `telemetry_lost`, `ticks`, `ticks_lost`. `silent_ms` is the time since the
+    last readable ticks, or since the beginning where none came; telemetry does not count. `unreadable` counts messages
+    that were left out; stderr tells why of the first. Silence does not end it, and `writer` stays open. The outcome is
+    UNREACHABLE for a silence of over SILENT_S at the end, else REFUSED where ticks were lost, else DONE. Raises OSError
+    where the disk takes no more.
     """
     unreadable = 0
     start_s = heard_s = time.monotonic()

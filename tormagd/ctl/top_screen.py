@@ -251,7 +251,8 @@ def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
     """Return the least and the greatest known value, widened to `least` apart so that noise does not look like a
     signal.
 
-    The middle stays, unless that would go below 0: then it is 0..`least`, as it is where no value is known.
+    The middle stays. Only where no value is below 0 and the widened range would be, it is 0..`least`, as it is where no
+    value is known. `values` are None where not known; `least` is in their unit.
     """
     known = [value for value in values if value is not None]
     if not known:

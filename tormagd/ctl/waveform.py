@@ -112,10 +112,11 @@ def beat(phase: float) -> float:
 
 
 def read_csv(path: Path) -> Waveform:
-    """Read a file of forces into a waveform of straight lines between its rows, with time, s, from the first row.
+    """Read a file of forces, N, into a waveform of straight lines between its rows, with time, s, from the first row.
 
-    It has the columns `t_s` and `force_N`, at least two rows, and may have OPTIONAL_COLUMNS: samples carry these then.
-    Raises ForceFileError, naming row, column and value, also for a file that cannot be read.
+    It has the columns `t_s` and `force_N`, at least two rows, and times that rise from row to row. It may have
+    OPTIONAL_COLUMNS, mm and mm/s: samples carry these then. After the last row its values hold. Raises ForceFileError,
+    naming row, column and value, for any other column or row, and for a file that cannot be read.
     """
     table = read_forces(path)
     start_s = table["t_s"][0]

@@ -402,7 +402,9 @@ class DeviceLink:
     def _measured(self) -> Measurement:
         """Return a Measurement of the newest State and Sense, and of the newest Status that counts for this State.
 
-        Only once measurements have begun: until then Sense or Status may be missing, which fails an assertion.
+        A Status that first tells of a homing counts only from the next State on: the newest one is still of the old
+        origin. Call it only once measurements have begun: until then Sense or Status may be missing, which fails an
+        assertion.
         """
         sense, status = self._sense, self._told
         assert sense is not None, "measuring begins with a Sense"

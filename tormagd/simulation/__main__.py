@@ -74,12 +74,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
-    """Return the device and the door that the options ask for; `resources` closes them.
+    """Build the device that the options ask for, open its door, and return both; `resources` closes the door.
 
-    `options` are those of `parser`. Without `--hand` it is `steady`, or `pressing` at a pad. A CAN door without a path
-    gets a temporary folder, which `resources` removes. Raises PlantError, HandError or FaultError for those words,
-    DomainError for a plant outside the force law. Raises BuildError for a firmware that cannot be built, OSError for a
-    door that cannot be opened.
+    `options` are those of `parser`. The device is not closed: an emulator ends with the last reference to it. Without
+    `--hand` it is `steady`, or `pressing` at a pad. A CAN door without a path gets a temporary folder, which
+    `resources` removes. Raises PlantError, HandError or FaultError for those words, DomainError for a plant outside the
+    force law. Raises BuildError for a firmware that cannot be built, OSError for a door that cannot be opened.
     """
     boot = FIRMWARES[options.firmware]
     plant = load_plant(options.plant)

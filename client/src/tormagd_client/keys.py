@@ -70,7 +70,8 @@ def fingerprint(public: bytes | str) -> str:
 def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
     """Make a key pair, both files with mode 0600, and return the paths of its secret and its public file.
 
-    Missing folders are made. Raises ConfigError where `name` is not allowed, or a file exists: nothing is overwritten.
+    Missing folders are made, with mode 0700. Raises ConfigError where `name` is not allowed, or a file exists or cannot
+    be made. Then neither file was made, and nothing is overwritten.
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(

@@ -22,10 +22,11 @@ def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
     `motor_parameters`; `time_constant_s` is an estimate, too. Numbers are `gain_N_V`, `relative_residual`, and
     `holdout_voltage_nrmse`: of the second half, by a fit of the first. `notes` are sentences.
 
-    With `gain_N_V` the parameters are scaled from volts, and a current is not used. With None they come from the
-    current, which also gives `motor` and the gain. Without one PARAMETERS, `motor` and the gain are None.
-    `log.gain_N_V` is not used. Raises LabError for a gain that is not above 0, or a log, or half of one, that moves too
-    little.
+    With `gain_N_V` the parameters are scaled from volts; a current is not used, and `motor` is None. With None they
+    come from the log's current, which also gives `motor` and the gain. With neither a gain nor a current, each of
+    PARAMETERS, `motor` and the gain are None. `log.gain_N_V` is not used. Raises LabError for a gain that is not above
+    0 and finite, and for a log, or half of one, that moves too little. It does so, too, where the voltage fits best
+    with a delay over `fit.LONGEST_DELAY_S`.
     """
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")

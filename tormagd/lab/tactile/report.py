@@ -62,7 +62,7 @@ def sections(figures: Json) -> Iterator[str]:
 
 
 def _table_4_1(data: Json) -> str:
-    """Return the Markdown section on table 4.1; `data` is of `models.table_4_1`.
+    """Return the Markdown section on table 4.1; `data` is what `models.table_4_1` returns.
 
     It tells the errors on the random split, those with whole groups left out, with the worst group, and where models
     fall.
@@ -98,9 +98,10 @@ def _table_4_1(data: Json) -> str:
 
 
 def _pulse(pulse: Json) -> str:
-    """Return the Markdown section on the pulse experiment; `pulse` is of `experiment.contract`.
+    """Return the Markdown section on the pulse experiment; `pulse` is what `experiment.contract` has under that key.
 
-    Its table has a row for each way, other pad and recorded pulse, and three columns for each sensor noise.
+    Its table has a row for each way, other pad and recorded pulse, and three columns for each sensor noise. A last row
+    has the bound that noise alone sets, in the first of the three only. A key that is missing raises KeyError.
     """
     columns, rows = ["way"], dict[str, list[str]]()
     for noise, scores in pulse["by_noise"].items():

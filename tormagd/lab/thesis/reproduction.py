@@ -112,9 +112,9 @@ def chapter_4(is_quick: bool) -> Json:
 def table_2_3() -> Json:
     """Return each insert's masses, g in 100 cc, from volume fractions and densities, beside the printed ones.
 
-    Keys: `rows`, `max_error_g` of all, and `note`. A row has `insert`, `thesis_g` and `ours_g` by component,
-    `max_error_g`, the greatest difference, and `G0_kPa`. Components that the thesis does not print are in `ours_g`
-    only.
+    Keys: `rows`, `max_error_g` of all, and `note`. A row has `insert`, `thesis_g` and `ours_g` by component, and
+    `max_error_g`, the greatest difference. Its `G0_kPa` is the thesis's, as printed: nothing is compared with it.
+    Components that the thesis does not print are in `ours_g` only.
     """
     rows: list[Json] = []
     for item in INSERTS.values():
@@ -302,8 +302,9 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
     """Return how much of both use cases, and of a measured pulse's points, the device as built covers.
 
     `as_built` has a row for each use case and gap speed: `use_case`, `gap_speed_mm_s`, and the shares `trapezoid`,
-    `true` and `thesis`, the last as printed. `pulse` is as `_pulse_cloud`. Besides `note`. Raises DomainError for a gap
-    speed out of range, ModuleNotFoundError where heartpy is not installed.
+    `true` and `thesis`. `thesis` is the share printed for the use case, the same at every gap speed. `pulse` is as
+    `_pulse_cloud`. Besides `note`. Without a gap speed both have no rows. Raises DomainError for a gap speed outside
+    1e-6 mm/s to 10 m/s, ModuleNotFoundError where heartpy is not installed.
     """
     rows = []
     for number, case in USE_CASES.items():
@@ -332,8 +333,8 @@ def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
 
     `rows` has a dict for each speed: `gap_speed_mm_s`, the shares `true` and `trapezoid`, and the numbers `points`,
     `too_fast`, `below_least_force` and `above_most_force`. `worst` are the five fastest points that it misses: `t_s`,
-    `force_N` and `rate_N_s`. Besides `insert`, `range_N` and `note`. Raises ModuleNotFoundError where heartpy is not
-    installed.
+    `force_N` and `rate_N_s`. Besides `insert`, `range_N` and `note`. Raises DomainError for a gap speed as
+    `phase_portrait`, ModuleNotFoundError where heartpy is not installed.
     """
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
     rates_N_s = np.gradient(forces_N, times_s)

@@ -220,8 +220,10 @@ def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Ar
 def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
     """Return the handle's rate, mm/s with its sign, at each tick (n) of 1 ms, and a mask (n) of steady sliding.
 
-    Sliding counts at a steady gap, after SETTLED_MM since rate or gap last changed, and MOBILISED_AFTER_MM since the
-    handle turned. The rate is as `_even` has it. Over RATE_TICKS ticks are needed.
+    `handle_mm` and `gap_mm` (n each) are positions. Sliding counts at CREEP_MM_S / 2 or faster, while rate and gap are
+    even: a gap that moves evenly counts as one that rests. It counts after SETTLED_MM since either last changed, and
+    MOBILISED_AFTER_MM since the handle turned. The rate is as `_even` has it. Over RATE_TICKS ticks are needed. Under
+    RATE_TICKS, and for arrays of two lengths, it raises ValueError.
     """
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
@@ -243,8 +245,9 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
 def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
     """Return the rate at each tick of 1 ms over a window around it, mm/s (n), and a mask (n) of where it is even.
 
-    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE. Each half has
-    RATE_TICKS ticks, and the record needs more. Beyond its ends the rate counts as 0.
+    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE of the rate. So
+    what moves evenly is even, as is what rests. Each half has RATE_TICKS ticks, and the record needs more, which is not
+    checked. Beyond its ends the rate counts as 0.
     """
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)

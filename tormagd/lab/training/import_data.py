@@ -443,8 +443,9 @@ def _missing(data: Dataset) -> list[str]:
 def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
     """Draw field and rate of all rows, coloured by force, into the PNG file `path`.
 
-    `missing`, as of `_missing`, is the title, a line each; where it is empty, the title says that nothing lacks. A file
-    there is replaced. Raises OSError, and ModuleNotFoundError without matplotlib.
+    `missing`, as of `_missing`, is the title, a line each; where it is empty, the title says that nothing lacks. The
+    axis of rates is logarithmic: rows of rate 0 do not show. A file there is replaced. Raises OSError, and
+    ModuleNotFoundError without matplotlib.
     """
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)
