@@ -171,7 +171,7 @@ int main(int count, char **words)
     static struct host host;
     host.port = open_port(words[1]);
     tormag_frame_decoder_init(&host.decoder);
-    bool is_granted = priority.sched_priority == 0 || sched_setscheduler(0, SCHED_FIFO, &priority) == 0;
+    bool is_granted = priority.sched_priority > 0 && sched_setscheduler(0, SCHED_FIFO, &priority) == 0;
     mlockall(MCL_CURRENT | MCL_FUTURE);
     int timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC);
     long long due_ns = now_ns() + period_ns;
