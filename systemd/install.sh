@@ -45,6 +45,10 @@ for text in "$checkout/README.md" "$checkout/CHANGELOG.md" "$here/README.md"; do
     [ "$text" = "$here/README.md" ] && name=service.md
     put "$text" "$share/doc/tormagd/$name"
 done
+# the guides name them, and one of them begins without a device
+for example in $(cd "$checkout/examples" && find . -type f ! -path '*/__pycache__/*'); do
+    put "$checkout/examples/$example" "$share/doc/tormagd/examples/$example"
+done
 # an installed configuration is its owner's, and stays as it is
 [ -e "$root/etc/tormag/tormagd.toml" ] || put "$checkout/examples/service.toml" "$root/etc/tormag/tormagd.toml"
 

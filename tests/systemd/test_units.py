@@ -114,6 +114,11 @@ def test_what_is_installed_lies_in_its_places(root):
     assert sorted(inside) == INSTALLED
     assert (root / "etc/tormag/tormagd.toml").read_bytes() == (UNITS.parent / "examples/service.toml").read_bytes()
     assert (root / "usr/share/tormagd/drop-ins/tcp.conf").is_file()
+    checkout = UNITS.parent
+    examples = {path.relative_to(checkout) for path in (checkout / "examples").rglob("*") if path.is_file()}
+    assert {path.relative_to(root / "usr/share/doc/tormagd") for path in files if "examples" in path.parts} == {
+        example for example in examples if "__pycache__" not in example.parts
+    }
     # nothing of the folder that it was put together in: that is moved, or packed
     assert [path for path in files if str(root).encode() in path.read_bytes()] == []
 
