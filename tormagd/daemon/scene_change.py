@@ -10,6 +10,7 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import Explained, SceneReport
 
 LONGEST_NAME = 4_096
+NEXT = "tormagctl scene check says what the device can give; rates stay: state [rates], or start with that scene"
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +60,7 @@ class SceneChange:
             self._require()
             self._take(scene, core)
         except ConfigError as refused:
-            error = Explained("bad_scene", str(refused), "tormagctl scene check says what the device can give")
+            error = Explained("bad_scene", str(refused), NEXT)
         except RefusedError as refused:
             error = Explained(refused.code, refused.message, refused.hint)
         if error is None:
