@@ -32,6 +32,7 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl, file):
     assert picture.read_bytes().startswith(b"\x89PNG")
     file.write_bytes(file.read_bytes()[:-40])
     assert "cut short: its recorder did not end it" in ctl("plot", str(file), "-o", str(picture)).ended(0).out
+    assert "no overview: still written, not ended by" in ctl("recordings", "list", str(file.parent)).ended(0).out
 
 
 def test_a_daemon_that_does_not_say_what_it_runs_is_not_recorded(fake_daemon, tmp_path, ctl):

@@ -80,7 +80,7 @@ def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
     except RecordingError as error:
         said = [str(error).removeprefix(f"{segment.path}: ")]
     else:
-        said = ["no overview: its recorder did not end it, or is older"]
+        said = ["no overview: still written, not ended by its recorder, or older"]
         if known is not None:
             contents, overview = known
             seconds = round(overview.duration_s, 3)
