@@ -196,6 +196,11 @@ def test_every_command_that_a_message_names_is_in_a_wheel():
     assert missing == []
 
 
+def test_no_message_sends_an_operator_to_a_file_of_the_checkout():
+    file = re.compile(r"\b(?:docs|systemd|examples)/[\w./-]+\.(?:md|rules|toml)\b|\bsystemd/udev\b")
+    assert [(name_of(source), text) for source in SOURCES for text in messages(source) if file.search(text)] == []
+
+
 # -- committed pictures are of the figures that are committed beside them ----------------------------------------------
 
 

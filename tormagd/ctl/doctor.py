@@ -37,6 +37,7 @@ LATE_SHARE = 0.25
 MISSED_SHARE = 0.001
 "Share of its beats that a bare timer may miss."
 STOP_OTHERS = "stop what else runs here; top shows it"
+RULES = "udev's 60-tormag.rules"
 BY_UNIT = "run tormagd by its systemd unit, or add "
 HERE = r"ipc://|tcp://(127\.|localhost:)"
 "An address of this machine."
@@ -50,7 +51,12 @@ ASKED = (
         f"add LimitMEMLOCK=infinity to its unit, or '@tormag - memlock unlimited' {LIMITS_D}",
     ),
     ("processors", "cpus", "", "name processors that are online and left to it: taskset -pc $(pidof tormagd)"),
-    ("keep awake", "keep_awake", "", "install systemd/udev/60-tormag.rules, and start it again"),
+    (
+        "keep awake",
+        "keep_awake",
+        "",
+        f"{RULES} opens it to the group, where the machine has that file; then start it again",
+    ),
 )
 "What a daemon may ask the kernel for: the finding, the key of `realtime`, its usual value, and what helps."
 
@@ -445,7 +451,7 @@ def port(config: Config, machine: Machine) -> Finding:
             "device port",
             Severity.FAIL,
             f"{shown} does not exist",
-            "plug the device in and switch it on; install systemd/udev/60-tormag.rules for the name /dev/tormag",
+            f"plug the device in and switch it on; {RULES} gives it the name /dev/tormag",
         )
     is_open = os.access(path, os.R_OK | os.W_OK)
     return _finding(
@@ -488,7 +494,7 @@ def usb_latency(config: Config, machine: Machine) -> Finding:
         latency_ms is None or latency_ms <= FAST_LATENCY_MS,
         "this port has no latency timer" if latency_ms is None else f"{latency_ms} ms",
         f"tormagd asks the driver for {FAST_LATENCY_MS} ms when it opens the port; where that is refused: "
-        f"echo {FAST_LATENCY_MS} | sudo tee {file}; systemd/udev/60-tormag.rules does it at every plug",
+        f"echo {FAST_LATENCY_MS} | sudo tee {file}; {RULES} does it at every plug",
     )
 
 

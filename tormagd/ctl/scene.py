@@ -283,7 +283,7 @@ def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
             Exit.REFUSED,
             "not_measured",
             f"scene {scene.name} was not measured as it is now",
-            "docs/guides/scene.md says how that is done, in some minutes",
+            "tormagctl guide scene says how that is done, in some minutes",
         )
     return found
 
@@ -313,6 +313,6 @@ def _derived(name: str, config: Path | None) -> dict[str, Any]:
             Exit.REFUSED,
             "refused",
             str(error).removeprefix("tormagd: "),
-            "docs/scenes.md says what each key asks of the device",
+            "tormagctl guide scenes says what each key asks of the device",
         ) from error
     return derived

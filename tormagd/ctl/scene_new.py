@@ -89,7 +89,9 @@ def _proposed(
     try:
         msgspec.convert(_with(tables, inserts[0]), Scene)
     except msgspec.ValidationError as error:
-        raise usage_error(f"no scene can be made of this: {error}", "docs/scenes.md says what each key asks") from error
+        raise usage_error(
+            f"no scene can be made of this: {error}", "tormagctl guide scenes says what each key asks"
+        ) from error
     insert, checked, unmet = _softest(out, tables, inserts, config, plant)
     found = {"file": str(out), "insert": insert, "unmet": unmet, "unmet_if_weak": []}
     if checked is None:

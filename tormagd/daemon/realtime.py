@@ -44,7 +44,7 @@ def prepare(settings: RealTime) -> list[str]:
             # never closed: it holds until the process ends
             os.write(os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC), bytes(4))
         except OSError as error:
-            refused.append(f"realtime.keep_awake: {_LATENCY}: {error.strerror}; see systemd/udev")
+            refused.append(f"realtime.keep_awake: {_LATENCY}: {error.strerror}; see 60-tormag.rules")
     for line in refused:
         log.warning("the kernel does not grant %s; next: tormagctl doctor", line)
     return refused
