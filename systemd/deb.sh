@@ -61,7 +61,8 @@ cat > "$root/DEBIAN/postrm" <<'END'
 #!/bin/sh
 set -e
 [ ! -d /run/systemd/system ] || systemctl daemon-reload
-rm -rf /run/tormag.root
+# a running daemon has its files in it: without them it is dead to the watchdog
+[ "$1" = upgrade ] || rm -rf /run/tormag.root
 if [ "$1" = purge ]; then
     # keys, profiles and recordings, too
     rm -rf /var/lib/tormag /etc/tormag

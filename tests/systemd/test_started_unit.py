@@ -91,6 +91,7 @@ def test_the_service_from_its_installation_to_its_removal(package, machine, impo
     installed(machine, package, imports)
     it_is_up_with_a_device_only(console)
     real_time_is_granted_to_the_daemon_alone(console)
+    an_upgrade_lets_it_run(console, package)
     what_can_change_does_and_what_cannot_is_named(console)
     a_hang_of_either_starts_it_again(console)
     another_console_stands_beside_it(console, left)
@@ -98,8 +99,13 @@ def test_the_service_from_its_installation_to_its_removal(package, machine, impo
     nothing_is_left(machine)
 
 
-def installed(machine, package, imports) -> None:
+def unpack(machine, package) -> None:
+    """Installs the package, or upgrades to it."""
     machine.run("dpkg", "--no-triggers", "--force-unsafe-io", "--install", f"/opt/shared/package/{package.name}")
+
+
+def installed(machine, package, imports) -> None:
+    unpack(machine, package)
     assert {"/usr/bin/tormagd", "/usr/lib/systemd/system/tormagd@.service", "/etc/tormag"} < files(machine)
     put(machine, "/etc/systemd/system/simulator@.service", SIMULATOR.format(**imports))
     seen = SEEN if machine.run("sh", "-c", RAISES) else SEEN + IN_ITS_PLACE
@@ -132,6 +138,18 @@ def real_time_is_granted_to_the_daemon_alone(console) -> None:
     said = machine.run("tormagctl", "doctor", check=False)
     assert "runs by /etc/tormag/tormagd.toml" in said
     assert "granted: realtime.fifo_priority = 50" in said
+
+
+def an_upgrade_lets_it_run(console, package) -> None:
+    """As the brake may hold something; systemd goes on hearing of it, and it finds its files."""
+    machine = console.machine
+    before = machine.shows("tormagd", "MainPID")
+    unpack(machine, package)
+    # longer than the watchdog's 2 s
+    machine.run("sleep", "4")
+    assert console.is_ready()
+    assert (machine.shows("tormagd", "MainPID"), console.restarts()) == (before, 0)
+    machine.run("tormagctl", "status")
 
 
 def what_can_change_does_and_what_cannot_is_named(console) -> None:
