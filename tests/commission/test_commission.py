@@ -16,7 +16,7 @@ from tormagd.commission.report import Report, begun
 from tormagd.commission.sequence import STEPS, Stopped
 from tormagd.config import Config, Rates, load_calibration
 from tormagd.control.move.motor import margins
-from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import load_plant, with_insert
 
 CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
@@ -124,6 +124,11 @@ NOISE = random.Random(1)
 def test_the_row_of_what_a_fault_changes_turns_red(bench, steps, device, expected):
     found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
     assert (expected in red(found), stopped) == (True, None)
+
+
+def test_a_handle_that_turns_seldom_makes_no_screw_rub(bench):
+    found, stopped = bench(SAMPLE, hand=ReversingHand(6.0)).commission(chosen("carriages"))
+    assert (red(found), stopped) == ([], None)
 
 
 @pytest.mark.parametrize(
