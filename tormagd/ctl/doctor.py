@@ -222,7 +222,7 @@ def bare_timer(found: Headroom) -> Finding:
         late_us.p99 <= LATE_SHARE * 1e6 / rate_hz and found.bare.missed_share <= MISSED_SHARE,
         f"late p50 {late_us.p50:.0f} p99 {late_us.p99:.0f} p99.9 {late_us.p999:.0f} us, "
         f"{found.bare.missed_share:.2%} of the beats missed at {rate_hz} Hz",
-        "heed the lines above; on a virtual machine also realtime.keep_awake = true, and processors of its own",
+        "heed the lines above; a virtual machine needs processors of its own",
     )
 
 
