@@ -39,6 +39,7 @@ def looked(time_s: float, **waited_s: float) -> host.Counters:
 
 def test_a_wait_that_led_to_a_fault_is_seen_by_the_look_after_it(tmp_path: Path):
     with (tmp_path / "log").open("w") as log, host.HostWatch(0, log) as watched:
+        watched.wait_for("device", os.getpid())
         watched.end()
         watched._looks = [
             looked(1.0),
@@ -51,6 +52,15 @@ def test_a_wait_that_led_to_a_fault_is_seen_by_the_look_after_it(tmp_path: Path)
     assert (found.waited, found.waited_worst_ms) == ({"device": pytest.approx(0.134 / 0.6)}, pytest.approx(100.0))
     assert found.took_much
     assert "device waited" in str(found)
+
+
+def test_a_worker_of_the_wire_that_had_to_wait_was_held_up_by_the_host(tmp_path: Path):
+    with (tmp_path / "log").open("w") as log, host.HostWatch(0, log) as watched:
+        watched.end()
+        watched._looks = [looked(1.0, worker=7.0), looked(1.2, worker=7.09, newer=9.0), looked(1.4, worker=7.09)]
+        found = watched.between(1.0, 1.4)
+    assert (found.waited, found.waited_worst_ms) == ({}, pytest.approx(70.0))
+    assert found.took_much
 
 
 def test_a_timer_on_every_processor_and_a_process_that_waits(tmp_path: Path):

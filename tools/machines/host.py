@@ -3,7 +3,7 @@
 Nothing here asks the program itself: a program that holds itself up must not be able to blame the host. Bare timers
 (`bare_timer.py`) stand on every processor, above the daemon's priority where that is allowed. So each of them misses
 exactly what its processor did not give. `steal` is what the hypervisor gave to others, and a process has *waited* where
-it was ready to run and stood in a queue.
+it was ready to run and stood in a queue. The workers that carry a pty's bytes (`wire.py`) are processes, too.
 """
 
 import contextlib
@@ -17,6 +17,8 @@ import time
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, NamedTuple
+
+from machines.wire import workers
 
 PERIOD_NS = 1_000_000
 "Between the beats of a bare timer."
@@ -150,7 +152,7 @@ class HostWatch:
         if len(looks) < 2:
             looks = self._looks
         first, last = looks[0], looks[-1]
-        newest = {name: look for look in looks for name in look.waited_s}
+        newest = {name: look for look in looks for name in look.waited_s if name in self._pids}
         within = [each for stalls in self._stalls for each in stalls if each.start_s < end_s and each.end_s > start_s]
         return Host(
             steal=(last.stolen - first.stolen) / max(last.ticks - first.ticks, 1),
@@ -166,7 +168,7 @@ class HostWatch:
 
     def _look(self) -> None:
         while not self._ended.wait(LOOK_S):
-            self._looks.append(counters(self._pids))
+            self._looks.append(counters(self._pids | workers()))
 
 
 def waited_over_s(before: Counters, after: Counters) -> float:

@@ -38,11 +38,20 @@ def keep(priority: int, ended: threading.Event) -> None:
 
 def schedule(policy: int, priority: int) -> bool:
     """Puts every worker under the policy; False where that is not granted."""
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # they come and go
-            if (process / "comm").read_text(encoding="utf-8", errors="replace").startswith(WORKERS):
-                try:
-                    os.sched_setscheduler(int(process.name), policy, os.sched_param(priority))
-                except PermissionError:
-                    return False
+    for worker in workers().values():
+        with contextlib.suppress(ProcessLookupError):  # they come and go
+            try:
+                os.sched_setscheduler(worker, policy, os.sched_param(priority))
+            except PermissionError:
+                return False
     return True
+
+
+def workers() -> dict[str, int]:
+    """The workers of now: a name for each, and its process."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # they come and go
+            if (process / "comm").read_text(encoding="utf-8", errors="replace").startswith(WORKERS):
+                found[f"wire's worker {process.name}"] = int(process.name)
+    return found
