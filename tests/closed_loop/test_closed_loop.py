@@ -122,7 +122,7 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     least_N = armed.planner.believe.min_N
     assert governed[-1] == pytest.approx(least_N, abs=0.01)
     assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
-    assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.05)
+    assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.02)
 
 
 # -- position ------------------------------------------------------------------------------------------------------
@@ -146,6 +146,18 @@ def test_a_millimetre_of_gap(arm, hold_gap, direction: float, start_mm: float) -
     assert travelled[-1] == pytest.approx(1.0, abs=0.02)
     assert max(abs(sample.truth.left_mm - sample.truth.right_mm) for sample in samples) < 0.2
     assert faults_of(samples) == ()
+
+
+@pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
+@pytest.mark.parametrize(("from_mm", "to_mm"), [(47.0, 95.0), (95.0, 47.0)], ids=["opening", "closing"])
+def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, from_mm: float, to_mm: float) -> None:
+    loop = arm(sample, planned=False)
+    hold_gap(loop, 47.0, 0.7)
+    if from_mm > to_mm:
+        hold_gap(loop, 95.0, 0.3)
+    went_mm = np.array([abs(each.truth.gap_mm - to_mm) for each in hold_gap(loop, to_mm, 0.2)])
+    assert went_mm.argmax() < 30, "ms"
+    assert went_mm.max() - went_mm[0] < 0.6
 
 
 # -- commands ------------------------------------------------------------------------------------------------------

@@ -82,9 +82,7 @@ class Carriages(Actuator):
         Reference and expected gap begin there anew. The speed counts as no faster than the motors' own, either way; the
         integrals stay.
         """
-        speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
-        self.reference = Reference(measured.gap_mm, speed_mm_s)
-        self.expected.begin(measured.gap_mm, speed_mm_s)
+        self.reference = self._begun_at(measured)
 
     def forget(self) -> None:
         """Forget all motion and the device, and count in `acted` a number that was not finite, as `Actuator.forget`."""
@@ -116,7 +114,7 @@ class Carriages(Actuator):
             pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._closed_mm)) / self._supply_V
         limits: list[Limit] = []
         reference, is_slewed = self._follow(
-            self.reference, now_s, dt_s, plan, self._speeds(pull, measured), is_over, limits
+            self.reference, now_s, dt_s, plan, self._speeds(pull, measured), measured, is_over, limits
         )
         self.reference = reference
         # each carriage also takes half of the skew as an error, so that the faster waits for the slower
@@ -142,11 +140,14 @@ class Carriages(Actuator):
         dt_s: float,
         plan: Plan | None,
         speeds: Speeds,
+        measured: Measured,
         is_over: bool,
         limits: list[Limit],
     ) -> tuple[Reference, bool]:
         """Return the reference `dt_s` later, and whether the limit of its acceleration held it back.
 
+        Where the carriages are LAGGING_MM behind what is expected, and the target is behind them, it turns at once:
+        from the `measured` gap.
         With `plan` None the reference comes to rest. A force over the ceiling (`is_over`) sends it open, with
         OVER_FORCE. What holds the gap back is added to `limits`: RATE only with a plan, and only where speed leaves it
         over LAGGING_MM behind. Counts one more tick in `acted.rate` where speed limits the reference, and in
@@ -159,6 +160,10 @@ class Carriages(Actuator):
         if is_over:
             target = Reference(self._open_mm)
             limits.append(Limit.OVER_FORCE)
+        ahead_mm, wanted_mm = self.expected.gap_mm - measured.gap_mm, target.gap_mm - measured.gap_mm
+        is_wrong_way = reference.speed_mm_s * wanted_mm < 0.0
+        if is_wrong_way and ahead_mm * wanted_mm < 0.0 and abs(ahead_mm) > LAGGING_MM:
+            reference = self._begun_at(measured)
         max_mm_s2 = self.acceleration_scale * self._gap_acceleration_mm_s2
         reference, is_limited, is_slewed = follow(max_mm_s2, reference, target, dt_s, speeds, floor_mm)
         if plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
@@ -166,6 +171,15 @@ class Carriages(Actuator):
         self.acted.rate += is_limited
         self.acted.slew += is_slewed
         return reference, is_slewed
+
+    def _begun_at(self, measured: Measured) -> Reference:
+        """Begin the expected gap anew at the measured gap and speed, and return a reference there.
+
+        The speed counts as no faster than the motors' own, either way.
+        """
+        speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
+        self.expected.begin(measured.gap_mm, speed_mm_s)
+        return Reference(measured.gap_mm, speed_mm_s)
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
         """Return the gap's speeds, mm/s: at no load, and the greatest that the reference may open and close with.

@@ -71,7 +71,8 @@ def follow(
     at the greatest speed that it can still brake from with `acceleration_mm_s2`. So a step is time-optimal and does not
     overshoot. The target's own speed is added, which follows a moving target without lag. A target that turns round
     leaves less to brake with, MIN_BRAKING of it at least. While speeding up, the acceleration falls to nothing at
-    `speeds.no_load_mm_s`. Speeds are held within `speeds` each way. Nothing is checked, and `reference` stays as it is.
+    `speeds.no_load_mm_s`. A reference that moves away from its target brakes with up to twice as much at that speed, as
+    a motor does. Speeds are held within `speeds` each way. Nothing is checked, and `reference` stays as it is.
     """
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
@@ -80,13 +81,11 @@ def follow(
     wanted = target.speed_mm_s + closing
     wanted = max(wanted, -_stopping_mm_s(max(reference.gap_mm - floor_mm, 0.0), acceleration_mm_s2, dt_s))
     bounded = min(max(wanted, -speeds.closing_mm_s), speeds.opening_mm_s)
-    torque = max(0.0, 1.0 - abs(reference.speed_mm_s) / speeds.no_load_mm_s)
-    is_opening = reference.speed_mm_s > 0.0
-    up, down = (
-        (acceleration_mm_s2 * torque, acceleration_mm_s2)
-        if is_opening
-        else (acceleration_mm_s2, acceleration_mm_s2 * torque)
-    )
+    share = min(abs(reference.speed_mm_s) / speeds.no_load_mm_s, 1.0)
+    speeding_up, braking = acceleration_mm_s2 * (1.0 - share), acceleration_mm_s2
+    if reference.speed_mm_s * distance < 0.0:
+        braking *= 1.0 + share
+    up, down = (speeding_up, braking) if reference.speed_mm_s > 0.0 else (braking, speeding_up)
     asked = (bounded - reference.speed_mm_s) / dt_s
     chosen = min(max(asked, -down), up)
     speed = reference.speed_mm_s + chosen * dt_s
