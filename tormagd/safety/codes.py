@@ -325,7 +325,7 @@ FAULTS: dict[Fault, Explanation] = {
         Position.LOST_HERE,
     ),
     Fault.OVER_FORCE: Explanation(
-        "on a brake the measured force stayed over 1.25 times the scene's most_N, and 0.1 N, for 100 ms",
+        "on a brake the measured force was over 1.25 times the scene's most_N, and 0.1 N, for 100 ms, or often",
         "compare force sensor and gap: is it the insert and the model that the scene names? Then `tormagctl arm`",
         Reaction.OPENING,
         150.0,

@@ -238,6 +238,16 @@ def test_too_much_force_opens_and_is_then_a_fault(running, given: tuple[str, ...
     assert running.run_into(Fault.OVER_FORCE, force_N=3.0, **running.there) < 20
 
 
+def test_a_force_that_is_too_much_again_and_again_is_a_fault(running) -> None:
+    """A gap that opens is no longer over; a plan that closes it again is no less wrong for that."""
+    for tick in range(240):
+        limits = running.step(force_N=3.0 if tick % 120 < 60 else 1.0, **running.there).limits
+        if running.faults:
+            break
+        assert Limit.OVER_FORCE not in limits or tick % 120 <= 60
+    assert running.faults == (Fault.OVER_FORCE,)
+
+
 # -- the wire and the clock ----------------------------------------------------------------------------------------
 
 

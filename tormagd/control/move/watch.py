@@ -26,6 +26,8 @@ OVER_N: Final = 0.1
 OVER_HELD_S: Final = 0.03
 OVER_FAULT_S: Final = 0.1
 "A force over the ceiling opens the gap after OVER_HELD_S, and is a fault after OVER_FAULT_S."
+OVER_FADES: Final = 0.25
+"While it is under, the time over it falls by so much a second. A force that is over again and again is a fault, too."
 SENSOR_FAULT_S: Final = 2.0
 "A sensor not believed for so long of sliding is a fault: forces are then only as good as the model."
 SENSE_FAULT_S: Final = 0.1
@@ -73,7 +75,9 @@ class Watch:
     opposed_s: float = 0.0
     "How long a carriage has moved against its duty."
     over_s: float = 0.0
-    "How long the measured force has been over the ceiling while the handle moved."
+    "How long the measured force has been over the ceiling of late while the handle moved."
+    is_over: bool = False
+    "Whether the force is over the ceiling, and has been for so long of late that the gap has to open."
     left_duty: float = 0.0
     "The left motor's duty at the step before."
     right_duty: float = 0.0
@@ -101,11 +105,6 @@ class Watch:
         self._needs_sensor: Final = scene.force.tolerance_rms_N < SCALE_SD * scene.force.most_N
         self._ceiling_N: Final = ceiling_N(scene)
 
-    @property
-    def is_over(self) -> bool:
-        """Whether the force has been over the ceiling for so long that the gap has to open."""
-        return self.over_s > OVER_HELD_S
-
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
         """Return `conditions` completed by the carriages' skew, and by the greatest values that a command may find.
 
@@ -125,6 +124,7 @@ class Watch:
         """Begin all counts anew for a device enabled at `enabled_s`; inf: not enabled."""
         self.enabled_s = enabled_s
         self.straying_s = self.still_s = self.opposed_s = self.over_s = 0.0
+        self.is_over = False
 
     def faults(
         self,
@@ -190,14 +190,17 @@ class Watch:
         """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`.
 
         Duties are the motors', at the nominal supply. Counts for how long a gap strays from `reference_mm`, a carriage
-        stands or goes against its duty, and the force is over the ceiling. A count begins again where its cause has
-        gone. A gap strays by over `limits.following_error_mm`; a reference of NaN is no straying. On a brake the force
-        counts only while the handle moves. The duties are kept for the next tick.
+        stands or goes against its duty, and the force is over the ceiling. Where its cause has gone, a count begins
+        again; that of the force falls by OVER_FADES s a second. A gap strays by over `limits.following_error_mm`; a
+        reference of NaN is no straying. On a brake the force counts only while the handle moves. The duties are kept
+        for the next tick.
         """
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
-        self.over_s = self.over_s + dt_s if measured.force_N > self._ceiling_N and is_felt else 0.0
+        is_over = measured.force_N > self._ceiling_N and is_felt
+        self.over_s = self.over_s + dt_s if is_over else max(self.over_s - OVER_FADES * dt_s, 0.0)
+        self.is_over = is_over and self.over_s > OVER_HELD_S
         self.still_s = self.still_s + dt_s if self._is_still(measured, left_duty, right_duty) else 0.0
         self._judge_direction(dt_s, measured, left_duty, right_duty)
         self.left_duty, self.right_duty = left_duty, right_duty
