@@ -214,6 +214,19 @@ def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
 
 
 @pytest.mark.parametrize("holder", [0, 1])
+def test_a_hand_that_draws_back_is_let_go_at_once_after_a_silence_too(holder: int) -> None:
+    following, _ = stream_of([1.0, 1.1, 1.2])
+    decide(following, 0.2, TimedSetpoint(1.2, 0.03, VALID_S))
+    setpoint = TimedSetpoint(1.5, 0.201, VALID_S, holder=holder, withdraw_N=0.7)
+    for is_pushing, asked_N in ((True, following.asked_N), (False, 0.7), (True, 1.5)):
+        ask = following.update(0.201, setpoint, DeviceFit(), 0.0, Travel(0.0, 0.0, is_pushing))
+        assert (ask.path_N[0], Limit.TAKEOVER in ask.limits) == (
+            pytest.approx(asked_N, abs=0.01),
+            asked_N not in (0.7, 1.5),
+        )
+
+
+@pytest.mark.parametrize("holder", [0, 1])
 def test_after_a_silence_a_publisher_is_followed_from_the_decayed_force_without_a_slope_from_before(
     holder: int,
 ) -> None:

@@ -174,9 +174,9 @@ def test_a_sensor_that_is_not_believed_shows_no_way_but_a_handle_that_comes_back
 def test_a_hand_that_pulls_where_the_encoder_shows_nothing_is_let_go() -> None:
     pushed = Pushed(1)
     pushed.at(5.0, 1.5)
-    assert pushed.at(5.0, -0.4).is_pushing
-    assert not pushed.at(5.0, -0.6).is_pushing
-    assert not pushed.at(5.0, -0.2).is_pushing
+    assert pushed.at(5.0, -0.15).is_pushing
+    assert not pushed.at(5.0, -0.25).is_pushing
+    assert not pushed.at(5.0, -0.15).is_pushing
     assert pushed.at(5.0, 0.3).is_pushing
 
 

@@ -163,6 +163,8 @@ class Governor:
             self._feed_forecast(setpoint.stamp_s, heard_N, soon_s)
             self.sent_N, self.expected_N = None, None
             path_N = [force_N] * len(PATH_S)
+            if held_N is None and force_N < self.asked_N:
+                self.is_passing = False  # a hand that draws back is let go at once, off any ramp
         elif wall is not None:
             self._feed_forecast(setpoint.stamp_s, heard_N, soon_s)
             path_N = self._path_against(wall, travel, dt_s, force_N, bounds, device, lag_s)

@@ -13,7 +13,7 @@ from tormagd.control.records import AT_REST, Measured, Travel
 
 PULLS_N: Final = 0.1
 "Least force of a hand that pulls: more than noise and drift of a force sensor."
-UNSEEN_N: Final = 0.5
+UNSEEN_N: Final = 0.2
 "Before a hand pulls so hard, bristles give more than the encoder's reversal: the encoder stands still."
 SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, 5 N/mm at 1.5 N either way."
