@@ -51,7 +51,7 @@ class Planner:
         terms, insert = scene.terms, scene.insert
         gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
-        self.believe = Believe(config, scene, element.nominal, followed, element.portrait.min_N)
+        self.believe = Believe(config, scene, element.nominal, followed)
         gap_speed_mm_s = config.position.gap_speed_mm_s
         self._portrait: Final = element.portrait
         self.way = Way(config.handle.push_sign)
@@ -76,7 +76,9 @@ class Planner:
         belief = self.believe.update(now_s, measured)
         travel = self.way.update(measured, is_sensor_believed=belief.sensor_doubted_s == 0.0)
         held_N = None if is_followed else self._held_N(measured, belief.device)
-        ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s, travel, held_N)
+        # at the open gap the element's field lags, and gives more than the portrait: from there the path begins
+        device = belief.device.relaxed(self._portrait.min_N - self.believe.memory.open_N())
+        ask = self.governor.update(now_s, setpoint, device, belief.lag_s, travel, held_N)
         plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
         # how late the carriages are is learned from this plan's gap, and acts in the next one
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)

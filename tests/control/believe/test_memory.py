@@ -68,6 +68,15 @@ def test_it_relaxes_as_its_series_does_of_the_force_of_its_own_field(follow, ele
         assert remembered.force_N(curve) == pytest.approx(true_N, abs=1e-12)
 
 
+def test_the_open_gap_gives_more_on_the_way_back(follow, element: Element) -> None:
+    """The element's own field lags: what was foreseen at the closed gap is there at the open one."""
+    open_mm, curve = max(GAPS_MM), element.nominal.only
+    rested, closed = follow(found(open_mm)), follow(found(open_mm), found(NEAR_MM))
+    opened = follow(found(open_mm), found(NEAR_MM), found(open_mm))
+    assert closed.open_N() == pytest.approx(opened.force_N(curve) + opened.relaxed_N)
+    assert closed.open_N() > rested.open_N() + 0.01
+
+
 def test_what_the_field_adds_relaxes_by_fractions_of_its_own() -> None:
     """Of a pad, which nothing had pressed before."""
     pad = build_core(Config(scene="radial_pulse")).element

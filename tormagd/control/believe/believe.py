@@ -96,16 +96,10 @@ class Believe:
     is_contradicted: bool = False
     "Whether the first slide has shown another device than `taught`."
 
-    def __init__(
-        self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory, min_model_N: float
-    ) -> None:
-        """Begin with an unseen device.
-
-        `memory` is advanced by `update`. `min_model_N` is the model's force with the gap open, for `min_N`.
-        """
+    def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
+        """Begin with an unseen device. `memory` is advanced by `update`."""
         terms = scene.terms
         trim = config.trim
-        self._min_model_N: Final = min_model_N
         self.memory, self.handle = memory, HandleWatch()
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
@@ -138,8 +132,8 @@ class Believe:
 
     @property
     def min_N(self) -> float:
-        """F_min of this device: the force of its open gap at speed."""
-        return self.device.force_N(self._min_model_N)
+        """F_min of this device: the force of its open gap at speed, with the lag of the element's field."""
+        return self.device.force_N(self.memory.open_N())
 
     def knows_zero(self, now_s: float) -> bool:
         """Tell whether the sensor's zero is known to within what the scene tolerates: else readings teach nothing."""

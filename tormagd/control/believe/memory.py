@@ -58,6 +58,7 @@ class ElementMemory:
         self._closed_mm: Final = gap_range_mm[0]
         self._open_mm: Final = gap_range_mm[1]
         self._only_free_N: Final = self._free_N(nominal.only)
+        self._open_mT: Final = field.field_mT(gap_range_mm[1])
 
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`.
@@ -71,6 +72,14 @@ class ElementMemory:
             return self.lag_mT
         side_mT = math.copysign(self._width_mT, change_mT)
         return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
+
+    def open_N(self) -> float:
+        """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed.
+
+        There the element's field lags behind: it still has some of what it had.
+        """
+        field_mT = self._open_mT - self.lag_at_mT(self._open_mT)
+        return self._nominal.only.force_N(within(field_mT, self._nominal.fields_mT))
 
     def force_N(self, curve: ForceCurve) -> float:
         """Return the model's force now, N, with memory; `curve` is its force over the field without.
