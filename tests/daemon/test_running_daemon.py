@@ -362,6 +362,18 @@ def test_sighup_takes_over_what_it_can_and_names_what_waits(alone: Running, capl
     assert alone.command("describe")["configuration"]["realtime"]["watchdog_ms"] == 800.0
 
 
+def test_a_watchdog_that_the_timeout_in_force_does_not_allow_is_refused(
+    alone: Running, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In the file it is above the timeout, which waits for a restart."""
+    timeouts = DeviceTable(command_timeout_ms=30.0, measurement_timeout_ms=30.0)
+    alone.daemon._read_again = lambda: Config(realtime=RealTime(watchdog_ms=40.0), device=timeouts)
+    signal.raise_signal(signal.SIGHUP)
+    alone.until(lambda _: "stays as it was" in caplog.text, "the configuration is refused")
+    assert "realtime.watchdog_ms = 40.0: allowed is over device.command_timeout_ms = 50" in caplog.text
+    assert alone.command("describe")["configuration"]["realtime"]["watchdog_ms"] == WATCHDOG_MS
+
+
 def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.LogCaptureFixture) -> None:
     """The loops are graded from their first period on."""
     said = logging.getLogger(daemon_module.__name__)

@@ -289,11 +289,11 @@ class Daemon:
             log.error("the lists of keys stay as they were: %s; next: mend that and reload again", error)
         try:
             read = await asyncio.to_thread(self._read_again)
-        except ConfigError as error:
+            again, config = reread(self._calibrations.configured, read), reread(self._config, read).config
+        except ValueError as error:
             log.error("the configuration stays as it was: %s; next: mend that and reload again", error)
             return
-        again = reread(self._calibrations.configured, read)
-        self._calibrations.configured, self._config = again.config, reread(self._config, read).config
+        self._calibrations.configured, self._config = again.config, config
         self._calibrations.read_again()
         self._telemetry.config = self._config
         self._endpoint.inbox.sources = again.config.sources

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd.config import Config
+from tormagd_client.printable import require
 
 LIVE = frozenset({"sources.priority", "sources.playout_ms", "realtime.watchdog_ms"})
 "Keys that nothing but the loop that looks at them knows. From all others something was built at the start."
@@ -26,13 +27,20 @@ def reread(running: Config, read: Config) -> Reread:
     """Return `running` with the keys in LIVE taken from `read`, which may change while control runs.
 
     The result also lists the keys that were taken, and those that differ but wait for a restart, each as a path.
-    Neither argument is changed.
+    Neither argument is changed. Raises ValueError for a watchdog that is not above the running command timeout.
     """
+    timeout_ms, watchdog_ms = running.device.command_timeout_ms, read.realtime.watchdog_ms
+    require(
+        watchdog_ms > timeout_ms,
+        "realtime.watchdog_ms",
+        watchdog_ms,
+        f"over device.command_timeout_ms = {timeout_ms:g}, which stays until a restart",
+    )
     differing = tuple(_differing(msgspec.to_builtins(running), msgspec.to_builtins(read), ""))
     config = msgspec.structs.replace(
         running,
         sources=read.sources,
-        realtime=msgspec.structs.replace(running.realtime, watchdog_ms=read.realtime.watchdog_ms),
+        realtime=msgspec.structs.replace(running.realtime, watchdog_ms=watchdog_ms),
     )
     taken = tuple(key for key in differing if key in LIVE)
     return Reread(config, taken, tuple(key for key in differing if key not in LIVE))
