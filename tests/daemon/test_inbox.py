@@ -294,8 +294,10 @@ def test_stamps_in_another_unit_are_refused_by_name_and_take_no_brake(
         if number >= 9:
             assert f"of 'a' counts {unit}: send ns since 1970" in (publishing.inbox.last_refusal or "")
     assert (publishing.inbox.hold.source, publishing.inbox.newest) == ("", None)
-    assert publishing.of("a").cause == f"its stamps count {unit}, and are refused"
+    found = publishing.of("a")
+    assert (found.cause, found.clock_behind_ms) == (f"its stamps count {unit}, and are refused", None)
     assert publishing.send(30, 1.5, "a")
+    assert publishing.of("a").clock_behind_ms == 0.0
 
 
 def test_a_clock_that_was_never_set_is_corrected_and_named(publishing: Publishing) -> None:

@@ -430,7 +430,7 @@ class SetpointInbox:
             restarts=sequence.restarts,
             delay_us=source.delays.report,
             jitter_us=round(clock.jitter_s * 1e6, 1),
-            clock_behind_ms=round(clock.offset_s * 1e3, 3) if clock.is_settled else None,
+            clock_behind_ms=round(clock.offset_s * 1e3, 3) if clock.is_settled and source.stamp_s > -math.inf else None,
             clock_steps=clock.steps,
             clock=clock_report(source.fit),
             cause=source.cause,
