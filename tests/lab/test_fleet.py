@@ -126,11 +126,16 @@ def test_a_commissioning_is_told_of_its_device_whether_it_was_recorded_or_not(tm
 
 def test_what_cannot_be_kept_is_told_after_what_was_found(folder, scheduler, capsys, tmp_path):
     (tmp_path / "file").touch()
-    for url, reason in ((f"{tmp_path}/file/a.parquet", f"{tmp_path}/file"), ("nothing://a", "not known: nothing")):
+    for url, reason in (
+        (f"{tmp_path}/file/a.parquet", f"{tmp_path}/file"),
+        (f"{tmp_path}/absent/a.parquet", f"{tmp_path}/absent"),
+        ("nothing://a", "not known: nothing"),
+    ):
         assert main(["fleet", str(folder / "1"), "--dask", scheduler, "--out", url]) == 2
         out, err = capsys.readouterr()
         assert "MRE-50-40" in out
         assert reason in err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_bucket_is_read_like_a_folder(folder):

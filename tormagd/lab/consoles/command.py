@@ -62,7 +62,7 @@ def write_parquet(summaries: dict[str, Summary], url: str) -> None:
     columns = [("file", pyarrow.string()), *((field.name, KINDS[field.type]) for field in fields)]
     rows = [{"file": name, **msgspec.structs.asdict(each)} for name, each in summaries.items()]
     table = pyarrow.Table.from_pylist(rows, pyarrow.schema(columns))
-    with fsspec.open(url, "wb") as file:
+    with fsspec.open(url, "wb", auto_mkdir=False) as file:
         pyarrow.parquet.write_table(table, file)
 
 
