@@ -91,6 +91,16 @@ def test_cantools_decodes_every_frame_with_names_and_units(
     assert (units["force_N"], units["left_position_mm"], units["supply_V"]) == ("N", "mm", "V")
 
 
+@pytest.mark.parametrize("ending", ["log", "db"])
+def test_a_log_that_is_there_is_replaced(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"session.{ending}"
+    for _ in range(2):
+        with contextlib.closing(wire_log.WireLog(path)) as log:
+            log.add(1.5, encode_frame(FUNCTION[Drive], 0, encode(Drive(0.1, 0.2, DriveMode.RUN, 5))), is_rx=False)
+    with can.LogReader(path) as reader:
+        assert len(list(reader)) == 1
+
+
 def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:
     drive = encode(Drive(0.1, 0.2, DriveMode.RUN, 5))
     good = encode_frame(FUNCTION[Drive], 0, drive)

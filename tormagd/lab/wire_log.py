@@ -44,12 +44,14 @@ MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 class WireLog:
     """Log of both directions of one serial line, as a file that CAN tools read; to be closed.
 
-    A frame is stamped with the time its last byte passed. Bytes that are no frame, or name a function without a CAN
-    identifier, are counted in `damaged` and not logged. Raises ValueError for a file type that python-can does not
-    know, and OSError where the file cannot be made.
+    A file that is there is replaced. A frame is stamped with the time its last byte passed. Bytes that are no frame, or
+    name a function without a CAN identifier, are counted in `damaged` and not logged. Raises ValueError for a file type
+    that python-can does not know, and OSError where the file cannot be made.
     """
 
     def __init__(self, path: Path) -> None:
+        if path.suffix.lower() == ".db":  # python-can would add to it
+            path.unlink(missing_ok=True)
         self._log = can.Logger(path)
         self._decoders = {is_rx: FrameDecoder() for is_rx in (False, True)}
         self._nameless = 0
