@@ -17,7 +17,7 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
     """
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
-    is_ahead = plan.foresight >= MIN_FORESIGHT
+    is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust
     return {
         "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),
         "offset": _told(fit.offset_N, fit.offset_sd_N, "N", terms.offset),
@@ -25,7 +25,7 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
         "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", believe.knows_zero(now_s)),
         "carriage_lag": _told(believe.carriages.lag_s, None, "s", terms.motor and is_ahead),
         "acceleration_scale": _told(stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),
-        "forecast_trust": _told(planner.governor.forecast.trust, None, "", plan.foresight > 0.0),
+        "forecast_trust": _told(trust, None, "", trust > 0.0 and plan.foresight > 0.0),
         "relaxed": _told(memory.relaxed_N, None, "N", memory.relaxed_N != 0.0),
         "field_lag": _told(memory.lag_mT, None, "mT", memory.lag_mT != 0.0),
     }
