@@ -210,6 +210,13 @@ def test_a_scene_is_checked_on_a_plant_of_ones_own(tmp_path, ctl, checked_here):
     assert "on plant" in ctl("scene", "check", "pulse", "--plant", str(weak)).ended(1).err
 
 
+def test_a_package_that_a_check_on_a_plant_lacks_is_told_with_what_brings_it_alone(monkeypatch, ctl, checked_here):
+    monkeypatch.setitem(sys.modules, "clarabel", None)
+    error = ctl("--json", "scene", "check", "pulse", "--plant", "sample_1").ended(2).error
+    assert error["message"].endswith("tormag-lab bound: clarabel is not installed")
+    assert error["hint"] == "pip install 'tormagd[lab]'"
+
+
 def test_every_measured_way_is_shown_with_what_it_costs(ctl, checked_here):
     text = ctl("scene", "explain", "brain").ended(0).out
     assert all(said in text for said in ("1000 / 500 Hz, newton", "chosen, runs here", "contact", "signal, frozen"))

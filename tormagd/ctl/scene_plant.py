@@ -43,7 +43,10 @@ def on_plant(scene: Scene, name: str, plant: str) -> dict[str, Any]:
         try:
             found: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.lab.__main__", words, LONGEST_S))
         except (TimeoutError, ChildProcessError) as error:
-            raise usage_error(f"--plant {plant}: {error}", "tormag-lab twin makes a plant file") from error
+            # what the laboratory lacks is told with the command that brings it
+            said, lacks, remedy = str(error).partition(" is not installed")
+            hint = remedy.removeprefix(": ") or "tormag-lab twin makes a plant file"
+            raise usage_error(f"--plant {plant}: {said}{lacks}", hint) from error
     for key, value, most in (
         ("force.most_N", force.most_N, found["most_N"]),
         ("the RMS error of ideal carriages", found["foresight_rms_N"], force.tolerance_rms_N),
