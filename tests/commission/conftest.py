@@ -12,7 +12,7 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.commission.course import COLUMNS, PREVIEW_STEP_S, Asked, Course, Found, Heard, drive
 from tormagd.commission.finding import Finding
 from tormagd.commission.known import Known
-from tormagd.commission.sequence import STEPS, Step, Stopped, sequence
+from tormagd.commission.sequence import STEPS, Step, Stopped, due, sequence
 from tormagd.config import Config, Rates
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.telemetry import tick_record
@@ -108,7 +108,9 @@ class Bench:
         """The findings by step, and why it stopped."""
         found: dict[str, list[Finding]] = {}
         known = Known(CONFIG, 1e-3, self.least_N, 2.0, weight_N)
-        course = sequence(steps, known, {}, lambda step: None, lambda step, each: found.update({step.name: list(each)}))
+        course = sequence(
+            due(steps, known, {}), known, lambda step: None, lambda step, each: found.update({step.name: list(each)})
+        )
         return found, self.follow(course)
 
 

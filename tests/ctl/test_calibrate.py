@@ -8,6 +8,7 @@ import math
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.commission import course
 from tormagd.commission.finding import Finding
-from tormagd.commission.sequence import Stopped
+from tormagd.commission.known import Known
+from tormagd.commission.report import begun
+from tormagd.commission.sequence import STEPS, Stopped
 from tormagd.config import Config
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
@@ -415,6 +418,22 @@ def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon,
     for broken in (b"{}", b'{"v": 1, "\xff": 1}'):
         Path(result["page"]).with_suffix(".json").write_bytes(broken)
         assert "is no report" in ctl(*command).ended(2).error["hint"]
+
+
+def test_the_steps_that_are_run_are_numbered_one_by_one(monkeypatch, tmp_path, capsys) -> None:
+    """Without a weight there is no step for one."""
+
+    def finds_nothing(known):
+        yield from ()
+        return []
+
+    steps = [step._replace(course=finds_nothing) for step in STEPS]
+    monkeypatch.setattr(ctl_commission, "STEPS", steps)
+    run = SimpleNamespace(progress=Progress(), follow=lambda course: next(course, None))
+    kept = ctl_commission.Kept(tmp_path / "7.json", begun(None, 7, 0, None, Config().motor))
+    kept.follow(run, Known(Config(), 1e-3, 0.6, 2.0, None))
+    numbers = re.findall(r"step (\d) of (\d)", capsys.readouterr().err)
+    assert numbers == [(str(number), "8") for number in range(1, 9)]
 
 
 def test_who_ends_the_input_has_not_agreed_that_anything_moves(monkeypatch, terminal) -> None:

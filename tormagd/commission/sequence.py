@@ -51,24 +51,27 @@ class Stopped(msgspec.Struct, frozen=True):
     remedy: str
 
 
+def due(steps: Sequence[Step], known: Known, done: Mapping[str, Findings]) -> list[Step]:
+    """Return which of `steps` are to be run, in order: those not `done`, or `always` run, and `weight` only with one.
+
+    `done` are findings by step; of them only the names count.
+    """
+    without = {"weight"} if known.weight_N is None else set()
+    return [step for step in steps if step.always or step.name not in done.keys() | without]
+
+
 def sequence(
     steps: Sequence[Step],
     known: Known,
-    done: Mapping[str, Findings],
     begins: Callable[[Step], object],
     ends: Callable[[Step, Findings], object],
 ) -> Course[Stopped | None]:
-    """Run the `steps` that are not `done`, in order, and return why it stopped early; None where all were done.
+    """Run the `steps`, in order, and return why it stopped early; None where all were done.
 
-    `done` are findings by step; of them only the names count. Steps that are `always` run are run again, and `weight`
-    is left out without one. `begins` is called before each step, `ends` behind it with its findings. A StoppedError
-    ends the sequence: `ends` gets the findings that it still has, if any, and the gap is told to open. What a device
-    raises is raised.
+    `begins` is called before each step, `ends` behind it with its findings. A StoppedError ends the sequence: `ends`
+    gets the findings that it still has, if any, and the gap is told to open. What a device raises is raised.
     """
     for step in steps:
-        is_done = step.name in done and not step.always
-        if is_done or (step.name == "weight" and known.weight_N is None):
-            continue
         begins(step)
         try:
             ends(step, (yield from step.course(known)))

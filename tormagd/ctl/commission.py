@@ -12,7 +12,7 @@ from tormagd.commission.calibration import calibration
 from tormagd.commission.known import Known
 from tormagd.commission.page import page_of
 from tormagd.commission.report import MAX_BYTES, Report, begun
-from tormagd.commission.sequence import STEPS, Findings, Step, Stopped, sequence
+from tormagd.commission.sequence import STEPS, Findings, Step, Stopped, due, sequence
 from tormagd.config import Config, checked
 from tormagd.ctl.calibrate import agree
 from tormagd.ctl.calibrate_run import Run, connected, known_of
@@ -117,16 +117,16 @@ class Kept:
         self._write()
 
     def follow(self, run: Run, known: Known) -> None:
-        """Run the steps that are not done, in order, and write the report after each; say each on stderr.
+        """Run the steps that are `due`, in order, and write the report after each; say each on stderr, with its number.
 
         That a step stopped, and why, is written; a stop that the steps themselves find is not raised. Raises as
         `Run.follow`, after writing why. Raises CommandError (USAGE) where the report cannot be written.
         """
+        steps = due(STEPS, known, self.report.findings)
 
         def begins(step: Step) -> None:
             self._step = step.name
-            number = STEPS.index(step) + 1
-            write_line(f"step {number} of {len(STEPS)}, {step.name}: {step.says}", sys.stderr)
+            write_line(f"step {steps.index(step) + 1} of {len(steps)}, {step.name}: {step.says}", sys.stderr)
             run.progress.begin(step.name, step.lasts_s)
 
         def ends(step: Step, found: Findings) -> None:
@@ -134,7 +134,7 @@ class Kept:
             self._note(findings=self.report.findings | {step.name: list(found)})
 
         try:
-            self._note(stopped=run.follow(sequence(STEPS, known, self.report.findings, begins, ends)))
+            self._note(stopped=run.follow(sequence(steps, known, begins, ends)))
         except ClientError as error:
             self._note(stopped=Stopped(self._step, error.code, error.message, error.hint))
             raise
