@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tormagd import __version__
 from tormagd.lab import errors
 from tormagd.lab.main import COMMANDS, main
 from tormagd.model.model_file import load_model
@@ -62,6 +63,10 @@ def test_the_commands_are_listed(arguments, exit_code, capsys):
     told = capsys.readouterr()
     assert all(f"  {name} " in (told.err if exit_code else told.out) for name in COMMANDS)
     assert "'train'" in told.err or not exit_code
+
+
+def test_it_says_which_version_it_is(capsys):
+    assert (main(["--version"]), capsys.readouterr().out) == (0, f"tormag-lab {__version__}\n")
 
 
 FORCES, MOTOR, ROWS = (

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from tormagd import __version__
 from tormagd.force_file import ForceFileError
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.told import lines
@@ -58,21 +59,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that the first argument names and return its exit code, as `run` with the other arguments.
 
     None takes the arguments of the process. Without arguments, and for `-h` or `--help`, the commands are listed on
-    stdout, and the code is 0. For an unknown name they are listed on stderr, with what may have been meant; the code is
-    2. Makes stdout and stderr take any text, for the whole process. Raises as `run`, such as SystemExit for wrong usage
-    of the command.
+    stdout, and the code is 0. So is the version for `--version`. For an unknown name they are listed on stderr, with
+    what may have been meant; the code is 2. Makes stdout and stderr take any text, for the whole process. Raises as
+    `run`, such as SystemExit for wrong usage of the command.
     """
     write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)
     name = given[0] if given else "--help"
     if name in COMMANDS:
         return run(name, given[1:])
-    wanted = name in ("-h", "--help")
+    commands = [f"  {each:20}{summary}" for each, (_, summary) in COMMANDS.items()]
+    usage = ["usage: tormag-lab NAME [--help] ...", "       tormag-lab --version", "", *commands]
+    told = {"--version": [f"tormag-lab {__version__}"], "-h": usage, "--help": usage}
     refused = f"tormag-lab: no command {in_short(name)}{did_you_mean(name, COMMANDS) or '; there are:'}"
-    head = ["usage: tormag-lab NAME [--help] ...", ""] if wanted else [refused]
-    commands = (f"  {each:20}{summary}" for each, (_, summary) in COMMANDS.items())
-    write_line("\n".join([*head, *commands]), sys.stdout if wanted else sys.stderr)
-    return 0 if wanted else USAGE
+    write_line("\n".join(told.get(name, [refused, *commands])), sys.stdout if name in told else sys.stderr)
+    return 0 if name in told else USAGE
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
