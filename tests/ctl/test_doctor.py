@@ -156,6 +156,7 @@ def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
         f"refused: {REFUSED[0]}",
         True,
     )
+    assert all("its container or cgroup withholds" in refused[name]["remedy"] for name in ("sched_fifo", "memlock"))
     assert (refused["swap"]["verdict"], "unlimited" in str(refused["memlock"]["found"])) == ("warn", False)
     assert not [each for each in refused.values() if each["remedy"].startswith("set realtime.")]
     machine.write(NOTHING)  # what whoever calls may not do changes nothing

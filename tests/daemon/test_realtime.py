@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import resource
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -34,6 +35,8 @@ def test_each_refusal_names_its_setting_and_reason(monkeypatch: pytest.MonkeyPat
         "realtime.keep_awake",
     ]
     assert all("Operation not permitted" in line for line in refused[:2])
+    limit, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    assert refused[1].endswith(f"under a limit of {limit}; see LimitRTPRIO")
 
 
 def test_processors_are_kept_awake_for_as_long_as_the_file_is_open(

@@ -41,7 +41,10 @@ RULES = "udev's 60-tormag.rules"
 BY_UNIT = "run tormagd by its systemd unit, or add "
 HERE = r"ipc://|tcp://(127\.|localhost:)"
 "An address of this machine."
-LIMITS_D = "to /etc/security/limits.d/tormag.conf where it is started by hand; then start it again"
+LIMITS_D = (
+    "to /etc/security/limits.d/tormag.conf where it is started by hand; then start it again. Where that is there, its "
+    "container or cgroup withholds it"
+)
 ASKED = (
     ("sched_fifo", "fifo_priority", "50", f"add LimitRTPRIO=90 to its unit, or '@tormag - rtprio 90' {LIMITS_D}"),
     (

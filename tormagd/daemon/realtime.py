@@ -4,6 +4,7 @@ import ctypes
 import gc
 import logging
 import os
+import resource
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -35,7 +36,8 @@ def prepare(settings: RealTime) -> list[str]:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(settings.fifo_priority))
         except OSError as error:
-            refused.append(f"realtime.fifo_priority = {settings.fifo_priority}: {error.strerror}; see LimitRTPRIO")
+            why = f"{error.strerror} under a limit of {resource.getrlimit(resource.RLIMIT_RTPRIO)[0]}; see LimitRTPRIO"
+            refused.append(f"realtime.fifo_priority = {settings.fifo_priority}: {why}")
     ask_for_slices()
     if settings.lock_memory and ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
         refused.append(f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}; see LimitMEMLOCK")
