@@ -338,7 +338,7 @@ class ClosedLoop:
         """Run ticks without a setpoint until `reached` is true of a measurement, at least one.
 
         `plan` is used in each, or the planner's where that is None. Raises RuntimeError after HOMING_S: the device did
-        not `what`, a verb for the message.
+        not `what`, a verb for the message. Raises as `tick`.
         """
         for _ in range(round(HOMING_S / self._period_s)):
             self.tick(plan=plan)

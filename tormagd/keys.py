@@ -42,8 +42,8 @@ class KeyRing:
     def load_allowed(self) -> Allowed:
         """Read the key folders of all roles again and return the accepted keys; `allowed` stays as it is.
 
-        A key in several folders has all their roles, and the name of the last, of publish, operate and observe. Raises
-        ConfigError as `load_folder`.
+        A key in several folders has all their roles, and the name of the last, of publish, operate and observe. An
+        empty folder gives no keys. Raises ConfigError as `load_folder`, also for a missing one.
         """
         found: dict[str, Listed] = {}
         for role, folder in self._folders.items():

@@ -145,9 +145,9 @@ def watch(
 ) -> Course[Columns]:
     """Ask for a force, N, over the time, s, for `lasts_s`, and return all ticks as `columns_of`.
 
-    `force_N` is called with the time since the first ticks came; None: no setpoint is published. `is_told_ahead` also
-    tells the PREVIEW_STEPS forces that follow. Raises StoppedError for a tick in another operating state than `states`;
-    its `rows` are the ticks before.
+    Time counts from the first answer, with ticks or without; the columns are empty where none comes. None for `force_N`
+    publishes no setpoint. `is_told_ahead` also tells the PREVIEW_STEPS forces that follow. Raises StoppedError for a
+    tick in another operating state than `states`; its `rows` are the ticks before.
     """
     rows: list[Row] = []
     ahead_s = [PREVIEW_STEP_S * number for number in range(1, 1 + PREVIEW_STEPS)] if is_told_ahead else []

@@ -235,7 +235,8 @@ def smooth(values: Array, window: int) -> Array:
 def _motor_findings(known: Known, slow: Columns, side: str, driven: Driven) -> list[Finding]:
     """Return a motor's resistance, back EMF, inertia and dry friction as shares of those in [motor], four findings.
 
-    `slow` are the ticks of the slow way, which shows the friction. What is NaN is not measured.
+    `driven` has what `_driven` found of the first three, `slow` the ticks of the slow way, which shows the friction.
+    What is NaN is not measured.
     """
     torque_Nm = _friction_A(known.period_s, slow, side) * driven.back_emf_V_s[0]
     seen = zip(nominals(known.config.motor).items(), (*driven, (torque_Nm, 0.0)), strict=True)

@@ -50,7 +50,7 @@ ELEMENT = (
 
 
 def enabled(force_N: float) -> Course[None]:
-    """Enable a device that is not, with `force_N` as the setpoint; return nothing.
+    """Enable a device that is not, with `force_N` as the setpoint until then; return nothing.
 
     It waits for the first tick, however long that takes. Raises StoppedError as `given`, after ENABLE_S.
     """

@@ -157,8 +157,8 @@ class Measure:
 
         `dt_s` is from the last Sense, on the device's clock. Rates are filtered over RATE_FILTER_S and QUICK_FILTER_S,
         with their sign along the way of the handle, or inwards for a finger. `sliding_mm_s` follows the rate over
-        SLIDING_MM of travel, so that a handle that stops keeps it. A finger's depth is its position, and at least 0 mm;
-        its `turn` stays. Nothing is kept here, and nothing checked.
+        SLIDING_MM of travel: a handle that stops keeps it, FAST_MM_S at most. A finger's depth is its position, and at
+        least 0 mm; its `turn` stays. Nothing is kept here, and nothing checked.
         """
         before = last.handle
         travel_mm = position_mm - last.handle_mm

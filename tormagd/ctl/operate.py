@@ -42,8 +42,8 @@ def arm(client: Client, timeout_s: float) -> Outcome:
     """Have the daemon clear faults, home and enable, as far as needed, and say each step on stderr.
 
     The result has the steps `given`, empty where it was armed already, `operating_state`, and the `seconds` that it
-    took. Raises CommandError (REFUSED) where the device is not ENABLED afterwards, and as `Client.arm`, such as after
-    `timeout_s`. Ctrl-C and that end disable the device: the gap opens.
+    took. Raises CommandError (REFUSED) where the device is not ENABLED afterwards. Raises as `Client.arm`: RefusedError
+    after `timeout_s`, UnreachableError without a daemon. Ctrl-C and the timeout disable the device: the gap opens.
     """
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))

@@ -107,8 +107,8 @@ def _instead(result: dict[str, Any]) -> str:
 def _happened(what: dict[str, Any]) -> str:
     """Say in words what was met in a run, of `what`, a part of the replay's report.
 
-    It has `faults` with their times and `limits` with how long they held, s, and `refused` commands. What is empty is
-    told as none, or left out.
+    It has `faults` with their times, s from the file's first tick, `limits` with how long they held, s, and `refused`
+    commands. What is empty is told as none, or left out.
     """
     faults = ", ".join(f"{name} at {at_s:.3f} s" for name, at_s in what["faults"].items()) or "no fault"
     limits = ", ".join(f"{name} {held_s:.3f} s" for name, held_s in what["limits"].items()) or "none"

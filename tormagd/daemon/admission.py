@@ -209,8 +209,8 @@ class Admission:
     def has_role(self, public: str, roles: frozenset[str]) -> bool:
         """Tell whether the key `public`, 40 characters (Z85), is now listed for at least one of `roles`.
 
-        False for one that is not listed. Ask for each message: a peer may have been taken off the list after it was let
-        in.
+        False for one that is not listed, and so for every key where `keys` is None. Ask for each message: a peer may
+        have been taken off the list after it was let in.
         """
         return public in self.allowed and not roles.isdisjoint(self.allowed[public].roles)
 

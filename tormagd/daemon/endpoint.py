@@ -211,10 +211,12 @@ class Endpoint:
         self._context.destroy(linger=0)
 
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
-        """Return a new socket of this `kind`, guarded where it has to be, bound to `address`, with bounded queues.
+        """Return a new socket of this `kind`, guarded where `endpoints` says so, bound to `address`, with bounded
+        queues.
 
-        Of an `ipc://` address the file is made, and removed by `close`. An XPUB passes on every subscription, also
-        repeated ones. Raises OSError naming the endpoint, the address and why it cannot be bound.
+        Of an `ipc://` address the file is made. `close` removes it and closes the socket, also one that could not be
+        bound. An XPUB passes on every subscription, also repeated ones. Raises OSError naming the endpoint, the address
+        and why it cannot be bound.
         """
         made = self._context.socket(kind)
         options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}

@@ -147,11 +147,10 @@ class RateGroup:
                 self.stalls += 1
 
     def report(self) -> RateReport:
-        """Return counts since the start, and rate, grade and percentiles over one to two horizons.
+        """Return counts and worst lateness since the start, and rate, grade and percentiles over one to two horizons.
 
-        Percentiles are those of the last `refresh` of the histograms. The grade is `error` after a stall, `warning`
-        after an overrun, else `good`. The worst lateness is since the start. 0 Hz stands for fewer than two runs;
-        merged ones do not count as runs.
+        Percentiles are those of the last `refresh` of the histograms. The grade is `error` for a stall in this time,
+        `warning` for an overrun, else `good`. 0 Hz stands for fewer than two runs; merged ones do not count as runs.
         """
         since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"

@@ -45,10 +45,10 @@ class SearchProcess:
             )
 
     def answer(self) -> Answer | None:
-        """Return the answer that has come since the last call; None where none has. Never waits.
+        """Return the answer that has come since the last call; None where none has, or the process has ended.
 
-        A search that found no field is logged, and gives None, too. Either ends the open question, and is recorded in
-        `timing`.
+        Never waits. A search that found no field is logged, and gives None, too. Either ends the open question, and is
+        recorded in `timing`.
         """
         data = None if self._is_idle else self._beside.receive()
         if data is None:

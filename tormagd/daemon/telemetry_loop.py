@@ -289,8 +289,9 @@ class TelemetryLoop:
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
         """Tell systemd what is new: readiness, which is logged, the status line, and that the daemon lives.
 
-        It lives while plans and, once a device was identified, its states are no older than `realtime.watchdog_ms`.
-        Else nothing says so, and systemd's watchdog runs out. Without systemd the log alone is told.
+        It lives while the newest plan is no older than `realtime.watchdog_ms`. Once a device was identified, its newest
+        state may be no older either, while its port is open and its firmware is not refused. Else nothing says so, and
+        systemd's watchdog runs out. Without systemd the log alone is told. `is_homed_` is for the status line.
         """
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state

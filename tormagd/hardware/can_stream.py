@@ -68,8 +68,8 @@ class CanStream:
         """Return the messages in frames (identifier, data), in their order, as `unpack` of each; UNREADABLE counts as
         corrupt.
 
-        For frames that were recorded in `received`. Raises SecondHostError as `unpack`; the frames behind are then not
-        read.
+        For recorded frames: this node's are added to `received`, which may not be `frames` itself. Raises
+        SecondHostError as `unpack`; the frames behind are then not read.
         """
         messages: list[Message] = []
         for identifier, data in frames:

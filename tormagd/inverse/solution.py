@@ -79,7 +79,8 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
     """Check the arguments of a search; return the field that its answer should be near, mT.
 
     That is the last field, or `least_mT`, the opener gap, where it is None. It is not held within the search's range.
-    Raises `DomainError` naming `last_field_mT` or `force_N` where it is not finite, or beyond LARGEST.
+    Raises `DomainError` naming `last_field_mT`, for either field, or `force_N` where it is not finite, or beyond
+    LARGEST.
     """
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):

@@ -94,9 +94,9 @@ class Drive(NamedTuple):
         """Return the speed of the gap, mm/s, `dt_s` after `speed_mm_s`, at full voltage to open against the pull
         `pull_mm_s2`.
 
-        It is the largest that can be reached; opening is positive. A gap that closes brakes, and may turn round within
-        the step. It stands, at 0, where friction is more than what is left over. `dt_s` is above 0 and at most 1 /
-        `per_s`; that is not checked.
+        It is the largest that can be reached; opening is positive, the pull too where it closes. A gap that closes
+        brakes, and may turn round within the step. It stands, at 0, where friction is more than what is left over.
+        `dt_s` is above 0 and at most 1 / `per_s`; that is not checked.
         """
         if speed_mm_s < 0.0:
             braking = self._acceleration(pull_mm_s2, speed_mm_s, -1.0)

@@ -210,10 +210,10 @@ class _Reading:
                 self.header.update(known.metadata)
 
     def message(self, sent: Sent) -> None:
-        """Keep a message of `/core`, or compare one of `/ticks` or `/frames` with it; others are passed over.
+        """Keep the entries in a message of `/core`, or compare one of `/ticks` or `/frames` with them, or pass it over.
 
-        The first that differs is noted in `odd`, after which nothing more is compared. Raises RecordingError where no
-        header came before, and UNREADABLE (ValueError among them) for a damaged part.
+        The first that differs is noted in `odd`, after which nothing more is compared. Raises RecordingError where
+        `take` was given no header before, and UNREADABLE (ValueError among them) for a damaged part.
         """
         if not self.header:
             raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read

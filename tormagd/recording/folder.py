@@ -150,8 +150,9 @@ class RecordingFolder:
     def mark_around(self, segment: Path) -> Path:
         """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return its new path.
 
-        Raises ValueError where `segment` is not named as one or not in this folder, and OSError where it cannot be
-        renamed. A failure to mark the one before is passed over.
+        One that is marked stays as it is; it may still be written. Raises ValueError where `segment` is not named as
+        one, or is marked now but not in this folder. Raises OSError where it cannot be renamed. A failure to mark the
+        one before is passed over.
         """
         marked = mark(segment)
         known = self.segments()

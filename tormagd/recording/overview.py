@@ -255,7 +255,8 @@ def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
     """Return the QUANTITIES of a tick or a snapshot in their order; None for what is missing or no number.
 
     NaN stays. A missing `gap_mm` is the sum of `left_mm` and `right_mm`. A missing `gap_setpoint_mm` is
-    `reference_gap_mm`. `duty`, left and right, goes before `left_duty` and `right_duty`.
+    `reference_gap_mm`. `duty`, left and right, goes before `left_duty` and `right_duty`; that it is a pair is not
+    checked.
     """
     get = message.get
     gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))

@@ -208,8 +208,8 @@ class CompiledFirmware:
 def parameters_of(plant: PlantParameters) -> CParameters:
     """Return what the firmware of a plant's device is given at its boot, as the C structure.
 
-    Ways of encoder counts come from screw lead and roller radius, the stall current from `assumed.overcurrent_A`. The
-    serial number is SERIAL_NUMBER for every plant. Nothing is checked here.
+    The mm of an encoder's count come from screw lead and roller radius, the stall current from `assumed.overcurrent_A`.
+    The serial number is SERIAL_NUMBER for every plant. Nothing is checked here.
     """
     return CParameters(
         lead_mm=plant.screw.lead_mm,

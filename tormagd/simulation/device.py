@@ -293,8 +293,8 @@ class MessageDevice:
     def _sensors(self) -> Sensors:
         """Return what the electronics measure now, faults included.
 
-        The carriages' encoders count from the firmware's last boot, the handle's from power-on. End switches follow the
-        carriages' true places. Force is the sensor's reading, N, the temperature the element's, Celsius.
+        Encoders are in counts, the carriages' from the firmware's last boot, the handle's from power-on. End switches
+        follow the carriages' true places. Force is the sensor's reading, N, the temperature the element's, Celsius.
         """
         plant, struck = self.plant, self._struck
         left_m, right_m = plant.left.position_m, plant.right.position_m

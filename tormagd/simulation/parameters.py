@@ -307,9 +307,9 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
     """Read a plant by the name of a packaged one (`sample_1`), or from a TOML file; a packaged name goes first.
 
     A file with `carriages` states only a pad or the second plant's element. All other parts are those of the plant that
-    it names, packaged or a file. Raises PlantError for a missing or unreadable file, bad TOML, and unknown or missing
-    keys. Values that are not finite, out of range, or contradict each other raise PlantError, too. Whether its motion
-    and force can be simulated is seen when a `Plant` is made.
+    it names, packaged or a file by its path from the working directory. Raises PlantError for a missing or unreadable
+    file, bad TOML, and unknown or missing keys. Values that are not finite, out of range, or contradict each other
+    raise PlantError, too. Whether its motion and force can be simulated is seen when a `Plant` is made.
     """
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)

@@ -153,7 +153,10 @@ class SecondElement:
         return force_N, age_s, springs_mm
 
     def _magnetised_mT(self, gap_mm: float) -> float:
-        """Move the plays to the field at `gap_mm`, and return that field with their hysteresis, mT."""
+        """Move the plays to the field at `gap_mm`, and return that field with their hysteresis, mT.
+
+        A gap of 0 raises ZeroDivisionError; less, and NaN, are not refused.
+        """
         second = self._second
         field_mT = shaft_field_mT(gap_mm, self._plant, second.concentration)
         found_mT = field_mT

@@ -45,8 +45,8 @@ def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
     """Return the attraction between the magnets at a gap, N, >= 0: the closed form in air times the factor for the iron
     shaft.
 
-    A float gives a float, an array one of its shape. Raises DomainError for a gap, mm, or for magnets, as
-    `attraction_N` and `CuboidMagnet` do.
+    A float gives a float, an array one of its shape. Raises DomainError for a gap outside 0.01 mm to 50 times the
+    magnets' shortest edge, and for magnets as `CuboidMagnet` does.
     """
     return plant.assumed.attraction_factor * attraction_N(gap_mm, _magnet(plant))
 

@@ -140,9 +140,9 @@ class Believe:
         return self.zero.sd_N(now_s) <= self._unknown_sd_N
 
     def learned(self) -> Learned:
-        """Return what is known of this device, to `teach` on another day.
+        """Return what is known of this device now, to `teach` on another day.
 
-        In a dispute, scale and offset are those from before it.
+        The fit is that of `strength`, without a dispute's `lead_N`; UNSEEN itself for a device that has shown nothing.
         """
         slow = self.slow
         return Learned(self.strength.fit, slow.factor, slow.learned, self.zero.zero_N, self.carriages.lag_s)
@@ -151,7 +151,7 @@ class Believe:
         """Replace all that is known of the device by `learned`, and begin its estimators anew.
 
         Until the handle has slid, the device may still be another one. The element's memory and the watch on the
-        encoder stay.
+        encoder stay. Nothing is checked.
         """
         self.strength.forget(learned.device)
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()

@@ -188,8 +188,8 @@ class SensorTrust:
     def confirm(self, wrong: Disputed) -> None:
         """Take the operator's word in a dispute. Call it in a dispute only.
 
-        `device`: the dispute ends, and none begins before LEARNS_S of sliding. `sensor`: the sensor counts as wrong
-        until its readings agree for TRUSTED_AGAIN_S.
+        `device`: the dispute ends, and the next takes LEARNS_S of sliding, or readings that no device gives. `sensor`:
+        the sensor counts as wrong, and the dispute lasts, until readings agree for TRUSTED_AGAIN_S or longer.
         """
         if wrong == "device":
             self._settle()

@@ -98,8 +98,9 @@ class SlowFriction:
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within `believable`.
 
-        `reading_N` is the force against the motion, less the sensor's zero. A force below what any device gives teaches
-        nothing. The force of `fit` at `followed_N` must be above 0 N.
+        Call it behind `follow`. `reading_N` is the force against the motion, less the sensor's zero. A force below what
+        any device gives teaches nothing. That the handle creeps, and the force of `fit` at `followed_N` is above 0 N,
+        is not checked.
         """
         if reading_N < self._bounds.min_scale * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
             return

@@ -94,10 +94,11 @@ def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit:
 
 
 def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit:
-    """Return the best fit of a law of `shape` with up to `terms` terms, which is not checked.
+    """Return the best fit of a law with up to `terms` terms, each of which has the stress `shape`, to a curve.
 
-    It is searched from the best _STARTS points of a grid of exponents, and no worse than any of them. Raises LabError
-    and DomainError as `fit_ogden`.
+    `shape` takes stretches and an exponent, and returns stress over modulus. It is searched from the best _STARTS
+    points of a grid of exponents. Raises LabError and DomainError for a curve that `fit_ogden` refuses; `terms` is not
+    checked.
     """
     _check(stretch, stress_Pa, 2 * terms + 1)
 

@@ -190,9 +190,10 @@ def _drawn(data: Dataset) -> Array:
 def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: int, seed: int) -> ForceModel:
     """Return a network that rises with the field everywhere, fitted to `forces_N` (n) at `rows` (n x 4).
 
-    Its size and scaling are of `metadata`. It takes `epochs` steps at most; whether the fit settled is not checked.
-    Least squares over the weights, by Newton's method with the Jacobian's normal equations. The weights of the field
-    and of the output are positive, because their logarithms are what is sought.
+    The columns of `rows` are FEATURES, unscaled, in UNITS. Size and scaling are of `metadata`. It takes `epochs` steps
+    at most; whether the fit settled is not checked. Least squares over the weights, by Newton's method with the
+    Jacobian's normal equations. The weights of the field and of the output are positive, because their logarithms are
+    what is sought.
     """
     scaling, hidden = metadata.scaling, metadata.hidden
     inputs = scaling.scaled(rows)
