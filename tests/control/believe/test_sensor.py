@@ -10,6 +10,7 @@ from tormagd.control.believe.freshness import FROZEN_S
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.sensor import (
     AGREES_S,
+    DRIFTS_S,
     EXCUSED_N,
     MOVED_N,
     RELAXED,
@@ -164,6 +165,18 @@ def test_a_step_ends_no_dispute(core, known, hear, moving) -> None:
     hear(known, 0.3, moving(force_N=MODEL_N - 0.14))
     known.believe.handle = HandleWatch()  # the handle has gone on
     assert hear(known, 1.0, moving(force_N=core.portrait.force_N_at(70.0) - 0.14, **CLOSER)).believe.sensor.is_disputed
+
+
+def test_readings_that_left_slowly_have_to_agree_for_ten_seconds_and_no_longer(known, hear, moving) -> None:
+    reading_N = MODEL_N
+    while not known.believe.sensor.is_disputed:  # as much as an elastomer may win back, for half a minute
+        reading_N += 0.0014
+        hear(known, 0.1, moving(force_N=reading_N))
+        if known.believe.sensor.leaves_s > 2.0 * DRIFTS_S:
+            hear(known, 0.3, moving(force_N=reading_N + 0.4))
+    agreeing_N = force_N(known.believe) - known.believe.sensor.lead_N
+    assert hear(known, 0.9 * DRIFTS_S, moving(force_N=agreeing_N)).believe.sensor.is_disputed
+    assert not hear(known, 0.2 * DRIFTS_S, moving(force_N=agreeing_N)).believe.sensor.is_disputed
 
 
 def test_a_fit_that_swings_is_the_same_device_still(known, hear, moving) -> None:

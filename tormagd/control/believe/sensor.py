@@ -48,6 +48,8 @@ SLOWEST_S: Final = 900.0
 AGREES_N: Final = 0.06
 AGREES_S: Final = 0.2
 "Readings within AGREES_N of the fit for so long agree with it."
+DRIFTS_S: Final = 10.0
+"So long they have to agree at most, however slowly they have left the fit."
 NAMED_S: Final = 0.1
 "A dispute is reported once it has lasted for longer."
 RISES_N_S: Final = 2.0
@@ -231,7 +233,7 @@ class SensorTrust:
 
         With `is_strange` no device gives such readings: after WRONG_S of them the sensor is doubted, in a dispute. A
         dispute ends once readings have agreed for AGREES_S, of a doubted sensor for TRUSTED_AGAIN_S. They have to agree
-        for longer than a reading that drifts on as it did would. In a dispute `lead_N` follows readings above the fit,
+        for longer than a reading that drifts on as it did would, DRIFTS_S at most. In a dispute `lead_N` follows readings above the fit,
         by RISES_N_S at most; it returns to 0 for others, and for a doubted sensor.
         """
         agrees = not is_strange and abs(over_N) <= AGREES_N
@@ -249,7 +251,8 @@ class SensorTrust:
         wanted_N = 0.0 if is_strange or self.is_doubted else max(over_N, 0.0)
         change_N = low_pass(self.lead_N, wanted_N, dt_s, LEADS_S) - self.lead_N
         self.lead_N += min(max(change_N, -RISES_N_S * dt_s), RISES_N_S * dt_s)
-        if self.agreed_s > max(TRUSTED_AGAIN_S if self.is_doubted else AGREES_S, 2.0 * self.leaves_s):
+        least_s = TRUSTED_AGAIN_S if self.is_doubted else AGREES_S
+        if self.agreed_s > max(least_s, min(2.0 * self.leaves_s, DRIFTS_S)):
             self._settle()
 
     def _settle(self) -> None:
