@@ -19,7 +19,7 @@ from mcap.writer import Writer
 from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
 from tormagd.assembly.build import Core
-from tormagd.assembly.journal import ANSWER, CONFIRM, MISSING
+from tormagd.assembly.journal import ANSWER, CONFIRM, FORMAT, MISSING
 from tormagd.config import Config, Device
 from tormagd.control.records import TimedSetpoint
 from tormagd.keeping import Part
@@ -36,7 +36,7 @@ CHANGED_TICK = 3_210
 TICKS = 4_000
 ROOT = Path(__file__).parents[2]
 FORMER = (
-    f"format = '4', written by tormagd {__version__!r}: allowed is 10, which tormagd {__version__} writes; "
+    f"format = '4', written by tormagd {__version__!r}: allowed is {FORMAT}, which tormagd {__version__} writes; "
     "replay it with the version that wrote it"
 )
 NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]
