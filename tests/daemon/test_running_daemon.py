@@ -600,7 +600,7 @@ def test_a_scene_is_changed_while_disabled_and_the_device_stays_homed(armed: Run
 def test_a_scene_that_needs_higher_rates_is_refused_with_where_they_are_stated(running: Running) -> None:
     running.start(Rates(inference_hz=83))
     running.until(lambda status: not status["is_busy"], "at rest")
-    error = running.scene("pulse")["scene_change"]["error"]
+    error = running.scene("cardiovascular")["scene_change"]["error"]
     assert "rates.inference_hz = 83" in error["cause"]
     assert "state [rates], or start with that scene" in error["remedy"]
 
