@@ -233,8 +233,8 @@ class SensorTrust:
 
         With `is_strange` no device gives such readings: after WRONG_S of them the sensor is doubted, in a dispute. A
         dispute ends once readings have agreed for AGREES_S, of a doubted sensor for TRUSTED_AGAIN_S. They have to agree
-        for longer than a reading that drifts on as it did would, DRIFTS_S at most. In a dispute `lead_N` follows readings above the fit,
-        by RISES_N_S at most; it returns to 0 for others, and for a doubted sensor.
+        for longer than a reading that drifts on as it did would, but not over DRIFTS_S. In a dispute `lead_N` follows
+        readings above the fit, by RISES_N_S at most; it returns to 0 for others, and for a doubted sensor.
         """
         agrees = not is_strange and abs(over_N) <= AGREES_N
         self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
