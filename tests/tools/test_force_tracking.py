@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import envelope
+import force_tracking
 import numpy as np
 import pytest
 from force_tracking import (
@@ -34,6 +35,14 @@ from tormagd.physics.inserts import INSERTS, insert
 from tormagd.simulation.parameters import load_plant
 
 BEGINS_S, IDEAL_S = 4.0, 0.9
+
+
+@pytest.mark.parametrize(("named", "measured"), [([], force_tracking.CASES), (["pulse", "steps"], ("steps", "pulse"))])
+def test_without_a_name_every_case_is_measured(monkeypatch: pytest.MonkeyPatch, capsys, named, measured) -> None:
+    monkeypatch.setattr(force_tracking, "measure", lambda case, draws, pool: {"of": [case]})
+    monkeypatch.setattr("sys.argv", ["force_tracking.py", "--json", *named])
+    assert force_tracking.main() == 0
+    assert tuple(json.loads(capsys.readouterr().out)) == measured
 
 
 def course(*errors: tuple[float, float, float]) -> Followed:
