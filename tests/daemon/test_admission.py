@@ -246,7 +246,7 @@ def test_nobody_else_is_let_in_and_everybody_is_counted(
     assert rig.reasons() == {(name, reason, key): 5}
     assert not any(peer.poll(5) for peer in peers)
     assert rig.answered == []
-    assert (rig.endpoint.inbox.accepted, rig.endpoint.inbox.refused, rig.endpoint.inbox.oversize) == (0, 0, 0)
+    assert (rig.endpoint.inbox.accepted, rig.endpoint.inbox.refused, rig.endpoint.admission.oversize) == (0, 0, 0)
     for report in rig.endpoint.report().refusals:
         # whoever left at once has taken his address with him
         if rig.addresses[name].startswith("tcp"):

@@ -209,7 +209,7 @@ def test_an_oversize_message_is_counted_when_its_peer_comes_back(rig: Rig) -> No
     publisher = rig.publisher()
     rig.look()
     publisher.send(b"\x00" * 10_000_000)
-    rig.until(lambda: rig.endpoint.inbox.oversize > 0, rig.look)
+    rig.until(lambda: rig.endpoint.admission.oversize > 0, rig.look)
     assert rig.endpoint.inbox.accepted == 0
     numbers = itertools.count(1)
 
@@ -219,7 +219,7 @@ def test_an_oversize_message_is_counted_when_its_peer_comes_back(rig: Rig) -> No
 
     rig.until(is_heard_again)
     rig.look()
-    assert (rig.endpoint.inbox.oversize, rig.endpoint.inbox.refused) == (1, 0)
+    assert (rig.endpoint.admission.oversize, rig.endpoint.inbox.refused) == (1, 0)
 
 
 SHORT_SEND = """
@@ -245,7 +245,7 @@ def test_publishers_that_come_and_go_quickly_were_not_cut_off(rig: Rig) -> None:
 
         rig.until(is_heard)
         process.communicate()
-    assert rig.endpoint.inbox.oversize == 0
+    assert rig.endpoint.admission.oversize == 0
 
 
 # -- telemetry and recording ---------------------------------------------------------------------------------------

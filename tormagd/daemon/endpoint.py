@@ -184,9 +184,7 @@ class Endpoint:
         return most
 
     def tell(self, now_s: float) -> None:
-        """Log the newly refused and dropped messages, a line of each at most in 10 s, and update the inbox's count of
-        oversize ones."""
-        self.inbox.oversize = self.admission.oversize
+        """Log the newly refused and dropped messages, a line of each at most in 10 s."""
         self._drops.tell(now_s)
         self.admission.refusals.tell(now_s)
 

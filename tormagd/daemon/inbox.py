@@ -116,7 +116,6 @@ class SetpointInbox:
         self.accepted = 0
         self.refused = 0
         self.dropped = 0
-        self.oversize = 0
         self.last_refusal: str | None = None
         self.playout = Playout()
         self._needs = Needs()
@@ -237,19 +236,20 @@ class SetpointInbox:
             if source.refresh(now_s):
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
-    def report(self, now_s: float) -> SetpointReport:
+    def report(self, now_s: float, oversize: int = 0) -> SetpointReport:
         """Return counts, the last refusal, and each source's `seq`, with full reports on the holder and the newest
         others.
 
         There are REPORTED full reports at most, the holder's first. At `now_s` a source is stale or not, and silent for
-        so long. Delays and the judgement of a clock are those of the source's last `refresh`.
+        so long. Delays and the judgement of a clock are those of the source's last `refresh`. `oversize` messages never
+        come here; it is reported as it is.
         """
         newest = sorted(self._sources, key=lambda name: (name != self.hold.source, -self._sources[name].heard_s))
         return SetpointReport(
             accepted=self.accepted,
             refused=self.refused,
             dropped=self.dropped,
-            oversize=self.oversize,
+            oversize=oversize,
             last_refusal=self.last_refusal,
             newest_source=self.hold.source,
             sources={name: source.sequence.seq for name, source in self._sources.items()},
