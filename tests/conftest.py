@@ -8,6 +8,7 @@ failure.
 
 import asyncio
 import contextlib
+import ctypes
 import inspect
 import os
 import signal
@@ -20,6 +21,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from machines.host import HostWatch
 
+from firmware_protocol.c.build import BuildError, compiler, load_library
 from tormagd.slices import ask_for_slices
 
 # No test asserts a wall-clock duration, so none fails because the machine is slow. One commit has one verdict: a
@@ -45,6 +47,21 @@ def recordings() -> Path:
     if not folder.is_dir():
         pytest.skip("no measured data: set TORMAG_DATA to its folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def c_compiler() -> str:
+    try:
+        return compiler()
+    except BuildError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def library(c_compiler: str) -> ctypes.CDLL:
+    """The firmware's C sources as a shared library. What does not compile fails the test; only a missing compiler
+    skips it."""
+    return load_library()
 
 
 @pytest.fixture

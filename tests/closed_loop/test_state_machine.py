@@ -12,7 +12,6 @@ import pytest
 from hypothesis import event, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
-from firmware_protocol.c.build import BuildError, load_library
 from firmware_protocol.codec import (
     FUNCTION,
     Clear,
@@ -345,14 +344,6 @@ class Together(RuleBasedStateMachine):
         if not self.open_by:
             self.open_by = now + ((OPEN_MM - gap_mm) / 2.0 / UNHOMED_MM_S * 1e3 + TURNED_MS) / SLOWEST
         assert now <= max(self.open_by, self.reset + RECONNECTED_MS), f"{gap_mm:.1f} mm, not open in time: {self.mode}"
-
-
-@pytest.fixture
-def library() -> None:
-    try:
-        load_library()
-    except BuildError as error:
-        pytest.skip(str(error))
 
 
 @pytest.mark.long

@@ -1,29 +1,14 @@
-"""The firmware's C sources, built for this machine; tests that need them skip where there is no C compiler."""
+"""The firmware's C sources under sanitizers; tests that need them skip where the C compiler has none."""
 
-import ctypes
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from firmware_protocol.c.build import BuildError, Target, build, compiler, load_library
+from firmware_protocol.c.build import Target, build
 
 Exchange = Callable[[list[str]], list[str]]
-
-
-@pytest.fixture(scope="session")
-def c_compiler() -> str:
-    try:
-        return compiler()
-    except BuildError as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="session")
-def library(c_compiler: str) -> ctypes.CDLL:
-    """The sources as a shared library. What does not compile fails the test; only a missing compiler skips it."""
-    return load_library()
 
 
 @pytest.fixture(scope="session")
