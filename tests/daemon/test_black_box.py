@@ -102,8 +102,12 @@ def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) 
     _, part = rig.heard()
     assert names(part)[:6] == ["state", "wrote", "step", "tick", "read", "wrote"]
     state, (_, time_s, sent, unsent), *_ = msgspec.msgpack.decode(part.entries)
-    assert state[3]["stream"] == plain(FrameStream())
-    assert (time_s, sent, unsent) == (1e-3, [FrameStream().pack(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255))], 0)
+    assert (state[3]["stream"], time_s, sent, unsent) == (
+        plain(FrameStream()),
+        1e-3,
+        [FrameStream().pack(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255))],
+        0,
+    )
 
 
 def test_what_the_other_process_does_not_take_is_counted_and_control_goes_on(rig: Rig) -> None:

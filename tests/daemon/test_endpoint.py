@@ -1,7 +1,9 @@
 """The daemon's sockets, real ones: setpoints in, telemetry out, commands answered, and hostile peers survived."""
 
+import contextlib
 import itertools
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -156,9 +158,8 @@ class Rig:
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path)
-    yield made
-    made.close()
+    with contextlib.closing(Rig(tmp_path)) as made:
+        yield made
 
 
 def setpoint(seq: int, force_N: float = 1.0) -> bytes:
@@ -313,8 +314,7 @@ def test_a_command_is_answered_or_refused_with_code_message_and_hint(rig: Rig, k
     client.send(encode(Request(v=VERSION, id="x7", command="status")))
     assert rig.serve(client, answer) == Reply(v=VERSION, id="x7", ok=True, result={"command": "status"})
     client.send(command("enable", 3))
-    why = ErrorReply("busy", "homing", "wait")
-    assert rig.serve(client, answer) == Reply(v=VERSION, id=3, ok=False, error=why)
+    assert rig.serve(client, answer) == Reply(v=VERSION, id=3, ok=False, error=ErrorReply("busy", "homing", "wait"))
 
 
 @pytest.mark.parametrize(
@@ -335,8 +335,7 @@ def test_garbage_is_answered_with_bad_request(rig: Rig, data: bytes) -> None:
     client = rig.connect(zmq.DEALER, "control")
     client.send(data)
     reply = rig.serve(client, never)
-    assert (reply.id, reply.ok) == (None, False)
-    assert reply.error.code == "bad_request"
+    assert (reply.id, reply.ok, reply.error.code) == (None, False, "bad_request")
     assert rig.is_answered()
 
 
@@ -463,8 +462,7 @@ def test_a_publisher_that_sends_too_much_is_dropped_unread_and_named(rig: Rig) -
     # once a burst's worth has been sent faster than the rate, which any machine can
     rig.until(is_dropped)
     assert rig.endpoint.inbox.accepted >= SETPOINT_BURST - 1
-    assert rig.endpoint.inbox.refused == 0
-    assert rig.drops() == [("setpoint", OURSELVES, "", "sent too much")]
+    assert (rig.endpoint.inbox.refused, rig.drops()) == (0, [("setpoint", OURSELVES, "", "sent too much")])
 
 
 def test_a_client_that_asks_too_much_is_dropped_and_others_are_answered(rig: Rig) -> None:
@@ -502,16 +500,11 @@ def test_a_subscriber_that_says_too_much_is_cut_off_and_named_and_may_come_back(
 
 
 def test_an_address_that_cannot_be_bound_is_named(tmp_path: Path) -> None:
-    taken = zmq.Context()
-    holder = taken.socket(zmq.PUB)
-    address = f"tcp://127.0.0.1:{holder.bind_to_random_port('tcp://127.0.0.1')}"
-    try:
-        with pytest.raises(
-            OSError, match=f"^endpoints.setpoint = '{address}': cannot be bound: Address already in use"
-        ):
+    with zmq.Context() as context, context.socket(zmq.PUB) as holder:
+        address = f"tcp://127.0.0.1:{holder.bind_to_random_port('tcp://127.0.0.1')}"
+        said = f"^endpoints.setpoint = '{address}': cannot be bound: Address already in use"
+        with pytest.raises(OSError, match=said):
             Endpoint(Endpoints(setpoint=address))
-    finally:
-        taken.destroy(linger=0)
 
 
 def test_a_second_daemon_takes_nothing_from_the_first_and_names_it(rig: Rig, tmp_path: Path) -> None:
@@ -522,9 +515,8 @@ def test_a_second_daemon_takes_nothing_from_the_first_and_names_it(rig: Rig, tmp
     config.write_text("[endpoints]\n" + "".join(f'{name} = "{address}"\n' for name, address in rig.addresses.items()))
     second = [sys.executable, "-m", "tormagd.daemon.main", "--config", str(config)]
     ended = subprocess.run(second, capture_output=True, text=True, check=False, timeout=60.0)
-    assert ended.returncode == 1
-    assert ended.stderr.splitlines()[-1].startswith("tormagd: endpoints.setpoint = 'ipc://")
-    assert f": already running, pid {os.getpid()}; end it, or name other" in ended.stderr
+    said = rf"tormagd: endpoints.setpoint = 'ipc://.*: already running, pid {os.getpid()}; end it, or name other"
+    assert (ended.returncode, bool(re.match(said, ended.stderr.splitlines()[-1]))) == (1, True), ended.stderr
     assert rig.is_answered()
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_socket()) == sorted(rig.addresses)
 
@@ -544,9 +536,8 @@ def test_closing_leaves_nothing_and_what_a_killed_daemon_left_is_replaced(tmp_pa
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(folder / "control"))
     (folder / "control.lock").write_text("4194304999\n")
-    made = Rig(folder)
-    assert made.is_answered()
-    made.close()
+    with contextlib.closing(Rig(folder)) as made:
+        assert made.is_answered()
     assert list(folder.iterdir()) == []
 
 

@@ -125,9 +125,9 @@ def test_a_law_of_the_handles_way_is_taken_and_refused_by_name_for_a_pad(publish
 def test_a_contact_out_of_range_is_refused_by_name(
     publishing: Publishing, name: str, value: float, allowed: str
 ) -> None:
-    assert not publishing.send(1, contact={"handle_mm": 1.0, "stiffness_N_mm": 0.5} | {name: value})
+    is_newest = publishing.send(1, contact={"handle_mm": 1.0, "stiffness_N_mm": 0.5} | {name: value})
     assert f"contact.{name} = {value!r}: allowed is {allowed}" in str(publishing.inbox.last_refusal)
-    assert publishing.inbox.newest is None
+    assert (is_newest, publishing.inbox.newest) == (False, None)
 
 
 def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over(publishing: Publishing) -> None:
@@ -150,17 +150,19 @@ def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over
     ],
 )
 def test_what_is_listed_goes_before_what_comes_later_or_is_not(holder: str, other: str, passed: bool) -> None:
-    assert is_passed(Hold(holder), other, PRIORITY, is_stale=False) == passed
-    assert is_passed(Hold(holder), other, PRIORITY, is_stale=True)
-    assert not is_passed(Hold(holder, is_given=True), other, PRIORITY, is_stale=False)
-    assert not is_passed(Hold(holder), other, (), is_stale=False)
+    found = {
+        "while it is fresh": is_passed(Hold(holder), other, PRIORITY, is_stale=False),
+        "once it is stale": is_passed(Hold(holder), other, PRIORITY, is_stale=True),
+        "where it was given the brake": is_passed(Hold(holder, is_given=True), other, PRIORITY, is_stale=False),
+        "where nobody is listed": is_passed(Hold(holder), other, (), is_stale=False),
+    }
+    assert list(found.values()) == [passed, True, False, False], found
 
 
 def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is_stale(
     publishing: Publishing, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert publishing.send(1, 1.0, "a")
-    assert not publishing.send(1, 2.0, "b", at_s=0.04)
+    assert (publishing.send(1, 1.0, "a"), publishing.send(1, 2.0, "b", at_s=0.04)) == (True, False)
     assert (publishing.counters(), publishing.force_N) == ((1, 1, 0), 1.0)
     assert publishing.send(2, 1.0, "a")
     assert publishing.newest.limits == (Limit.OTHER_SOURCE,)
@@ -190,8 +192,7 @@ def test_a_limit_that_is_over_is_over(publishing: Publishing) -> None:
 
 def test_a_source_that_is_late_itself_takes_nothing_over(publishing: Publishing) -> None:
     publishing.send(1, 1.0, "a")
-    assert not publishing.send(1, 2.0, "b", 0.06, at_s=0.2)
-    assert publishing.inbox.hold.source == "a"
+    assert (publishing.send(1, 2.0, "b", 0.06, at_s=0.2), publishing.inbox.hold.source) == (False, "a")
 
 
 def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None:
@@ -205,8 +206,7 @@ def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None
     assert publishing.passed_over() == (("b", 7), None)
     newest = publishing.newest
     assert (newest.force_N, newest.holder, newest.limits) == (2.0, 1, ())
-    assert not publishing.send(2, 1.0, "a")
-    assert publishing.send(8, 2.1, "b")
+    assert (publishing.send(2, 1.0, "a"), publishing.send(8, 2.1, "b")) == (False, True)
     publishing.now_s = 0.2
     with pytest.raises(RefusedError, match="source 'a' has sent nothing that is still valid"):
         publishing.inbox.give("a", publishing.now_s)
@@ -229,11 +229,9 @@ def test_two_publishers_of_one_name_do_not_alternate_on_the_brake(publishing: Pu
 def test_why_it_is_stale_is_said(publishing: Publishing) -> None:
     publishing.send(1)
     publishing.now_s = 0.3
-    silent = publishing.inbox.told(publishing.now_s)[Limit.STALE]
-    publishing.send(2, 1.0, "a", 0.12)
-    late = publishing.inbox.told(publishing.now_s)[Limit.STALE]
-    assert silent.cause.startswith("'a' has sent nothing for 300 ms")
-    assert late.cause.startswith("setpoints of 'a' come 120 ms late, and are valid for 50 ms")
+    for says in ("'a' has sent nothing for 300 ms", "setpoints of 'a' come 120 ms late, and are valid for 50 ms"):
+        assert publishing.inbox.told(publishing.now_s)[Limit.STALE].cause.startswith(says)
+        publishing.send(2, 1.0, "a", 0.12)
 
 
 # -- clocks --------------------------------------------------------------------------------------------------------
@@ -266,8 +264,7 @@ def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(
 
 
 def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock(publishing: Publishing) -> None:
-    assert not publishing.send(1, 2.0, "a", -AHEAD_S - 0.001)
-    assert publishing.counters() == (0, 1, 0)
+    assert (publishing.send(1, 2.0, "a", -AHEAD_S - 0.001), publishing.counters()) == (False, (0, 1, 0))
     with pytest.raises(RefusedError, match="nothing that is still valid"):
         publishing.inbox.give("a", publishing.now_s)
     assert "51 ms ahead" in str(publishing.inbox.last_refusal)
@@ -296,8 +293,7 @@ def test_stamps_in_another_unit_are_refused_by_name_and_take_no_brake(
     assert (publishing.inbox.hold.source, publishing.inbox.newest) == ("", None)
     found = publishing.of("a")
     assert (found.cause, found.clock_behind_ms) == (f"its stamps count {unit}, and are refused", None)
-    assert publishing.send(30, 1.5, "a")
-    assert publishing.of("a").clock_behind_ms == 0.0
+    assert (publishing.send(30, 1.5, "a"), publishing.of("a").clock_behind_ms) == (True, 0.0)
 
 
 def test_a_clock_that_was_never_set_is_corrected_and_named(publishing: Publishing) -> None:
@@ -360,8 +356,7 @@ def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> No
         publishing.now_s += 0.01
     assert len(publishing.inbox.report(publishing.now_s).sources) == SOURCES
     assert publishing.inbox.accepted + publishing.inbox.refused == 2_000
-    assert publishing.send(1, 1.5, "patient")
-    assert publishing.inbox.hold.source == "patient"
+    assert (publishing.send(1, 1.5, "patient"), publishing.inbox.hold.source) == (True, "patient")
 
 
 @pytest.mark.parametrize(
@@ -390,8 +385,11 @@ def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> No
 def test_a_refused_setpoint_changes_nothing_but_the_counter(publishing: Publishing, fields: dict[str, Any]) -> None:
     publishing.send(1, 1.0)
     before = publishing.inbox.newest
-    assert not publishing.send(2, **fields)
-    assert (publishing.inbox.newest is before, publishing.counters()) == (True, (1, 1, 0))
+    assert (publishing.send(2, **fields), publishing.inbox.newest is before, publishing.counters()) == (
+        False,
+        True,
+        (1, 1, 0),
+    )
     assert str(next(iter(fields))) in str(publishing.inbox.last_refusal)
     assert publishing.send(2, 1.1)
 
@@ -436,9 +434,8 @@ def test_every_message_is_counted_once_and_no_source_takes_the_brake_from_one_th
         is_newest = publishing.send(seq, force_N, source, age_s, session=session)
         assert is_newest == (publishing.inbox.newest is not before)
         if is_newest:
-            assert publishing.force_N == force_N
+            assert (publishing.force_N, publishing.inbox.hold.source) == (force_N, source)
             assert publishing.newest.stamp_s <= publishing.now_s
-            assert publishing.inbox.hold.source == source
             if before is not None and held != source:
                 assert publishing.now_s - before.stamp_s > before.valid_for_s
                 assert publishing.newest.holder == before.holder + 1

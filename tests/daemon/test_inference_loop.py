@@ -41,8 +41,7 @@ class Rig:
     def beat(self, beats: int = 1, *, is_asked: bool = False) -> None:
         """So many beats are over, the last of which runs."""
         self.due_ns += beats * TICK_NS
-        beat = Beat(self.due_ns, self.due_ns, beats - 1)
-        self.loop.plan(beat, None, is_asked=is_asked, is_followed=True)
+        self.loop.plan(Beat(self.due_ns, self.due_ns, beats - 1), None, is_asked=is_asked, is_followed=True)
 
 
 @pytest.fixture

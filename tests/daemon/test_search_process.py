@@ -29,8 +29,7 @@ PATIENCE_S = 60.0
 def core(tmp_path_factory: pytest.TempPathFactory) -> Core:
     """A tenth of the thesis's fields: how fine they are does not matter here, and each is a pass of torch."""
     scene = tmp_path_factory.mktemp("scenes") / "thesis.toml"
-    text = SHIPPED.read_text(encoding="utf-8").replace("step_mT = 1.0", "step_mT = 10.0")
-    scene.write_text(text, encoding="utf-8")
+    scene.write_text(SHIPPED.read_text(encoding="utf-8").replace("step_mT = 1.0", "step_mT = 10.0"), encoding="utf-8")
     return build_core(Config(rates=Rates(inference_hz=250), scene=str(scene)))
 
 

@@ -215,8 +215,11 @@ def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(presen
     is_driven = present in (OperatingState.ENABLED, OperatingState.PAUSED)
     published = telemetry(MEASUREMENT, SafetyState(present))
     assert bool(limits_held(SafetyState(present), OUTPUT, PLAN)) == is_driven
-    assert (published.governed_cf, published.setpoint_cf) == (1.4 if is_driven else None, 1.5)
-    assert (published.field_mT is None) == (not is_driven)
+    assert (published.governed_cf, published.setpoint_cf, published.field_mT is not None) == (
+        1.4 if is_driven else None,
+        1.5,
+        is_driven,
+    )
 
 
 # -- the way of a setpoint, part by part; what comes of it in a closed loop: tests/closed_loop/test_sources.py ---------

@@ -86,8 +86,7 @@ def test_what_only_makes_it_late_or_concerns_others_holds_nothing(core: Core, li
 
 
 def test_the_ceiling_holds_what_is_beyond_it_and_not_what_it_lets_pass(core: Core) -> None:
-    floor_mm = core.portrait.gap_mm_at(STRONG.model_N(1.6))
-    held = {"min_gap_mm": floor_mm, "limits": (Limit.CEILING,)}
+    held = {"min_gap_mm": core.portrait.gap_mm_at(STRONG.model_N(1.6)), "limits": (Limit.CEILING,)}
     assert found(core, plan(1.8, **held)) == (CANNOT, None, ("CEILING",))
     assert found(core, plan(1.5, **held)).outcome == ARRIVES
 
@@ -96,8 +95,7 @@ def test_the_models_range_holds_where_its_field_was_not_followed(core: Core) -> 
     assert FEATURES[2] == FIELD
     limits = (Limit.MODEL_RANGE,)
     assert found(core, plan(1.5, limits, outside=(Outside("rate_mm_s", 300.0, 84.0),))).outcome == ARRIVES
-    held = plan(1.5, limits, outside=(Outside(FIELD, 120.0, 100.0),))
-    assert found(core, held) == (CANNOT, None, ("MODEL_RANGE",))
+    assert found(core, plan(1.5, limits, outside=(Outside(FIELD, 120.0, 100.0),))) == (CANNOT, None, ("MODEL_RANGE",))
 
 
 @pytest.mark.parametrize("state", [OperatingState.DISABLED, OperatingState.PAUSED, OperatingState.FAULT])
