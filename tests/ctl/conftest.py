@@ -296,8 +296,7 @@ def ctl(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
 
     def run(*arguments: str) -> Ran:
         capsys.readouterr()
-        code = main(list(arguments))
-        return Ran(code, *capsys.readouterr())
+        return Ran(main(list(arguments)), *capsys.readouterr())
 
     return run
 

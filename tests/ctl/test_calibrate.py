@@ -302,8 +302,7 @@ class Played:
 
 def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, tmp_path, monkeypatch, ctl):
     monkeypatch.setattr(ctl_calibrate_motors, "armed", lambda *_: contextlib.nullcontext(Played(ticks(300))))
-    rates = status_with()["rates"]
-    slow = {name: rate | {"hz": 500.0} for name, rate in rates.items()}
+    slow = {name: rate | {"hz": 500.0} for name, rate in status_with()["rates"].items()}
     fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0, rates=slow)
     out = tmp_path / "right.csv"
     arguments = [*fake_daemon.at, "--json", "calibrate", "--yes", "--motors", "--side", "right"]
@@ -311,8 +310,11 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, t
     fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0)
     assert ctl(*arguments, "--out", str(out)).ended(0).result["rows"] == 299
     head, _, second, *_ = csv.reader(out.read_text().splitlines())
-    assert head == ["t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm"]
-    assert (float(second[0]), float(second[2])) == (0.001, 30.0)
+    assert (head, float(second[0]), float(second[2])) == (
+        ["t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm"],
+        0.001,
+        30.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -427,8 +429,7 @@ def test_the_steps_that_are_run_are_numbered_one_by_one(monkeypatch, tmp_path, c
         yield from ()
         return []
 
-    steps = [step._replace(course=finds_nothing) for step in STEPS]
-    monkeypatch.setattr(ctl_commission, "STEPS", steps)
+    monkeypatch.setattr(ctl_commission, "STEPS", [step._replace(course=finds_nothing) for step in STEPS])
     run = SimpleNamespace(progress=Progress(), follow=lambda course: next(course, None))
     kept = ctl_commission.Kept(tmp_path / "7.json", begun(None, 7, 0, None, Config().motor))
     kept.follow(run, Known(Config(), 1e-3, 0.6, 2.0, None))

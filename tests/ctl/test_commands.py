@@ -573,8 +573,7 @@ def test_a_flank_near_the_gaps_speed_is_told_with_the_tolerance_that_a_weak_devi
     """Its carriages have mass: of recorded pulses the samples miss twice what speed alone does."""
     forces = recording(tmp_path / "f.csv", 0.9, 1.3, 3.0)
     result = ctl("scene", "new", str(tmp_path / "mine.toml"), "--force", str(forces), "--json").ended(0).result
-    told = f"force.tolerance_rms_N = 0.026: it keeps {4.0 * result['missed_rms_N']:.2g}"
-    assert told in result["unmet_if_weak"]
+    assert f"force.tolerance_rms_N = 0.026: it keeps {4.0 * result['missed_rms_N']:.2g}" in result["unmet_if_weak"]
 
 
 @pytest.mark.parametrize(

@@ -120,8 +120,7 @@ async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
         assert sum(then.late_counts) >= len(first.t_s)
         fake_daemon.is_silent = True
         assert (await event(stream, "silence"))["seconds"] >= 0.5
-    assert set(fake_daemon.commands) == {"status", "describe"}
-    assert not fake_daemon.setpoints
+    assert (set(fake_daemon.commands), fake_daemon.setpoints) == ({"status", "describe"}, [])
 
 
 async def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telemetry_with) -> None:
@@ -165,8 +164,7 @@ async def test_a_browser_that_does_not_read_misses_the_oldest_and_holds_nobody_u
 async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Recorded) -> None:
     async with served(recorded) as asks:
         hosts = ("evil.example", "localhost", "127.0.0.1:8733")
-        answers = [await asks.get("/about", headers={"Host": host}) for host in hosts]
-        assert [answer.status for answer in answers] == [403, 200, 200]
+        assert [(await asks.get("/about", headers={"Host": host})).status for host in hosts] == [403, 200, 200]
         assert [(await asks.post(path)).status for path in ("/", "/about", "/frame")] == [405] * 3
         page = await asks.get("/")
         assert page.headers["Content-Security-Policy"].startswith("default-src 'self'")
@@ -242,8 +240,7 @@ def test_every_moment_has_a_frame(recorded: Recorded, at_s: float) -> None:
 async def test_a_moment_that_is_none_is_refused(recorded: Recorded, at_s: str) -> None:
     async with served(recorded) as asks:
         answer = await asks.get("/frame", params={"at_s": at_s})
-        assert answer.status == 400
-        assert "allowed is a finite number" in await answer.text()
+        assert (answer.status, "allowed is a finite number" in await answer.text()) == (400, True)
 
 
 def test_lateness_falls_into_the_bar_that_names_it() -> None:
@@ -261,8 +258,7 @@ def test_the_command_says_where_it_serves_and_ends_in_order(fake_daemon: Any) ->
             said, _ = process.communicate(timeout=60.0)
         finally:
             process.kill()
-    assert process.returncode == 0
-    assert json.loads(said)["ok"]
+    assert (process.returncode, json.loads(said)["ok"]) == (0, True)
 
 
 CHROMIUM = next(

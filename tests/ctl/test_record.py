@@ -107,8 +107,7 @@ def test_a_report_is_one_page_of_one_recording_or_of_two(fake_daemon, tmp_path, 
     other.write_bytes(file.read_bytes().replace(b"tormagd.Tick", b"tormagd.Tack"))
     page = tmp_path / "a.html"
     ctl("report", str(file), "-o", str(page)).ended(0)
-    alone = page.read_text()
-    assert f"{file.name} is whole: all {file.stat().st_size} bytes are as they were written." in alone
+    assert f"{file.name} is whole: all {file.stat().st_size} bytes are as they were written." in page.read_text()
     said = ctl("--json", "report", str(file), str(other), "-o", str(page)).ended(1).result["seals"]
     assert list(said.values()) == ["whole", "altered or damaged"]
     both = page.read_text()

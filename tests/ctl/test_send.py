@@ -188,8 +188,7 @@ def seen(status_with: Any, source_with: Any) -> Any:
         by_source = {} if source is None else {"me": source_with(**source)}
         setpoints = status_with()["setpoints"] | {"by_source": by_source, "newest_source": "robot"}
         details = [{"code": code, "cause": cause, "remedy": "do this"} for code, cause in EXPLAINED.items()]
-        known = {"setpoints": setpoints, "limit_details": details}
-        return msgspec.convert(status_with(**known | changes), Status)
+        return msgspec.convert(status_with(**{"setpoints": setpoints, "limit_details": details} | changes), Status)
 
     return made
 
@@ -237,8 +236,7 @@ def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes,
 @pytest.fixture
 def sent(fake_daemon: Any, ctl: Any) -> Any:
     """Sends a step of 0.4 s."""
-    step = ("send", "step", "--duration", "0.4", "--rate", "50")
-    return lambda: ctl(*fake_daemon.at, "--json", *step)
+    return lambda: ctl(*fake_daemon.at, "--json", "send", "step", "--duration", "0.4", "--rate", "50")
 
 
 def test_what_was_rendered_is_told(fake_daemon, sent):
@@ -259,11 +257,10 @@ def test_what_was_rendered_is_told(fake_daemon, sent):
 def test_what_is_not_rendered_is_no_success(fake_daemon, sent, changes, expected, code, says):
     fake_daemon.says(**changes)
     done = sent().ended(expected)
-    assert (done.result, done.error["code"]) == (None, code)
     assert says in done.error["message"]
     assert says[-10:] in done.err
     # in FAULT nothing is sent at all
-    assert bool(fake_daemon.setpoints) == (expected == 1)
+    assert (done.result, done.error["code"], bool(fake_daemon.setpoints)) == (None, code, expected == 1)
 
 
 def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, sent, status_with):
@@ -310,9 +307,8 @@ def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, ctl, tmp_path, a
     file.write_text("t_s,force_N\n0,1\n1,7\n")
     told = [str(file) if each == "FILE" else each for each in arguments]
     error = ctl(*fake_daemon.at, "--json", "send", *told).ended(1).error
-    assert error["code"] == "out_of_range"
     assert "allowed is 0..5 N in scene pulse; nothing was sent" in error["message"]
-    assert fake_daemon.setpoints == []
+    assert (error["code"], fake_daemon.setpoints) == ("out_of_range", [])
 
 
 def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, ctl):
