@@ -41,8 +41,7 @@ def test_the_firmware_needs_no_heap_and_hardly_a_library(objects: list[Path]) ->
     symbols = [line.split() for line in listing.splitlines() if line and not line.endswith(":")]
     assert ["tormag_device_tick"] in [words[2:] for words in symbols]
     defined = {words[-1] for words in symbols if words[-2] != "U"}
-    needed = {words[-1] for words in symbols if words[-2] == "U"} - defined
-    assert needed <= ALLOWED_FROM_OUTSIDE
+    assert {words[-1] for words in symbols if words[-2] == "U"} - defined <= ALLOWED_FROM_OUTSIDE
     # all state is the caller's: no variable of the library's own, initialised or not
     assert {words[-1] for words in symbols if words[-2] in "bBdDC"} == set()
 

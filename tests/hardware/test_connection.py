@@ -246,8 +246,12 @@ def test_a_device_that_was_reset_is_a_loss_without_closing_the_port(bench: Bench
     bench.running()
     bench.firmware.reset()
     bench.pass_ms(60)
-    assert bench.seen[-2:] == [LinkState.IDENTIFYING, LinkState.RUNNING]
-    assert (bench.losses, bench.connection.losses, len(bench.ports)) == (1, 1, 1)
+    assert (bench.seen[-2:], bench.losses, bench.connection.losses, len(bench.ports)) == (
+        [LinkState.IDENTIFYING, LinkState.RUNNING],
+        1,
+        1,
+        1,
+    )
     assert "reset" in bench.connection.report().last_loss
 
 

@@ -365,9 +365,7 @@ class Line:
         self.far.close()
 
     def _pieces(self, unit: bytes) -> list[bytes]:
-        if self._bytewise and isinstance(self.far, PtyEnd):
-            return [bytes((byte,)) for byte in unit]
-        return [unit]
+        return [bytes((byte,)) for byte in unit] if self._bytewise and isinstance(self.far, PtyEnd) else [unit]
 
 
 class Tap:
@@ -494,8 +492,7 @@ def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Ca
     states = sum(isinstance(message, State) for message in tap.heard)
     assert states > 100
     # on serial every frame has a number, and the second is not given out; on CAN only State has, and the link knows
-    expected = len(tap.heard) if transport == "serial" else states // 2
-    assert connection.report().repeated == expected
+    assert connection.report().repeated == (len(tap.heard) if transport == "serial" else states // 2)
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items() if name != "cut"])

@@ -122,8 +122,7 @@ def test_a_device_that_turns_up_late_is_no_loss_and_asked_at_its_first_word(unme
     late = due(unmet, UNANSWERED_S, 10.3, heard=False)
     assert (unmet.state, len(late)) == (LinkState.UNANSWERED, pytest.approx(9.0 / HELLO_S, abs=1))
     unmet.receive(10.3, status())
-    assert unmet.state is LinkState.IDENTIFYING
-    assert [type(message) for message in unmet.due(10.3)] == [Hello]
+    assert (unmet.state, [type(message) for message in unmet.due(10.3)]) == (LinkState.IDENTIFYING, [Hello])
 
 
 def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
@@ -149,8 +148,7 @@ def test_a_reset_device_does_nothing_that_was_asked_of_it_before(request_: Devic
     link.receive(0.02, status(0))
     link.due(0.02)
     told(link, 0.03, US, status(FIRST_NONCE))
-    assert link.pending is DeviceRequest.NONE
-    assert {type(message) for _, message in due(link, 0.03, 2.0)} == {Hello}
+    assert (link.pending, {type(message) for _, message in due(link, 0.03, 2.0)}) == (DeviceRequest.NONE, {Hello})
 
 
 def test_another_device_at_the_same_line_is_not_taken_for_the_first() -> None:
@@ -167,8 +165,7 @@ def test_a_state_that_is_no_news_measures_nothing(behind: int, link: DeviceLink)
     link.receive(0.1, State(-1.0, -1.0, 0.1, 40))
     before = link.measurement
     link.receive(0.2, State(-9.0, -9.0, 0.05, 40 - behind))
-    assert link.measurement is before
-    assert link.repeated == 1
+    assert (link.measurement is before, link.repeated) == (True, 1)
     link.receive(0.3, State(-1.5, -1.5, 0.3, 40 + 3))
     assert link.measurement.left_mm == pytest.approx(-1.5)
 
@@ -236,8 +233,7 @@ def test_opening_is_asked_for_until_the_device_opens_or_has_latched(link: Device
     link.receive(5.0, status(mode=DeviceMode.RETRACTING))
     assert link.pending is DeviceRequest.RETRACT
     link.receive(5.02, status(mode=DeviceMode.LATCHED))
-    assert link.pending is DeviceRequest.NONE
-    assert {type(message) for _, message in due(link, 5.02, 7.0)} == {Hello}
+    assert (link.pending, {type(message) for _, message in due(link, 5.02, 7.0)}) == (DeviceRequest.NONE, {Hello})
 
 
 def test_every_request_has_a_new_number_and_none_is_zero_or_a_hellos(link: DeviceLink) -> None:
@@ -288,8 +284,12 @@ def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_ori
     assert (before.is_homed, before.is_busy, before.left_mm) == (False, True, 7.5)
     unmet.receive(0.001, State(0.1, 0.2, 0.001, 1))
     after = unmet.measurement
-    assert (after.is_homed, after.is_busy) == (True, False)
-    assert (after.left_mm, after.right_mm) == pytest.approx((0.1, 0.2))
+    assert (after.is_homed, after.is_busy, after.left_mm, after.right_mm) == (
+        True,
+        False,
+        pytest.approx(0.1),
+        pytest.approx(0.2),
+    )
 
 
 # -- what it measured ----------------------------------------------------------------------------------------------

@@ -206,6 +206,5 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
     each_tick = {message.name for message in database.messages if message.cycle_time == 1}
     layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
     assert len(layouts) == len(each_tick) == 3
-    most = [max_bits(struct.calcsize(layout.format)) for layout in layouts]
-    assert sum(most) == EXCHANGE_BITS
+    assert sum(max_bits(struct.calcsize(layout.format)) for layout in layouts) == EXCHANGE_BITS
     assert EXCHANGE_BITS == 395, "as firmware_protocol/README.md says"

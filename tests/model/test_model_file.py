@@ -104,8 +104,11 @@ def test_round_trip_is_exact_to_the_byte(saved: Path, tmp_path: Path, model: For
     loaded = load_model(saved, element="torque", insert="MRE-50-40")
     again = tmp_path / "again.safetensors"
     save_model(again, loaded)
-    assert (again.read_bytes(), loaded.metadata) == (saved.read_bytes(), model.metadata)
-    assert loaded.predict_one(*POINT) == model.predict_one(*POINT)
+    assert (again.read_bytes(), loaded.metadata, loaded.predict_one(*POINT)) == (
+        saved.read_bytes(),
+        model.metadata,
+        model.predict_one(*POINT),
+    )
     assert sorted(tmp_path.iterdir()) == [again, saved]
 
 
@@ -114,8 +117,11 @@ def test_others_can_read_the_file(saved: Path) -> None:
         header = file.metadata()
         assert header["element"] == "torque"
         told = [json.loads(header[name]) for name in ("features", "units", "hidden")]
-        assert (told, header["created"]) == ([list(FEATURES), UNITS, 6], "2024-02-29")
-        assert file.get_tensor("hidden_weight").shape == (6, 4)
+        assert (told, header["created"], file.get_tensor("hidden_weight").shape) == (
+            [list(FEATURES), UNITS, 6],
+            "2024-02-29",
+            (6, 4),
+        )
 
 
 def test_every_truncation_is_refused(saved: Path) -> None:

@@ -86,8 +86,11 @@ def test_an_overview_that_nothing_vouches_for_is_not_shown(path: Path, tmp_path:
     spoilt.write_bytes(path.read_bytes().replace(b"\xa4SKEW", b"\xa4SHOW"))
     for file, state in ((unsealed, State.UNSEALED), (spoilt, State.ALTERED)):
         known = RecordingFile(file)
-        assert (known.seal.state, list(known.overview.codes["faults"])) == (state, ["SKEW"])
-        assert known.overview.end_ns == own.end_ns
+        assert (known.seal.state, list(known.overview.codes["faults"]), known.overview.end_ns) == (
+            state,
+            ["SKEW"],
+            own.end_ns,
+        )
     assert RecordingFile(spoilt).notes[0].startswith("altered or damaged: the bytes ")
 
 
@@ -107,8 +110,9 @@ def test_any_seconds_of_it_are_those_of_the_whole(path: Path) -> None:
     from_ns, to_ns = START_NS + 7_000_000_000, START_NS + 9_500_000_000
     some = [each for each in RecordingFile(path).between(from_ns, to_ns, Glance) if each.is_tick]
     whole = [each for each in back(path).ticks if from_ns <= each.t_ns <= to_ns]
-    assert [each.t_ns for each in some] == [each.t_ns for each in whole]
-    assert [each.message["measured_cf"] for each in some] == [each.message["measured_cf"] for each in whole]
+    assert [(each.t_ns, each.message["measured_cf"]) for each in some] == [
+        (each.t_ns, each.message["measured_cf"]) for each in whole
+    ]
     assert "tick" not in some[0].message
 
 

@@ -59,15 +59,16 @@ def test_other_tools_find_json_messages_with_schemas(written):
         reader = make_reader(file)
         summary = reader.get_summary()
         topics = {channel.topic: channel for channel in summary.channels.values()}
-        assert set(topics) == {"/telemetry", "/ticks"}
-        assert {channel.message_encoding for channel in topics.values()} == {"json"}
+        assert {topic: channel.message_encoding for topic, channel in topics.items()} == {
+            "/telemetry": "json",
+            "/ticks": "json",
+        }
         schemas = {topic: summary.schemas[channel.schema_id] for topic, channel in topics.items()}
         assert {schema.encoding for schema in schemas.values()} == {"jsonschema"}
         assert set(json.loads(schemas["/ticks"].data)["properties"]) >= set(COLUMNS)
         assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
         _, _, message = next(iter(reader.iter_messages(topics="/ticks")))
-        assert message.log_time == START_NS
-        assert json.loads(message.data)["left_mm"] == 35.0
+        assert (message.log_time, json.loads(message.data)["left_mm"]) == (START_NS, 35.0)
 
 
 def obey(path: Path) -> int:

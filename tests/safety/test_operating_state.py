@@ -152,8 +152,11 @@ def test_stop_is_taken_without_a_device() -> None:
 
 def test_an_unknown_command_lists_the_known_ones() -> None:
     refused = refusal(SafetyState(), "detonate")
-    assert (refused.code, refused.message) == ("unknown_command", "no command 'detonate'")
-    assert refused.hint == f"commands: {', '.join(COMMANDS)}"
+    assert (refused.code, refused.message, refused.hint) == (
+        "unknown_command",
+        "no command 'detonate'",
+        f"commands: {', '.join(COMMANDS)}",
+    )
 
 
 def test_clearing_asks_the_device_only_where_it_has_latched_too() -> None:

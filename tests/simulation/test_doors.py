@@ -53,18 +53,16 @@ def descriptor(backend: Any) -> int:
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    processes = []
+    with contextlib.ExitStack() as stack:
 
-    def begin(*arguments: str) -> "subprocess.Popen[str]":
-        command = [sys.executable, "-m", "tormagd.simulation", *arguments]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        processes.append(process)
-        return process
+        def begin(*arguments: str) -> "subprocess.Popen[str]":
+            command = [sys.executable, "-m", "tormagd.simulation", *arguments]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            return process
 
-    yield begin
-    for process in processes:
-        process.kill()
-        process.communicate()
+        yield begin
 
 
 def channel(process: "subprocess.Popen[str]") -> str:
@@ -315,9 +313,7 @@ def test_the_adapter_answers_as_the_manual_says(said: bytes, answer: bytes) -> N
 def test_frames_come_out_however_they_are_cut(cut: int) -> None:
     adapter = SlcanAdapter()
     said = b"O\rt0217E204D20401C865\rt7FF0\r"
-    frames = []
-    for start_at in range(0, len(said), cut):
-        frames += adapter.feed(said[start_at : start_at + cut])[1]
+    frames = [frame for at in range(0, len(said), cut) for frame in adapter.feed(said[at : at + cut])[1]]
     assert frames == [CanFrame(0x021, bytes.fromhex("e204d20401c865")), CanFrame(0x7FF, b"")]
     assert adapter.line(frames[0]) == b"t0217E204D20401C865\r"
 

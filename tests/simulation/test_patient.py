@@ -40,10 +40,8 @@ def test_the_vessel_sticks_slips_and_turns_with_the_motion() -> None:
 def test_the_wall_is_elastic_and_is_left_again() -> None:
     found = felt_along(Patient(lag_s=0.001, friction_N=0.1, wall_mm=6.0, stiffness_N_mm=0.5), 3.0 + in_and_out(10.0))
     assert found[250].contact_mm is None
-    assert found[990].wall_N == pytest.approx(2.0, abs=0.01)
-    assert found[990].contact_mm == 9.0
-    assert found[-1].wall_N == 0.0
-    assert found[-1].contact_mm == 9.0
+    assert (found[990].wall_N, found[990].contact_mm) == (pytest.approx(2.0, abs=0.01), 9.0)
+    assert (found[-1].wall_N, found[-1].contact_mm) == (0.0, 9.0)
     assert [felt.wall_N > 0.0 for felt in found] == [felt.tip_mm > 9.0 for felt in found]
 
 
@@ -161,8 +159,7 @@ def test_the_process_feels_where_the_handle_was_and_says_it_later() -> None:
     first_s, _, _, fields = next(each for each in daemon.published if each[3])
     # the handle is at the wall after 1 s, the tip 0.1 s and its lag later, and 0.1 s later it is known
     assert first_s == pytest.approx(1.23, abs=0.04)
-    assert fields["contact"]["stiffness_N_mm"] == 0.5
-    assert fields["contact"]["handle_mm"] == pytest.approx(10.0)
+    assert (fields["contact"]["stiffness_N_mm"], fields["contact"]["handle_mm"]) == (0.5, pytest.approx(10.0))
 
 
 def test_a_wrong_call_says_what_is_right(capsys: pytest.CaptureFixture[str], tmp_path: Any) -> None:

@@ -429,5 +429,9 @@ def test_the_device_feels_the_finger() -> None:
     assert (plant.truth.handle_mm, plant.truth.force_N) == (0.0, 0.0)
     plant.advance(5.0)
     truth = plant.truth
-    assert (truth.handle_mm, truth.handle_mm_s, truth.force_N > 1.5) == (1.5, 0.0, True)
-    assert plant.force_sensor.reading_N == pytest.approx(truth.force_N, abs=0.05)
+    assert (truth.handle_mm, truth.handle_mm_s, truth.force_N > 1.5, plant.force_sensor.reading_N) == (
+        1.5,
+        0.0,
+        True,
+        pytest.approx(truth.force_N, abs=0.05),
+    )
