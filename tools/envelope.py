@@ -148,8 +148,7 @@ def judged(found: Followed, open_N: Callable[[float], float]) -> Figures:
     """The figures of a run, a row a millisecond; `open_N` is what the open gap brakes over the speed."""
     asked_N, speed_mm_s = found.asked_N, found.handle_mm_s
     floor_N = np.array([open_N(speed) for speed in np.abs(speed_mm_s).round(1).tolist()])
-    wanted_N = np.maximum(asked_N, floor_N)
-    error_N = found.along_N - wanted_N
+    error_N = found.along_N - np.maximum(asked_N, floor_N)
     waited_s = lasted_s(asked_N[1:] == asked_N[:-1])
     # what has to be travelled is the gap's way between where it was when the force changed and where it comes to rest
     travel_s = STROKE_MM / GAP_MM_S + GAP_MM_S / GAP_MM_S2
@@ -266,8 +265,7 @@ def missed(result: Json) -> list[str]:
 
 def row(case: Case, figures: Figures) -> Json:
     """One run for JSON."""
-    measured = {name: getattr(figures, name) for name in ("over_N", "under_N", "peak_N", "limits")}
-    return case._asdict() | measured
+    return case._asdict() | {name: getattr(figures, name) for name in ("over_N", "under_N", "peak_N", "limits")}
 
 
 def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None:

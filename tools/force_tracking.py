@@ -125,8 +125,7 @@ def step_figures(found: Followed, begins_s: float, ideal: float, direction: floa
 def steps(name: str) -> Json:
     """Up and down on a fresh device, the same after REST_S, and once it was started again with its profile."""
     plant = device(name)
-    brake = brake_of(plant)
-    low_N = max(LOW_N, brake.open_N(TURNED_MM_S) + ABOVE_N)
+    low_N = max(LOW_N, brake_of(plant).open_N(TURNED_MM_S) + ABOVE_N)
     up_s, down_s = ideal_s(plant, low_N)
     legs, once = [(RUNS_ON_S, TURNED_MM_S)], [(1.0, 0.0), (STEP_S, low_N), (STEP_S, HIGH_N)]
     fresh = course(plant, legs, [*once, (REST_S, low_N), (STEP_S, HIGH_N), (STEP_S, low_N)])

@@ -129,9 +129,8 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
         return "-"
     value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
-    if isinstance(value, dict):
-        return "`{}`"
-    return f"`{msgspec.json.encode(value).decode()}`"  # which TOML writes alike
+    # TOML writes alike what JSON does, but for a table
+    return "`{}`" if isinstance(value, dict) else f"`{msgspec.json.encode(value).decode()}`"
 
 
 def _allowed(hint: Any) -> str:

@@ -16,8 +16,7 @@ from tormagd.simulation.hand import FeltHand, Impedance
 @pytest.fixture(scope="module")
 def rows() -> dict[str, dict]:
     """A firm wall, touched in three ways over 100 ms."""
-    modes = ("force", "way", "law_standby")
-    return {mode: judged(Case("draw 100", 0.3, 0.25, 30.0, 100.0, mode)) for mode in modes}
+    return {mode: judged(Case("draw 100", 0.3, 0.25, 30.0, 100.0, mode)) for mode in ("force", "way", "law_standby")}
 
 
 def test_a_wall_is_felt_when_carriages_of_this_speed_make_it(rows) -> None:

@@ -30,8 +30,7 @@ def test_cases_in_real_time_hold_on_one_stand_one_after_the_other() -> None:
         stand = Stand(stack)
         for case, count in ((soak, 8), (siege, 1), (stalls, 3)):
             assert case.run(stand, count, 1)["failures"] == []
-        assert stand.latched == []
-        assert stand.unhandled() == []
+        assert (stand.latched, stand.unhandled()) == ([], [])
 
 
 @pytest.mark.parametrize("wrong", [["nobody"], ["fuzz", "--count", "0"]])

@@ -28,8 +28,7 @@ def test_all_parts_run_and_the_status_tells_of_the_failed(tmp_path: Path) -> Non
         "measured": printing({"cases": 5}, judges=False),
     }
     assert evidence.collect(parts, tmp_path) == 1
-    text = page.read_text(encoding="utf-8")
-    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if " | `" in line]
+    rows = [line.strip("| ").split(" | ") for line in page.read_text("utf-8").splitlines() if " | `" in line]
     assert [(row[0], *row[-2:]) for row in rows] == [
         ("good", "yes", "1 cases"),
         ("other", "yes", "kept"),

@@ -95,8 +95,14 @@ def test_refusals_and_what_is_stated_are_counted_and_behind_a_border_comes_only_
     border: str, is_refused: bool
 ) -> None:
     row = tried(Stage("planted", lambda: None, refuses, border), EPISODES, seed=1)
-    assert (row.refused > 0, row.stated > 0) == (is_refused, True)
-    assert (row.nonfinite, row.swallowed, row.unnamed, row.told) == (0, 0, 0, [])
+    assert (row.refused > 0, row.stated > 0, row.nonfinite, row.swallowed, row.unnamed, row.told) == (
+        is_refused,
+        True,
+        0,
+        0,
+        0,
+        [],
+    )
 
 
 def test_every_float_of_plain_data_values_and_stages_is_seen() -> None:

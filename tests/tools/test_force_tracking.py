@@ -137,8 +137,11 @@ def test_a_publisher_sends_what_follows() -> None:
     publish = publisher(times + 3.0, forces, 0.02)
     assert publish(2.999) is None
     setpoint = publish(3.0101)
-    assert (setpoint.force_N, setpoint.preview_dt_s) == (pytest.approx(forces[5]), 0.002)
-    assert setpoint.preview_N == pytest.approx(forces[6:16])
+    assert (setpoint.force_N, setpoint.preview_dt_s, setpoint.preview_N) == (
+        pytest.approx(forces[5]),
+        0.002,
+        pytest.approx(forces[6:16]),
+    )
     assert publisher(times, forces, 0.0)(0.1).preview_N == ()
 
 
@@ -199,8 +202,7 @@ def test_what_counts_of_a_run(asked_N: float, along_N: np.ndarray, figure: str, 
 
 @pytest.mark.parametrize("speed_mm_s", [42.0, -42.0])
 def test_both_ways_are_sliding(speed_mm_s: float) -> None:
-    found = judged(1.0, np.full(6_000, 1.1), speed_mm_s)
-    assert {round(error, 6) for _, _, error in found.settled} == {0.1}
+    assert {round(error, 6) for _, _, error in judged(1.0, np.full(6_000, 1.1), speed_mm_s).settled} == {0.1}
     assert judged(0.2, np.full(6_000, 0.55), speed_mm_s).settled == ()
 
 

@@ -74,5 +74,8 @@ def test_a_timer_on_every_processor_and_a_process_that_waits(tmp_path: Path):
         watched.end()
     assert 0.0 <= found.steal <= 1.0
     assert 0.0 <= found.bare_kept <= 1.0
-    assert (set(found.waited), (tmp_path / "log").read_text()) == ({"test"}, "")
-    assert len(watched._stalls) == min(len(os.sched_getaffinity(0)), host.MAX_TIMERS)
+    assert (set(found.waited), (tmp_path / "log").read_text(), len(watched._stalls)) == (
+        {"test"},
+        "",
+        min(len(os.sched_getaffinity(0)), host.MAX_TIMERS),
+    )

@@ -255,8 +255,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The contract's object for `benchmark inverse`; with `--write`, also the page."""
     effort = QUICK if options.quick else FULL
     torch.set_num_threads(1)
-    bench = Bench(effort)
-    rows, refused = bench.sweep()
+    rows, refused = Bench(effort).sweep()
     mark_pareto(rows)
     usual = {row["name"]: row for row in rows if row["hidden"] == USUAL_HIDDEN}
     # where a network refuses it, as a small one may, the scene would run the search that looks at a grid

@@ -112,8 +112,7 @@ def step(loop: ClosedLoop, target_mm: float) -> Step:
 def stroke(loop: ClosedLoop) -> float:
     """Time from the first to the last millimetre of the stroke, opening, s."""
     drive(loop, STROKE_MM[0], 3.0)
-    samples = drive(loop, STROKE_MM[1], 3.0)
-    gap = np.array([sample.truth.gap_mm for sample in samples])
+    gap = np.array([sample.truth.gap_mm for sample in drive(loop, STROKE_MM[1], 3.0)])
     return float(np.argmax(gap > STROKE_MM[1] - 0.05) + 1) * TICK_S
 
 

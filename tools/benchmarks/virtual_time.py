@@ -113,10 +113,10 @@ def take_turns(builds: Mapping[str, Executor], ticks: int) -> Stretches:
 
 def summary(found: Stretches, period_us: float) -> dict[str, Any]:
     """The contract's object, null for a build that is not there: a period over the median tick."""
-    result: dict[str, Any] = dict.fromkeys(BUILDS)
-    for name, loops in found.items():
-        result[name] = {loop: round(period_us / statistics.median(taken_us), 2) for loop, taken_us in loops.items()}
-    return result
+    return dict.fromkeys(BUILDS) | {
+        name: {loop: round(period_us / statistics.median(taken_us), 2) for loop, taken_us in loops.items()}
+        for name, loops in found.items()
+    }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

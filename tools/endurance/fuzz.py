@@ -201,8 +201,7 @@ def differences(of_codec: list[bytes], of_framing: list[bytes]) -> int:
             ours.append(" ".join(frames + counts))
     text = "".join(f"{request}\n" for request in requests)
     # a sanitizer's complaint ends the program (firmware_protocol/c/host/exchange.c)
-    program = build(Target.SANITIZED_EXCHANGE)
-    done = subprocess.run([program], input=text, capture_output=True, text=True, check=True)
+    done = subprocess.run([build(Target.SANITIZED_EXCHANGE)], input=text, capture_output=True, text=True, check=True)
     theirs = [re.sub(r"^refused .*", "refused", answer) for answer in done.stdout.splitlines()]
     return sum(one != other for one, other in zip_longest(ours, theirs))
 

@@ -330,8 +330,7 @@ def aim() -> list[Any]:
 def aiming(stage: list[Any], draw: Draw) -> object:
     begun, remembered, believed = stage
     asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), is_meant=True)
-    meant = setpoint(usual(draw.now_s))
-    return begun.update(draw.now_s, meant, asked, believed, remembered, measured(draw))
+    return begun.update(draw.now_s, setpoint(usual(draw.now_s)), asked, believed, remembered, measured(draw))
 
 
 def floors(_: object, draw: Draw) -> object:
@@ -365,8 +364,7 @@ def carriages() -> Carriages:
 def driving(stage: Carriages, draw: Draw) -> object:
     seen, dt_s, planned = measured(draw), elapsed_s(draw), plan(draw)
     reading = measurement(usual(draw.now_s)).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
-    drive = stage.update(draw.now_s, dt_s, planned, reading, seen, False)
-    return [drive, stage.reference, stage.expected]
+    return [stage.update(draw.now_s, dt_s, planned, reading, seen, False), stage.reference, stage.expected]
 
 
 def elapsed_s(draw: Draw) -> float:

@@ -204,6 +204,4 @@ class Watch:
         return max((before - after) / (LOSS_MS * 1e-3) for before, after in over)
 
     def _since(self, what: str) -> float | None:
-        if what not in self._since_s:
-            return None
-        return round((self._since_s[what] - self._from_s) * 1e3, 1)
+        return round((self._since_s[what] - self._from_s) * 1e3, 1) if what in self._since_s else None
