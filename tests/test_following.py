@@ -78,8 +78,7 @@ def test_it_is_forgotten_some_seconds_after_the_last_and_without_a_handle_all_co
 
 def test_a_handle_that_has_just_turned_feels_no_whole_force_and_does_not_count() -> None:
     turned = [tick for way in (-20.0, 20.0) * 9 for tick in ticks(0.08, handle_rate_mm_s=way, measured_cf=0.2)]
-    assert reported(ticks(5.0), turned, ticks(2.0)).rms_N == 0.0
-    assert recorded(ticks(5.0), turned, ticks(2.0)).rms_N == 0.0
+    assert [of(ticks(5.0), turned, ticks(2.0)).rms_N for of in (reported, recorded)] == [0.0, 0.0]
 
 
 def test_what_status_and_a_recording_say_of_the_same_ticks_is_the_same() -> None:

@@ -108,9 +108,7 @@ def room(parts: tuple[str, ...]) -> str | None:
     """The room a module or an import stands in; None for what is not ours."""
     if parts[0] == "firmware_protocol":
         return "firmware_protocol"
-    if parts[0] == "tormagd" and len(parts) > 1 and parts[1] in MAY_IMPORT:
-        return parts[1]
-    return None
+    return parts[1] if parts[0] == "tormagd" and len(parts) > 1 and parts[1] in MAY_IMPORT else None
 
 
 def imported(path: Path) -> Iterator[str]:

@@ -39,8 +39,7 @@ def test_keys_are_their_owners_only_and_a_pair(tmp_path: Path) -> None:
         secret, public = generate("robot", tmp_path / "a", tmp_path / "a/publish")
     finally:
         os.umask(before)
-    assert [stat.S_IMODE(path.stat().st_mode) for path in (secret, public)] == [0o600, 0o600]
-    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o700
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (secret, public, tmp_path / "a")] == [0o600, 0o600, 0o700]
     pair = load_pair(secret)
     assert zmq.curve_public(pair.secret) == pair.public == load_public(public) == load_public(secret)
     assert "secret-key" not in public.read_text()

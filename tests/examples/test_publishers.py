@@ -73,8 +73,7 @@ def answer(command, refusal):
         error = refusal and {"code": refusal[0], "message": refusal[1], "hint": "home"}
         return {"ok": False, "error": error} if refusal else {}
     ended = refusal and refusal != BUSY and {"code": refusal[0], "cause": refusal[1], "remedy": "home"}
-    arm = {"given": ["home"], "is_over": refusal != BUSY, "error": ended or None}
-    return {"result": {"arm": arm}}
+    return {"result": {"arm": {"given": ["home"], "is_over": refusal != BUSY, "error": ended or None}}}
 
 
 def played(publisher, tmp_path, refusals):

@@ -233,8 +233,7 @@ def test_other_processes_give_the_same_answer(thread: Executor) -> None:
 
 def test_runs_that_stand_twice_are_solved_once(thread: Executor) -> None:
     counting = Mock(submit=Mock(side_effect=thread.submit))
-    assert list(sweep([RUNS[0], RUNS[0]], counting)) == RUNS[:1]
-    assert counting.submit.call_count == 1
+    assert (list(sweep([RUNS[0], RUNS[0]], counting)), counting.submit.call_count) == (RUNS[:1], 1)
 
 
 def test_a_run_that_fails_ends_the_sweep(thread: Executor) -> None:

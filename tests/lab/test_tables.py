@@ -81,5 +81,4 @@ def test_of_what_the_thesis_names_one_is_not_wide_enough() -> None:
 
 def test_the_page_has_it() -> None:
     """`tormag-lab reproduce-thesis --out docs` writes it."""
-    written = Path(__file__).parents[2] / "docs" / "reproduction.md"
-    assert page.table_2_5(FOUND) in written.read_text(encoding="utf-8")
+    assert page.table_2_5(FOUND) in Path(__file__).parents[2].joinpath("docs/reproduction.md").read_text("utf-8")

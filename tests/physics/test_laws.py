@@ -440,8 +440,8 @@ def test_an_error_can_be_sent_between_processes() -> None:
     with pytest.raises(DomainError) as caught:
         require("gap_mm", np.array([50.0, -1.0]), 0.0, 100.0)
     copy = pickle.loads(pickle.dumps(caught.value))
-    assert type(copy) is DomainError
-    assert (str(copy), copy.variable, copy.value, copy.allowed) == (
+    assert (type(copy), str(copy), copy.variable, copy.value, copy.allowed) == (
+        DomainError,
         str(caught.value),
         "gap_mm",
         -1.0,

@@ -36,5 +36,4 @@ def test_a_recording_is_smooth_between_its_rows_and_keeps_to_the_range(tmp_path:
     (tmp_path / "mine.csv").write_text("t_s,force_N\n" + "\n".join(lines) + "\n")
     time_s, force_N = asked(Signal(file="mine.csv"), tmp_path, RANGE_N, 100.0, 500)
     assert time_s[-1] == pytest.approx(2.0, abs=0.003)
-    expected = np.clip(1.2 + 0.9 * np.sin(2.0 * np.pi * time_s), *RANGE_N)
-    assert force_N == pytest.approx(expected, abs=5e-4)
+    assert force_N == pytest.approx(np.clip(1.2 + 0.9 * np.sin(2.0 * np.pi * time_s), *RANGE_N), abs=5e-4)

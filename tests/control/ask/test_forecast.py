@@ -216,8 +216,12 @@ def test_trust_is_the_product_of_two_scores_each_held_within_0_and_1(
 def test_a_gap_or_a_stamp_from_before_begins_anew(learned: Forecast, step_s: float) -> None:
     stamp_s = learned.stamp_s + step_s
     learned.update(stamp_s, 1.5)
-    assert learned.trust == 0.0
-    assert (learned.stamp_s, learned.time_s, np.frombuffer(learned.history).tolist()) == (stamp_s, stamp_s, [1.5])
+    assert (learned.trust, learned.stamp_s, learned.time_s, np.frombuffer(learned.history).tolist()) == (
+        0.0,
+        stamp_s,
+        stamp_s,
+        [1.5],
+    )
     fresh = Forecast()
     fresh.update(stamp_s, 1.5)
     assert plain(fresh) == plain(learned)

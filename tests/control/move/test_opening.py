@@ -49,10 +49,12 @@ def opens(measure) -> Opens:
 
 @pytest.mark.parametrize("start_mm", [-25.0, -12.0, -2.0, -0.2])
 def test_an_ordinary_opening(opens: Opens, start_mm: float) -> None:
-    assert opens.look(0.1, start_mm) is None
-    assert opens.look(2.0, start_mm, SPEED_MM_S) is None
-    assert opens.look(5.0, 0.0, mode=DeviceMode.IDLE, switches=Switches.HOMED | BOTH) is None
-    assert opens.look(5.0, -0.3, mode=DeviceMode.IDLE) is None
+    assert [
+        opens.look(0.1, start_mm),
+        opens.look(2.0, start_mm, SPEED_MM_S),
+        opens.look(5.0, 0.0, mode=DeviceMode.IDLE, switches=Switches.HOMED | BOTH),
+        opens.look(5.0, -0.3, mode=DeviceMode.IDLE),
+    ] == 4 * [None]
 
 
 @pytest.mark.parametrize("start_mm", [-25.0, -12.0, -2.0])
@@ -136,8 +138,10 @@ def test_a_device_that_says_itself_that_it_failed_is_not_told_twice(opens: Opens
 
 
 def test_a_homing_and_a_device_that_was_away_are_no_failure(opens: Opens) -> None:
-    assert opens.look(5.0, mode=DeviceMode.HOMING, switches=Switches(0)) is None
-    assert opens.look(5.0, mode=DeviceMode.IDLE, switches=Switches(0)) is None
+    assert [opens.look(5.0, mode=mode, switches=Switches(0)) for mode in (DeviceMode.HOMING, DeviceMode.IDLE)] == [
+        None,
+        None,
+    ]
     opens.ask()
     assert opens.look(0.3) is None
     opens.opening.rest(opens.safety.request_number)
@@ -147,5 +151,4 @@ def test_a_homing_and_a_device_that_was_away_are_no_failure(opens: Opens) -> Non
 def test_open_is_by_places_or_by_both_switches(measure) -> None:
     near, off = (measure(1, left_mm=-OPEN_MM, right_mm=right_mm) for right_mm in (0.1, -OPEN_MM - 0.1))
     assert (is_open(near, True), is_open(near, False), is_open(off, True)) == (True, False, False)
-    found = [is_open(measure(1, switches=switches), False) for switches in (BOTH, Switches.LEFT_OPEN)]
-    assert found == [True, False]
+    assert [is_open(measure(1, switches=only), False) for only in (BOTH, Switches.LEFT_OPEN)] == [True, False]
