@@ -78,7 +78,8 @@ def _head() -> str:
         "| `[terms]` | parts of the controller's model that do not run, `false` each (`tormagd/scenes/scene.py`; [why "
         "all run](decisions/0009-what-a-scene-requires.md)) |\n\n"
         "Rates and search are measured and chosen. The cheapest way is taken that does in every situation what the "
-        f"usual one does: within {TOLERATED:g} of the tolerance, or at most {WORSE:.0%} of it worse. [Choose by price "
+        f"usual one does. It is within {TOLERATED:g} of the tolerance, or at most {WORSE:.0%} of it worse, and keeps "
+        "it where that one does. [Choose by price "
         "or error](guides/scene.md#the-tables) yourself."
     )
 

@@ -134,6 +134,8 @@ def measured() -> Measurements:
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
     """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`.
 
-    It is TOLERATED of `tolerance_N`, N, or WORSE of it more than `usual_N`, whichever is greater.
+    It is TOLERATED of `tolerance_N`, N, or WORSE of it more than `usual_N`, whichever is greater. Where the usual way
+    keeps the tolerance, the other has to.
     """
-    return max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)
+    most_N = max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)
+    return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N
