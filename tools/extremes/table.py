@@ -284,7 +284,7 @@ def memory(stage: ElementMemory, draw: Draw) -> object:
 
 
 def way(stage: Way, draw: Draw) -> object:
-    return stage.update(measured(draw), draw.steps % 2 > 0)
+    return stage.update(measured(draw), draw.bounded(0.4), draw.steps % 2 > 0)
 
 
 def governor(stage: Governor, draw: Draw) -> object:

@@ -1,7 +1,7 @@
 """Way of the handle: whether it pushes on or withdraws.
 
-turned   the encoder shows the handle going the other way, and its force is over PULLS_N there, or it came SLID_MM
-pulled   the encoder shows nothing, but the force has changed its sign and is over UNSEEN_N
+pulled   the force is over PULLS_N the other way, whether the encoder shows it yet or not
+slid     the encoder shows the handle going the other way, and it came SLID_MM
 
 Either changes the way. A held handle that trembles turns back by what bristles give, but its hand goes on pushing: its
 way stays.
@@ -13,8 +13,6 @@ from tormagd.control.records import AT_REST, Measured, Travel
 
 PULLS_N: Final = 0.1
 "Least force of a hand that pulls: more than noise and drift of a force sensor."
-UNSEEN_N: Final = 0.2
-"Before a hand pulls so hard, bristles give more than the encoder's reversal: the encoder stands still."
 SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, 5 N/mm at 1.5 N either way."
 
@@ -44,14 +42,13 @@ class Way:
         """`push_sign` is 1 where a handle that pushes on moves to greater places of its encoder, else -1."""
         self._push_sign: Final = float(push_sign)
 
-    def update(self, measured: Measured | None, is_sensor_believed: bool) -> Travel:
+    def update(self, measured: Measured | None, zero_N: float, is_sensor_believed: bool) -> Travel:
         """Return the handle's travel, and keep it in `travel`.
 
         `measured` is None while the device is silent: the handle counts as resting where it was, and keeps its way. A
-        force over PULLS_N against the encoder's motion shows that the handle goes that way; one below -UNSEEN_N, that
-        it goes the other. Between them, the way changes after SLID_MM on the encoder: since it turned, and from where
-        the way last changed. With `is_sensor_believed` False, or a force of NaN, only such travel counts. A change of
-        way is kept in `changed_mm`.
+        force over PULLS_N, less the sensor's zero `zero_N`, shows the way that it resists. A smaller one shows nothing:
+        the way then changes after SLID_MM on the encoder, since it turned, and from where the way last changed. With
+        `is_sensor_believed` False, or a force of NaN, only such travel counts. A change of way is kept in `changed_mm`.
         """
         before = self.travel
         if measured is None:
@@ -62,10 +59,9 @@ class Way:
         onward = self._push_sign * turn.direction
         is_pushing = before.is_pushing
         has_turned = (onward > 0.0) != is_pushing
-        if is_sensor_believed and measured.force_N > PULLS_N:
-            is_pushing = onward > 0.0
-        elif is_sensor_believed and measured.force_N < -UNSEEN_N:
-            is_pushing = onward < 0.0
+        force_N = measured.force_N - turn.direction * zero_N
+        if is_sensor_believed and abs(force_N) > PULLS_N:
+            is_pushing = (onward > 0.0) == (force_N > 0.0)
         elif has_turned and min(turn.displacement_mm(place_mm), abs(place_mm - self.changed_mm)) > SLID_MM:
             is_pushing = not is_pushing
         if is_pushing != before.is_pushing:
