@@ -5,10 +5,11 @@
 Onset: from when the wall's force at the handle's place reaches the waiting level W and 0.2 N to when the kinetic force
 does. W is what carriages without inertia leave of the open gap, the scene's least force and its standby. RMS: kinetic
 force less the wall's, at least W, from the wall's place until the hand turns; less W after that. Held: how long the
-handle is held back by more than W and 0.1 N while the hand draws it back. Devices are simulated: sample 1 was tuned on,
+handle is held back by more than W and 0.1 N while the hand draws it back. Where another force or a wall is sent, its
+bound are the run's own motors, which only open from when the hand pulls. Devices are simulated: sample 1 was tuned on,
 the others judge. `--draws` are random walls, pushes and hands behind a network with jitter of 30 ms and 5 % loss in
-bursts. The band of the picture is the just noticeable difference of force, 10 % (Jones 1989); that of
-stiffness is 22 % (Jones and Hunter 1990).
+bursts. The band of the picture is the just noticeable difference of force, 10 % (Jones 1989); that of stiffness is 22 %
+(Jones and Hunter 1990).
 """
 
 import argparse
@@ -31,6 +32,7 @@ from rendering.touching import (
     Touch,
     core_of,
     ideal,
+    opened,
     reached_ms,
     rendered,
 )
@@ -91,11 +93,12 @@ def drawn(count: int) -> list[Case]:
 
 def judged(case: Case) -> Json:
     """The row of one case: run, bound, and what a gap without inertia would leave."""
-    run, bound, infinite = rendered(case, core_of(case)), ideal(case), ideal(case, has_motors=False)
+    core = core_of(case)
+    run, bound, infinite = rendered(case, core), ideal(case), ideal(case, has_motors=False)
     free = infinite.depth_mm < -0.5 * FREE_MM
     waiting_N = float(infinite.kinetic_N[free & (infinite.time_s < infinite.time_s[-1] / 2.0)].mean())
     is_counted = case.wall_N_mm * infinite.depth_mm.max() >= waiting_N + COUNTED_N
-    force = core_of(case).scene.force
+    force = core.scene.force
 
     def lag_ms(touch: Touch) -> float | None:
         return reached_ms(touch, case.wall_N_mm, waiting_N + ONSET_N) if is_counted else None
@@ -113,7 +116,7 @@ def judged(case: Case) -> Json:
         "free_drag_N": free_drag_N(run),
         "standby_N": force.standby_N or None,
         "withdrawal_held_ms": held_ms(run, waiting_N),
-        "withdrawal_bound_ms": held_ms(bound, waiting_N),
+        "withdrawal_bound_ms": held_ms(bound if case.mode.startswith("force") else opened(case, core), waiting_N),
         "tip_depth_mm": float(run.depth_mm.max()),
         "tip_depth_bound_mm": float(bound.depth_mm.max()),
         "tip_depth_infinite_mm": float(infinite.depth_mm.max()),

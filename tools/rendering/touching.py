@@ -2,7 +2,8 @@
 
 The patient's tip is where the handle was half a round trip ago; what it feels comes back as late. The bound moves the
 gap by the device's own motors, which stop at once, along the device's true force over gap. It knows what the run's
-controller knows: the newest message, and the handle's place and speed. *Infinite* is the same without motors.
+controller knows: the newest message, and the handle's place and speed. *Infinite* is the same without motors. *Opened*
+is the run until the hand pulls; from there its motors only open.
 """
 
 import math
@@ -150,7 +151,7 @@ class Scenario:
         self.felt = FeltHand(self._hand, Impedance(MASS_KG, case.hand_N_mm, damping_N_s_mm))
         self.wall = Wall(sum(lasts_s * speed_mm_s for lasts_s, speed_mm_s in LEARNING) + FREE_MM, case.wall_N_mm)
         self._patient = Link(case, self.wall, core.scene.force.least_N)
-        self._start_s = 0.0
+        self._start_s = self._turns_s = 0.0
         self._rows: list[tuple[float, ...]] = []
         self._limits: set[str] = set()
 
@@ -161,7 +162,7 @@ class Scenario:
         there: Legs = [(push_s, case.push_mm_s), (RESTS_S, 0.0)]
         legs = [*LEARNING, *there, (push_s, -case.push_mm_s), (RESTS_S, 0.0)]
         self._hand.begin(legs, now_s)
-        self._start_s = now_s
+        self._start_s, self._turns_s = now_s, now_s + LEARNT_S + push_s + RESTS_S
         return range(round(sum(lasts_s for lasts_s, _ in legs) / PERIOD_S))
 
     def setpoint(self, now_s: float, truth: Truth) -> TimedSetpoint | None:
@@ -171,6 +172,10 @@ class Scenario:
         if since_s >= LEARNT_S:
             return sent
         return TimedSetpoint(LEARNS * self._case.most_N if since_s < LEARNS_FOR_S else 0.0, now_s, VALID_S)
+
+    def pulls(self, truth: Truth) -> bool:
+        """Whether the hand draws back, and pulls."""
+        return truth.time_s > self._turns_s and truth.force_N < -PULLS_N
 
     def see(self, truth: Truth, limits: tuple[Limit, ...] = ()) -> None:
         """One tick."""
@@ -201,6 +206,25 @@ def rendered(case: Case, core: Core) -> Touch:
         if faults:
             break
     return scenario.touch(faults)
+
+
+def opened(case: Case, core: Core) -> Touch:
+    """Play one case by this controller until the hand pulls. From there the motors open at their rated voltage, or at
+    what the device has."""
+    scenario, parameters = Scenario(case, core), with_insert(device_of(case.device), core.scene.insert.name)
+    loop = armed(core, parameters, scenario.felt)
+    plant, has_pulled = loop.simulated.plant, False
+    opening_V = min(core.config.motor.supply_V, parameters.electronics.supply_V)
+    for _ in scenario.begin(loop.now_s):
+        has_pulled = has_pulled or scenario.pulls(plant.truth)
+        if has_pulled:
+            volts = opening_V if plant.gap_mm < core.scene.insert.gap_open_mm else 0.0
+            plant.drive(volts, volts)
+            plant.advance(PERIOD_S)
+        else:
+            loop.tick(scenario.setpoint(loop.now_s, plant.truth))
+        scenario.see(plant.truth)
+    return scenario.touch()
 
 
 def ideal(case: Case, *, has_motors: bool = True) -> Touch:
