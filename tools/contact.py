@@ -1,6 +1,6 @@
 """What a hand feels that pushes into a wall and draws back: run and bound, in virtual time.
 
-    contact.py [--quick] [--draws N] [--json] [--picture FILE.png]
+    contact.py [--draws N] [--json] [--picture FILE.png]
 
 Onset: from when the wall's force at the handle's place reaches the waiting level W and 0.2 N to when the kinetic force
 does. W is what carriages without inertia leave of the open gap, the scene's least force and its standby. RMS: kinetic
@@ -43,8 +43,7 @@ from tormagd.lab.pages import subplots
 from tormagd.lab.told import lines
 
 DEVICES = (*SAMPLES, "draw 100", "draw 103", SECOND)
-QUICK_DEVICES = ("sample_2", SECOND)
-HANDS_N_MM, QUICK_HANDS_N_MM = (0.1, 0.3, 1.0), (0.3,)
+HANDS_N_MM = (0.1, 0.3, 1.0)
 TOUCHES = ((0.05, 60.0), (0.25, 10.0), (0.25, 30.0), (1.0, 30.0))
 "Walls, N/mm, and pushes, mm/s."
 ROUND_TRIPS_MS = (0.0, 100.0, 400.0)
@@ -64,12 +63,11 @@ DRAWN = {
 FORCE_JND = 0.10
 
 
-def cases(is_quick: bool) -> list[Case]:
+def cases() -> list[Case]:
     """The matrix."""
-    devices, hands = (QUICK_DEVICES, QUICK_HANDS_N_MM) if is_quick else (DEVICES, HANDS_N_MM)
     return [
         Case(device, hand, *touched, round_trip_ms, mode)
-        for device, hand, touched, round_trip_ms, mode in product(devices, hands, TOUCHES, ROUND_TRIPS_MS, MODES)
+        for device, hand, touched, round_trip_ms, mode in product(DEVICES, HANDS_N_MM, TOUCHES, ROUND_TRIPS_MS, MODES)
     ]
 
 
@@ -242,12 +240,11 @@ def draw(picture: Path) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Exit code 0: all that has to hold does; else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two devices, one hand")
     parser.add_argument("--draws", type=int, default=0, metavar="N", help="random touches instead of the matrix")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--picture", type=Path, metavar="FILE.png")
     options = parser.parse_args(arguments)
-    played = drawn(options.draws) if options.draws else cases(options.quick)
+    played = drawn(options.draws) if options.draws else cases()
     with ProcessPoolExecutor() as pool:
         rows = list(tqdm(pool.map(judged, played), total=len(played), disable=options.json))
     result = {"cases": rows, "kept": kept(rows), "energy_error": max(row["energy_error"] for row in rows)}
