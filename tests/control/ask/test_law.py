@@ -141,24 +141,15 @@ class Pushed:
     def __init__(self, push_sign: int) -> None:
         self._way, self._sign, self._turn = Way(push_sign), push_sign, Turn(1.0, 0.0, 0.0)
 
-    def at(
-        self,
-        place_mm: float,
-        hand_N: float,
-        *,
-        zero_N: float = 0.0,
-        known_N: float = 0.0,
-        is_sensor_believed: bool = True,
-    ) -> Travel:
-        """The handle there, while the hand gives this force, positive pushing on; the sensor's zero, and what of it is
-        known."""
+    def at(self, place_mm: float, hand_N: float, *, zero_N: float = 0.0, is_sensor_believed: bool = True) -> Travel:
+        """The handle there, while the hand gives this force, positive pushing on. The sensor's zero is known."""
         encoder_mm = self._sign * place_mm
         self._turn = self._turn.moved_to(encoder_mm)
         direction = self._turn.direction
         handle = Handle(self._turn.displacement_mm(encoder_mm), 5.0, self._turn)
         against_N = direction * (self._sign * hand_N + zero_N)
         measured = Measured(1, True, 0.0, 40.0, 40.0, 0.0, 0.0, against_N, handle, encoder_mm, 0.0, 0.0)
-        return self._way.update(measured, known_N, is_sensor_believed)
+        return self._way.update(measured, zero_N, is_sensor_believed)
 
 
 @pytest.mark.parametrize("push_sign", [1, -1])
@@ -192,11 +183,11 @@ def test_a_hand_that_pulls_where_the_encoder_shows_nothing_is_let_go() -> None:
 @pytest.mark.parametrize("push_sign", [1, -1])
 @pytest.mark.parametrize("zero_N", [0.15, -0.15])
 def test_what_a_sensors_zero_is_off_by_is_no_hand_that_pulls(push_sign: int, zero_N: float) -> None:
-    pushed, off = Pushed(push_sign), {"zero_N": zero_N, "known_N": zero_N}
-    pushed.at(5.0, 1.5, **off)
+    pushed = Pushed(push_sign)
+    pushed.at(5.0, 1.5, zero_N=zero_N)
     for place_mm in (5.0, 4.9, 5.0):
-        assert [pushed.at(place_mm, hand_N, **off).is_pushing for hand_N in (0.05, -0.05)] == [True, True]
-    assert not pushed.at(5.0, -0.11, **off).is_pushing
+        assert [pushed.at(place_mm, hand_N, zero_N=zero_N).is_pushing for hand_N in (0.05, -0.05)] == [True, True]
+    assert not pushed.at(5.0, -0.11, zero_N=zero_N).is_pushing
 
 
 def test_a_tremor_of_a_held_handle_changes_no_way() -> None:

@@ -12,7 +12,7 @@ from typing import Final, final
 from tormagd.control.records import AT_REST, Measured, Travel
 
 PULLS_N: Final = 0.1
-"Least force of a hand that pulls: more than noise and drift of a force sensor."
+"Least force of a hand that pulls: more than a force sensor's noise, and than what of its zero is not known."
 SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, 5 N/mm at 1.5 N either way."
 
