@@ -156,9 +156,11 @@ def test_the_model_is_never_asked_outside_what_it_was_shown(first) -> None:
 def test_where_the_field_lags_and_the_force_relaxes_the_gap_makes_up_for_both(planned, moving) -> None:
     """Whichever way the force goes, with the memory that the element has."""
     planner = build_core(CONFIG).planner()
-    for force_N in (1.6, 0.9, 1.3):
-        for _ in range(50):
-            plan = planned(planner, force_N, moving(planner.planned.gap_mm, sensed_s=-1.0))
+    for force_N, begins_mm in ((1.6, 100), (0.9, 150), (1.3, 200)):
+        for at_mm in range(begins_mm, begins_mm + 50):
+            handle = Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, at_mm), 42.0)
+            there = moving(planner.planned.gap_mm, sensed_s=-1.0, handle_mm=float(at_mm), handle=handle)
+            plan = planned(planner, force_N, there)
         assert plan.predicted_N == pytest.approx(force_N, abs=0.004)
 
 

@@ -9,11 +9,13 @@ from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
 from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
 from tormagd.control.believe.sensor_zero import MAX_SD_N, UNKNOWN_SD_N
+from tormagd.control.believe.slow_friction import BRISTLES_N_MM
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle, TimedSetpoint
 from tormagd.exact import plain, restore
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
+from tormagd.physics.friction import Friction
 from tormagd.safety.codes import Limit
 
 PERIOD_S = 0.004
@@ -28,6 +30,18 @@ def test_the_device_is_learned_from_measured_over_predicted_force(core, hear, mo
     assert Limit.TRIM not in plan.limits
     # a model that is too low in force is corrected by a wider gap
     assert plan.gap_mm > hear(core.planner(), 8.0, moving()).planned.gap_mm + 3.0
+
+
+def test_what_friction_has_not_followed_yet_is_no_weak_device(core, hear, planned, moving) -> None:
+    """A gap that closes at 125 mm/s, and readings of the model's own device, whose bristles bend with the travel."""
+    planner, friction = hear(core.planner(), 2.0, moving(sensed_s=0.0)), Friction(BRISTLES_N_MM, 0.0, 1.0, 1.0)
+    known, bent_mm = planner.believe.device, 1.0871 / BRISTLES_N_MM
+    for step in range(1, 60):
+        gap_mm, at_mm = 78.1 - 0.5 * step, 100.0 + 42.0 * PERIOD_S * step
+        force_N, bent_mm = friction.advance(bent_mm, 42.0, core.portrait.force_N_at(gap_mm), PERIOD_S)
+        there = {"handle_mm": at_mm, "handle": Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, at_mm), 42.0)}
+        planned(planner, 1.0, moving(gap_mm, force_N, sensed_s=planner.planned.time_s + PERIOD_S, **there))
+    assert planner.believe.device.force_N(3.0) == pytest.approx(known.force_N(3.0), abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from hypothesis import given, strategies as st
 
 from tormagd.config import Config
 from tormagd.control.believe.slow_friction import (
+    BRISTLES_N_MM,
     FASTEST_MM_S,
     MAX_STATIC,
     MIN_STATIC,
-    REACH_MM,
     SLOWS_S,
     STRIBECK_MM_S,
     SlowFriction,
@@ -81,14 +81,14 @@ def test_what_is_believed_of_a_creep_grows_by_three_deviations_of_the_fit() -> N
 
 
 def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
-    slow = SlowFriction(BOUNDS)
-    slow.follow(1.0, 0.0)
+    slow, reach_mm = SlowFriction(BOUNDS), 2.0 / BRISTLES_N_MM
+    slow.follow(2.0, 0.0)
     assert slow.followed_N == 0.0  # nothing has been travelled
     for step in range(1, 101):
-        slow.follow(1.0, 0.01 * REACH_MM * step)
-    assert slow.followed_N == pytest.approx(1.0 - math.exp(-1.0), rel=1e-9)
-    slow.follow(0.3, REACH_MM)
-    assert slow.followed_N == 0.3
+        slow.follow(2.0, 0.01 * reach_mm * step)
+    assert slow.followed_N == pytest.approx(2.0 * (1.0 - math.exp(-1.0)), rel=1e-9)
+    slow.follow(0.3, reach_mm)
+    assert slow.followed_N == pytest.approx(0.3)
     slow.follow(1.0, 0.0)  # the way back bends the bristles as well
     assert slow.followed_N > 0.3
 

@@ -1,8 +1,9 @@
 """What is believed of one device: its estimators, and which of them may learn from a reading of the force sensor.
 
 The force teaches only while friction is mobilised and the handle slides: only there the model knows the force. A
-reading is compared with the model at the *measured* gap, so no tracking error is learned. A sensor that is not believed
-teaches nothing.
+reading is compared with the model at the *measured* gap, so no tracking error is learned. Friction follows a rising
+force only as the handle goes on: what it has not followed yet is no weak device. A sensor that is not believed teaches
+nothing.
 """
 
 import math
@@ -175,7 +176,7 @@ class Believe:
         teaches only the watch on the encoder. The element's memory follows the gap of a homed device. Raises
         DomainError for a gap outside the field law's range.
         """
-        model_N: float | None = None
+        slid_N: float | None = None
         if measured is not None:
             self.memory.update(now_s, measured)
             if self._has_creep:
@@ -183,7 +184,8 @@ class Believe:
             if measured.is_homed:
                 model_N = self.memory.force_N(self._nominal.now(measured))
                 self._hear(now_s, measured, model_N)
-        return self._belief(measured, model_N)
+                slid_N = self.slow.followed_N if self._nominal.contact.slides else model_N
+        return self._belief(measured, slid_N)
 
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan.
@@ -200,8 +202,10 @@ class Believe:
             gap_mm, speed_mm_s = measured.gap_mm, measured.gap_speed_mm_s
             self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
-    def _belief(self, measured: Measured | None, model_N: float | None) -> Belief:
-        """Return the belief, and change nothing. `model_N` is the model's force now; None: nothing is predicted.
+    def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
+        """Return the belief, and change nothing. `slid_N` is the model's force as far as friction has followed it now.
+
+        With None nothing is predicted.
 
         Nothing is predicted either without `measured` (None: a silent device), or where the contact's force is not
         known. A lost encoder adds the limit HANDLE_LOST.
@@ -209,9 +213,9 @@ class Believe:
         at_speed = self.device
         device = at_speed.times(self.slow.factor_at(self.slow.creep_mm_s)) if self._has_creep else at_speed
         predicted_N: float | None = None
-        if measured is not None and model_N is not None and self._nominal.contact.is_known(measured):
+        if measured is not None and slid_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-            predicted_N = self.strength.fit.force_N(model_N) * slow
+            predicted_N = self.strength.fit.force_N(slid_N) * slow
         is_unseen = self.is_prior and not self.sensor.has_slid
         unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
@@ -225,8 +229,10 @@ class Believe:
         creep else, and for a handle that is stuck or rests beside a moved gap. The watch on a brake's encoder takes
         every reading. An old force, and a reading within MIN_DT_S of the last, teach nothing else.
         """
-        if self._nominal.contact.slides:
+        slides = self._nominal.contact.slides
+        if slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
+            self.slow.follow(model_N, measured.handle_mm)
         if measured.number == self.read or now_s - self.read_s < MIN_DT_S:
             return
         if now_s - measured.sensed_s > self._unsensed_s:
@@ -235,13 +241,13 @@ class Believe:
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
         is_mobilised = self._nominal.contact.is_known(measured)
-        is_slow = self._nominal.contact.slides and (
+        is_slow = slides and (
             rate_mm_s < MOVING_MM_S or self._is_stuck(measured, model_N) or self.handle.moved_gap_at_rest(model_N)
         )
         if is_mobilised and not is_slow:
-            self._hear_at_speed(now_s, measured, model_N, dt_s)
+            self._hear_at_speed(now_s, measured, self.slow.followed_N if slides else model_N, dt_s)
         else:
-            self._hear_at_creep(now_s, measured, model_N, dt_s, is_mobilised)
+            self._hear_at_creep(now_s, measured, dt_s, is_mobilised)
 
     def _is_stuck(self, measured: Measured, model_N: float) -> bool:
         """Tell whether the handle has stopped, with a force that is less than friction by more than STUCK_N.
@@ -254,21 +260,19 @@ class Believe:
         reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
         return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
 
-    def _hear_at_creep(self, now_s: float, measured: Measured, model_N: float, dt_s: float, is_mobilised: bool) -> None:
+    def _hear_at_creep(self, now_s: float, measured: Measured, dt_s: float, is_mobilised: bool) -> None:
         """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise.
 
-        In a dispute, or without the term `creep`, nothing is learned. The model's force follows the handle's travel in
-        any other case. A handle that rests or comes to rest teaches nothing, nor does a zero that is not known. Unless
-        `is_mobilised`, only a reading greater than expected teaches.
+        In a dispute, or without the term `creep`, nothing is learned. A handle that rests or comes to rest teaches
+        nothing, nor does a zero that is not known. Unless `is_mobilised`, only a reading greater than expected teaches.
         """
         self.strength.settle()
-        if not self._has_creep or self.sensor.is_disputed:
+        if not (self._has_creep and self.learns) or self.sensor.is_disputed:
             return
-        self.slow.follow(model_N, measured.handle_mm)
         handle = measured.handle
         rate_mm_s = abs(handle.rate_mm_s)
         is_creep = handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
-        if not self.learns or not is_creep or not SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S:
+        if not is_creep or not SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S:
             return
         expected_N = self.strength.fit.force_N(self.slow.followed_N)
         reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
@@ -281,8 +285,8 @@ class Believe:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit.
 
         A dispute of device and sensor may begin or end. A zero that a reversal shows may shift the fit in it. In a
-        dispute, or while the zero is unknown, the fit learns nothing. Sets `limits`: SENSOR_ZERO, and SENSOR,
-        DEVICE_OR_SENSOR, OFFSET_UNKNOWN or TRIM.
+        dispute, or while the zero is unknown, the fit learns nothing. `model_N` is the model's force as far as friction
+        has followed it. Sets `limits`: SENSOR_ZERO, and SENSOR, DEVICE_OR_SENSOR, OFFSET_UNKNOWN or TRIM.
         """
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
@@ -333,8 +337,6 @@ class Believe:
         Where the fit does not learn, the readings' mean is only compared with it: a dispute may begin. The force at a
         creep stays. A fit at one of its bounds adds the limit TRIM.
         """
-        if self._has_creep:
-            self.slow.follow(model_N, measured.handle_mm)
         if self.sensor.freshness.is_stale or self.sensor.wrong_s > 0.0:
             return  # the reading may be old or wrong
         if not (self.learns and self._fits):

@@ -23,8 +23,8 @@ FASTEST_MM_S: Final = 2.0 * STRIBECK_MM_S
 SLOWS_S: Final = 0.1
 """A handle that slows down creeps after some SLOWS_S. One that sticks and slips does not: if the gap opened whenever it
 sticks, it would slip further."""
-REACH_MM: Final = 0.35
-"Travel over which friction follows a rising field."
+BRISTLES_N_MM: Final = 8.0
+"Stiffness of the contact's bristles, sample 1's (plant card): friction follows a rising field as they are bent."
 LEARNED_S: Final = 0.3
 "Time constant of learning the factor at rest."
 MIN_STATIC: Final = 0.9
@@ -78,12 +78,12 @@ class SlowFriction:
     def follow(self, model_N: float, handle_mm: float) -> None:
         """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`.
 
-        A fall is followed at once, a rise by 1 - exp(-travel / REACH_MM), with the handle's travel since the last call.
-        The first call counts from 0 mm and 0 N.
+        A fall is followed at once. A rise is followed by 1 - exp(-BRISTLES_N_MM travel / model_N), with the handle's
+        travel since the last call. The first call counts from 0 mm and 0 N.
         """
         rise_N = model_N - self.followed_N
-        if rise_N > 0.0:
-            rise_N *= 1.0 - math.exp(-abs(handle_mm - self.handle_mm) / REACH_MM)
+        if rise_N > 0.0 and model_N > 0.0:
+            rise_N *= 1.0 - math.exp(-BRISTLES_N_MM * abs(handle_mm - self.handle_mm) / model_N)
         self.followed_N += rise_N
         self.handle_mm = handle_mm
 
