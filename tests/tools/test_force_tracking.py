@@ -217,6 +217,8 @@ def test_a_missed_bound_is_named() -> None:
     [
         envelope.Case("draw 17", "flicks", "steps"),
         envelope.Case("sample_2", "300 mm/s", "1 N", 0.0, -300.0),
+        envelope.Case("draw 46", "other reversals", "steps"),
+        envelope.Case("sample_2", "ladder", "ladder at 0.8 N"),
     ],
     ids=str,
 )
@@ -224,6 +226,7 @@ def test_a_corner_keeps_the_bounds(case) -> None:
     found = envelope.run(case)
     assert found.faults == ()
     assert found.over_N <= envelope.BOUNDS["over_N"]
+    assert all(abs(error_N) <= envelope.BOUNDS["settled_N"] for _, _, error_N in found.settled)
     assert found.peak_N <= envelope.BOUNDS["peak_N"]
 
 

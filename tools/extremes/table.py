@@ -240,7 +240,7 @@ def strength(stage: Strength, draw: Draw) -> object:
 
 def slow_friction(stage: SlowFriction, draw: Draw) -> object:
     stage.follow(draw(1.1), draw(10.0))
-    stage.rescale(draw(1.1), draw(1.1))
+    stage.rescale(draw(1.1), draw(1.1), abs(draw(5.0)))
     if UNSEEN.force_N(stage.followed_N) > 0.1:  # as `believe` has it
         stage.update(UNSEEN, abs(draw(1.0)) % 6.0, draw(1.2), PLAN_S)
     return stage.factor_at(abs(draw(1.0)))

@@ -21,7 +21,7 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
     return {
         "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),
         "offset": _told(fit.offset_N, fit.offset_sd_N, "N", terms.offset),
-        "low_speed_factor": _told(believe.slow.factor, None, "", terms.creep),
+        "low_speed_factor": _told(believe.slow.factor_at(0.0), None, "", terms.creep),
         "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", believe.knows_zero(now_s)),
         "carriage_lag": _told(believe.carriages.lag_s, None, "s", terms.motor and is_ahead),
         "acceleration_scale": _told(stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),

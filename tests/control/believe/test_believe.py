@@ -44,6 +44,15 @@ def test_what_friction_has_not_followed_yet_is_no_weak_device(core, hear, planne
     assert planner.believe.device.force_N(3.0) == pytest.approx(known.force_N(3.0), abs=0.02)
 
 
+@pytest.mark.parametrize("static", [0.95, 1.12])
+def test_a_reading_just_above_a_creep_teaches_the_force_there(planner, hear, moving, static: float) -> None:
+    """At 6 mm/s some of static friction is left: a fit that took the reading for one at speed counted it twice."""
+    planner.teach(Learned(slow_factor=static, slow_learned=1.0))
+    slow = {"handle": Handle(MOBILISED_MM, 6.0, TURN, 6.0)}
+    plan = hear(planner, 8.0, moving(force_N=0.9 * 1.0871, **slow)).planned
+    assert plan.predicted_N == pytest.approx(0.9 * 1.0871, abs=6e-3)
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -37,12 +37,12 @@ def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit =
     return slow
 
 
-def rescaled(slow: SlowFriction, before_N: float, after_N: float) -> float:
-    """Its factor once the fit has learned."""
+def rescaled(slow: SlowFriction, before_N: float, after_N: float, rate_mm_s: float = 42.0) -> SlowFriction:
+    """What is known of slow friction once the fit has learned at that rate."""
     after = SlowFriction(BOUNDS)
-    after.factor, after.learned = slow.factor, slow.learned
-    after.rescale(before_N, after_N)
-    return after.factor
+    after.factor, after.learned, after.slowness = slow.factor, slow.learned, slow.slowness
+    after.rescale(before_N, after_N, rate_mm_s)
+    return after
 
 
 def test_what_a_creep_shows_is_learned_and_not_believed_at_speed() -> None:
@@ -93,13 +93,27 @@ def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
     assert slow.followed_N > 0.3
 
 
-def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
+@pytest.mark.parametrize("rate_mm_s", [0.5, 2.0, 4.0])
+def test_beside_a_fit_that_learned_the_force_at_a_creep_stays(rate_mm_s: float) -> None:
+    slow = crept(1.05, 9.0, rate_mm_s)
+    after = rescaled(slow, 1.0, 1.05)
+    assert after.factor_at(rate_mm_s) * 1.05 == pytest.approx(slow.factor_at(rate_mm_s), rel=1e-3)
+    # a fit that learned there shows what the force at a creep is
+    assert rescaled(slow, 1.0, 1.05, rate_mm_s).factor == pytest.approx(slow.factor)
+
+
+def test_a_fit_that_errs_by_rate_and_comes_back_leaves_slow_friction_as_it_was() -> None:
+    slow = crept(1.05, 9.0, 4.0)
+    gone = rescaled(slow, 1.0, 1.5)
+    assert (gone.factor_at(0.0), rescaled(gone, 1.5, 1.0).factor) == (MIN_FACTOR, pytest.approx(slow.factor))
+
+
+def test_what_a_creep_has_not_shown_is_what_the_fit_says() -> None:
     slow = crept(1.1, 3.0)
-    assert rescaled(slow, 1.0, 1.05) * 1.05 == pytest.approx(slow.factor, rel=1e-4)
-    assert rescaled(slow, 1.0, 1.0) == rescaled(slow, 1.0, -0.1) == slow.factor
-    assert rescaled(crept(1.0, 9.0), 1.0, 0.4) == MAX_FACTOR  # of more than twice the force
-    # of a creep that was never seen nothing is known but what the fit says
-    assert rescaled(SlowFriction(BOUNDS), 1.0, 0.8) == 1.0
+    assert rescaled(slow, 1.0, 1.0).factor == pytest.approx(slow.factor)
+    assert rescaled(slow, 1.0, -0.1).factor == slow.factor
+    assert rescaled(crept(1.0, 9.0), 1.0, 0.4).factor_at(0.0) == MAX_FACTOR  # of more than twice the force
+    assert rescaled(SlowFriction(BOUNDS), 1.0, 0.8).factor == 1.0
 
 
 @given(
@@ -117,8 +131,7 @@ def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float
     for expected_N, rate_mm_s, reading_N, dt_s, handle_mm in events:
         slow.follow(expected_N, handle_mm)
         slow.update(fit, rate_mm_s, reading_N, dt_s)
-        slow.rescale(expected_N, abs(reading_N))
-        assert MIN_FACTOR <= slow.factor <= MAX_FACTOR
+        slow.rescale(expected_N, abs(reading_N), rate_mm_s)
         assert 0.0 <= slow.followed_N <= 5.0
         assert MIN_FACTOR <= slow.factor_at(rate_mm_s) <= MAX_FACTOR
 

@@ -146,7 +146,7 @@ class Believe:
         The fit is that of `strength`, without a dispute's `lead_N`; UNSEEN itself for a device that has shown nothing.
         """
         slow = self.slow
-        return Learned(self.strength.fit, slow.factor, slow.learned, self.zero.zero_N, self.carriages.lag_s)
+        return Learned(self.strength.fit, slow.factor_at(0.0), slow.learned, self.zero.zero_N, self.carriages.lag_s)
 
     def teach(self, learned: Learned) -> None:
         """Replace all that is known of the device by `learned`, and begin its estimators anew.
@@ -245,7 +245,8 @@ class Believe:
             rate_mm_s < MOVING_MM_S or self._is_stuck(measured, model_N) or self.handle.moved_gap_at_rest(model_N)
         )
         if is_mobilised and not is_slow:
-            self._hear_at_speed(now_s, measured, self.slow.followed_N if slides else model_N, dt_s)
+            slid_N = self.slow.followed_N * self.slow.factor_at(rate_mm_s) if slides else model_N
+            self._hear_at_speed(now_s, measured, slid_N, dt_s)
         else:
             self._hear_at_creep(now_s, measured, dt_s, is_mobilised)
 
@@ -285,8 +286,9 @@ class Believe:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit.
 
         A dispute of device and sensor may begin or end. A zero that a reversal shows may shift the fit in it. In a
-        dispute, or while the zero is unknown, the fit learns nothing. `model_N` is the model's force as far as friction
-        has followed it. Sets `limits`: SENSOR_ZERO, and SENSOR, DEVICE_OR_SENSOR, OFFSET_UNKNOWN or TRIM.
+        dispute, or while the zero is unknown, the fit learns nothing. `model_N` is the model's force at the handle's
+        rate, as far as friction has followed it. Sets `limits`: SENSOR_ZERO, and SENSOR, DEVICE_OR_SENSOR,
+        OFFSET_UNKNOWN or TRIM.
         """
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
@@ -310,13 +312,13 @@ class Believe:
             sensor.compare(fit, model_N)
             self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
         else:
-            self._fit(measured, model_N, reading_N, dt_s)
+            self._fit(model_N, rate_mm_s, reading_N, dt_s)
         if sensor.is_disputed and not was_disputed:
-            self._dispute(model_N)
+            self._dispute(model_N, rate_mm_s)
         elif was_disputed and not sensor.is_disputed:
             zero.trust()
 
-    def _dispute(self, model_N: float) -> None:
+    def _dispute(self, model_N: float, rate_mm_s: float) -> None:
         """Take the device for what it was before the readings left the fit, and the zero for unknown.
 
         Before the handle has slid, only what was taught from another day remains of the fit. The force at a creep
@@ -328,14 +330,14 @@ class Believe:
             self.strength.shift(self.sensor.back_N)
         else:
             self.strength.forget(self.taught)  # all else known of the device came from this sensor
-        self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
+        self.slow.rescale(before_N, self.strength.fit.force_N(model_N), rate_mm_s)
 
-    def _fit(self, measured: Measured, model_N: float, reading_N: float, dt_s: float) -> None:
+    def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing.
 
-        `model_N` is the model's force. A fit from another day that the first slide contradicts is forgotten first.
-        Where the fit does not learn, the readings' mean is only compared with it: a dispute may begin. The force at a
-        creep stays. A fit at one of its bounds adds the limit TRIM.
+        `model_N` is the model's force at the handle's rate, `rate_mm_s`. A fit from another day that the first slide
+        contradicts is forgotten first. Where the fit does not learn, the readings' mean is only compared with it: a
+        dispute may begin. The force at a slower creep stays. A fit at one of its bounds adds the limit TRIM.
         """
         if self.sensor.freshness.is_stale or self.sensor.wrong_s > 0.0:
             return  # the reading may be old or wrong
@@ -349,8 +351,8 @@ class Believe:
         self.strength.update(model_N, reading_N, dt_s)
         after_N = self.strength.fit.force_N(model_N)
         self.sensor.fit_moved(after_N - before_N, after_N, dt_s)
-        # the force at a creep stays while scale and offset are learned
-        self.slow.rescale(before_N, after_N)
+        # the force at a slower creep stays while scale and offset are learned
+        self.slow.rescale(before_N, after_N, rate_mm_s)
         if self.strength.is_held:
             self.limits = (Limit.TRIM, *self.limits)
 

@@ -44,9 +44,11 @@ class SlowFriction:
     """
 
     factor: float = 1.0
-    "k."
+    "k, without its bounds: what a fit that errs by rate takes from it comes back at the rate where it was learned."
     learned: float = 0.0
     "Share of the factor that was learned at a creep, 0..1."
+    slowness: float = 1.0
+    "e(v) where it was learned, by the same low pass; 1, as at rest, until then."
     followed_N: float = 0.0
     "The model's force as far as the bristles of the contact have followed it."
     handle_mm: float = 0.0
@@ -63,8 +65,11 @@ class SlowFriction:
         self._most: Final = most
 
     def factor_at(self, rate_mm_s: float) -> float:
-        """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
-        return 1.0 + _slowness(rate_mm_s) * (self.factor - 1.0)
+        """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest.
+
+        `factor_bounds` hold k.
+        """
+        return 1.0 + _slowness(rate_mm_s) * (min(max(self.factor, self._least), self._most) - 1.0)
 
     def slide(self, now_s: float, sliding_mm_s: float) -> None:
         """Update `creep_mm_s` with the level of rate that friction has, `sliding_mm_s` >= 0, at `now_s`.
@@ -87,13 +92,17 @@ class SlowFriction:
         self.followed_N += rise_N
         self.handle_mm = handle_mm
 
-    def rescale(self, before_N: float, after_N: float) -> None:
+    def rescale(self, before_N: float, after_N: float, rate_mm_s: float) -> None:
         """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N` to `after_N`.
 
-        Only the share `learned` at a creep counts, and `factor_bounds` hold k. A force of 0 or less changes nothing.
+        It stays where k was learned, and by the share that was `learned` there. The nearer to that `rate_mm_s` >= 0 is,
+        at which the fit learned, the less it stays: one reading cannot teach both. A force of 0 or less changes
+        nothing.
         """
         if before_N > 0.0 and after_N > 0.0:
-            self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), self._least), self._most)
+            kept = self.learned * max(1.0 - _slowness(rate_mm_s) / self.slowness, 0.0)
+            at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
+            self.factor = 1.0 + (at_creep - 1.0) / self.slowness
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within `believable`.
@@ -110,6 +119,7 @@ class SlowFriction:
         least, most = believable(fit, self.followed_N, self._bounds)
         self.factor = min(max(self.factor + share * (shown - self.factor), least), most)
         self.learned += share * (1.0 - self.learned)
+        self.slowness += share * (slowness - self.slowness)
 
 
 def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
