@@ -8,7 +8,6 @@ WORKERS ?= auto
 PYTHONS ?= 3.11 3.12 3.13
 GOAL ?= test
 SEARCHES ?= 5
-MUTANTS ?= 60
 SEED ?= 1
 PLANT ?= sample_1
 SECONDS ?= 12
@@ -37,7 +36,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb wheels run test compiled live yielding interpreted fuzz coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb wheels run test compiled live yielding interpreted fuzz coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py --plant '$(PLANT)'
@@ -81,17 +80,6 @@ search: $(VENV)/.dev
 	    $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
 	        --hypothesis-profile=search || exit 1; \
 	done
-
-# faults put one at a time into a clone of what is committed; the core is interpreted there, and survivors are listed
-mutation: $(VENV)/.dev
-	$(MAKE) --no-print-directory fetched EXTRAS=mutation
-	rm -rf build/mutation && git clone --quiet . build/mutation
-	cd build/mutation && export PATH='$(CURDIR)/$(BIN)':"$$PATH" PYTHONPATH=. TORMAG_COMPILED=0 && \
-	    cosmic-ray init tools/mutation.toml mutants.sqlite && \
-    cr-filter-operators mutants.sqlite tools/mutation.toml && \
-	    python tools/mutation_sample.py mutants.sqlite $(MUTANTS) $(SEED) && \
-	    cosmic-ray exec tools/mutation.toml mutants.sqlite && \
-	    cr-report --surviving-only --show-diff mutants.sqlite
 
 # what is committed, from nothing, with every supported Python; one that is not here is named
 pythons:
