@@ -74,7 +74,7 @@ class Planner:
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
-        is_believed = belief.sensor_doubted_s == 0.0
+        is_believed = belief.sensor_doubted_s == 0.0 and self.believe.knows_zero(now_s)
         travel = self.way.update(measured, self.believe.zero.zero_N, is_sensor_believed=is_believed)
         held_N = None if is_followed else self._held_N(measured, belief.device)
         # at the open gap the element's field lags, and gives more than the portrait: from there the path begins

@@ -44,6 +44,15 @@ def test_what_friction_has_not_followed_yet_is_no_weak_device(core, hear, planne
     assert planner.believe.device.force_N(3.0) == pytest.approx(known.force_N(3.0), abs=0.02)
 
 
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_force_is_a_pull_only_where_the_sensors_zero_is_known(planner, planned, moving, is_known: bool) -> None:
+    """A hand that rests beside a zero that has drifted is not let go."""
+    if not is_known:
+        planner.believe.zero.doubt()
+    planned(planner, 1.0, moving(force_N=-0.15, **RESTING))
+    assert planner.way.travel.is_pushing is not is_known
+
+
 @pytest.mark.parametrize("static", [0.95, 1.12])
 def test_a_reading_just_above_a_creep_teaches_the_force_there(planner, hear, moving, static: float) -> None:
     """At 6 mm/s some of static friction is left: a fit that took the reading for one at speed counted it twice."""
