@@ -102,7 +102,7 @@ class SlowFriction:
         if before_N > 0.0 and after_N > 0.0:
             kept = self.learned * max(1.0 - _slowness(rate_mm_s) / self.slowness, 0.0)
             at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
-            self.factor = 1.0 + (at_creep - 1.0) / self.slowness
+            self.factor = 1.0 + (min(max(at_creep, self._least), self._most) - 1.0) / self.slowness
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within `believable`.
