@@ -94,7 +94,7 @@ def run(
     at: Callable[[SetpointInbox, float], None] = lambda inbox, now_s: None,
 ) -> Run:
     """The loop with these publishers; `at` is called in every tick, as an operator may."""
-    inbox, way, samples, start_s = SetpointInbox(sources), Way(Budget()), [], loop.now_s
+    inbox, way, samples, start_s = SetpointInbox(sources), Way(), [], loop.now_s
     coming = heapq.merge(*(each.messages(start_s, lasts_s) for each in publishers))
     following = next(coming, None)
     for _ in range(round(lasts_s * 1e3)):
@@ -216,7 +216,7 @@ def test_a_way_that_takes_too_long_is_stale_and_says_why(armed: ClosedLoop) -> N
 def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
     noise = random.Random(1)
     done = run(armed, Publisher(swell_N, way_s=lambda t: noise.uniform(0.08, 0.0815)), lasts_s=6.0)
-    found = done.way.report(400.0, armed.planner.believe.carriages.lag_s)
+    found = done.way.report(400.0, armed.planner.believe.carriages.lag_s, Budget())
     delay_us = done.of("a").delay_us
     # in ticks of 1 ms: what arrives is read in the next, planned in it, and driven in the one after; bins are 3% wide
     assert 0.0 < found.to_duty_us.p50 - delay_us.p50 <= 1_000.0 + 0.04 * delay_us.p50

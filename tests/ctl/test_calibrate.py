@@ -348,17 +348,17 @@ def test_a_refused_fit_is_the_commands_refusal(tmp_path):
 # -- `--device`: what becomes of its findings; tests/commission has its courses ----------------------------------------
 
 
-def finding(value_mN):
-    return Finding("steps", value_mN, 0.0, "mN", -60.0, 60.0, "look")
-
-
 @pytest.fixture
 def calibrated(fake_daemon, monkeypatch, ctl):
     """Runs the command beside a daemon that says so."""
 
     def run(**status):
         monkeypatch.setattr(
-            calibrate_device, "armed", lambda *_: contextlib.nullcontext(Played([finding(-3.0), finding(10.0)]))
+            calibrate_device,
+            "armed",
+            lambda *_: contextlib.nullcontext(
+                Played([Finding("steps", mN, 0.0, "mN", -60.0, 60.0, "look") for mN in (-3.0, 10.0)])
+            ),
         )
         monkeypatch.setattr(calibrate_device, "KEPT_WITHIN_S", 0.2)
         fake_daemon.says(**{"setpoint_age_ms": None, "least_N": 0.6} | status)

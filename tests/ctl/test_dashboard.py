@@ -53,17 +53,12 @@ def tick(k: int) -> tuple[Any, ...]:
 
 
 @pytest.fixture(scope="module")
-def recorded_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     path: Path = tmp_path_factory.mktemp("recorded") / "a.mcap"
     about = {"scene": json.dumps({"name": "pulse"}), "portrait": json.dumps(PORTRAIT)}
     with RecordingWriter(path, about) as writer:
         writer.ticks(TickBatch(v=1, columns=COLUMNS, rows=tuple(tick(k) for k in range(round(100 * SECONDS)))))
-    return path
-
-
-@pytest.fixture(scope="module")
-def recorded(recorded_path: Path) -> Recorded:
-    return Recorded(RecordingFile(recorded_path))
+    return Recorded(RecordingFile(path))
 
 
 @asynccontextmanager

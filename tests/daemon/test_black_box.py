@@ -165,9 +165,7 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert state_folder("", "blackbox") is None
     box = BlackBox(None, {}, 1_000)
-    loop = closed_loop(core)
-    box.begin(core.stepper(), core.planner(), loop.connection)
-    loop.tick()
+    box.begin(core.stepper(), core.planner(), closed_loop(core).connection)
     box.journal.stepped()
     assert box.journal.take() == []
     with pytest.raises(RefusedError, match="no folder is named"):

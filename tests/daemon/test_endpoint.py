@@ -86,15 +86,12 @@ class Rig:
         return made
 
     def publisher(self) -> "zmq.Socket[bytes]":
-        """A publisher that the endpoint has subscribed to."""
+        """A publisher that the endpoint has subscribed to: what is published earlier is lost, as everywhere in
+        ZeroMQ."""
         socket = self.connect(zmq.XPUB, "setpoint")
-        self.subscribed(socket)
-        return socket
-
-    def subscribed(self, socket: "zmq.Socket[bytes]") -> None:
-        """Waits for the endpoint's subscription; what is published earlier is lost, as everywhere in ZeroMQ."""
         self.until(lambda: socket.poll(0) > 0)
         assert socket.recv() == b"\x01"
+        return socket
 
     def until(self, reached: Callable[[], bool], work: Callable[[], object] | None = None) -> None:
         """Does some work, or drains setpoints, until it is so; in between others have their turn."""
@@ -146,11 +143,6 @@ class Rig:
         """Endpoint, address, key and reason of all whose messages were not read."""
         return [(it.endpoint, it.address, it.key, it.reason) for it in self.endpoint.report().drops]
 
-    @property
-    def force_N(self) -> float:
-        """Of the newest setpoint, which there has to be."""
-        return self.endpoint.inbox.newest.force_N
-
     def close(self) -> None:
         self.endpoint.close()
         self.context.destroy(linger=0)
@@ -185,7 +177,7 @@ def test_garbage_between_setpoints_is_counted_and_does_not_hide_them(rig: Rig) -
         publisher.send(setpoint(seq, 1.0 + seq / 10.0))
         publisher.send(b"")
     rig.until(lambda: rig.endpoint.inbox.refused == 10)
-    assert (rig.endpoint.inbox.accepted, rig.force_N) == (5, 1.4)
+    assert (rig.endpoint.inbox.accepted, rig.endpoint.inbox.newest.force_N) == (5, 1.4)
 
 
 def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:
@@ -276,7 +268,7 @@ def test_a_topic_has_listeners_only_where_it_was_asked_for_by_its_name(rig: Rig)
     listeners, motion = rig.endpoint.listeners, Motion(v=1, t_ns=2, device_s=0.5, handle_mm=-3.0, handle_mm_s=20.0)
 
     def tell() -> None:
-        rig.endpoint.publish_topic(MOTION_TOPIC, motion)
+        rig.endpoint.publish(motion, MOTION_TOPIC)
         rig.tell()
 
     everything, snapshots, motions = (rig.connect(zmq.SUB, "telemetry") for _ in range(3))

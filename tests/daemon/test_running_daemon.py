@@ -355,31 +355,43 @@ def test_the_watchdog_is_fed_while_plans_are_fresh(alone: Running, monkeypatch: 
     assert notified == []
 
 
-def test_sighup_takes_over_what_it_can_and_names_what_waits(alone: Running, caplog: pytest.LogCaptureFixture) -> None:
-    read = Config(scene="pulse", endpoints=in_folder(alone.folder), realtime=RealTime(watchdog_ms=800.0))
-    alone.daemon._read_again = lambda: read
+@pytest.mark.parametrize(
+    ("read", "said", "watchdog_ms"),
+    [
+        (
+            Config(scene="pulse", realtime=RealTime(watchdog_ms=800.0)),
+            [
+                "configuration read again: now in force: realtime.watchdog_ms",
+                "not before a restart (systemctl restart tormagd): scene",
+            ],
+            800.0,
+        ),
+        (
+            # in the file it is above the timeout, which waits for a restart
+            Config(
+                realtime=RealTime(watchdog_ms=40.0),
+                device=DeviceTable(command_timeout_ms=30.0, measurement_timeout_ms=30.0),
+            ),
+            [
+                "the configuration stays as it was: realtime.watchdog_ms = 40.0: allowed is over "
+                "device.command_timeout_ms = 50, which stays until a restart; next: mend that and reload again"
+            ],
+            WATCHDOG_MS,
+        ),
+    ],
+    ids=["what waits", "what is refused"],
+)
+def test_sighup_takes_over_what_it_can_and_names_the_rest(
+    alone: Running, caplog: pytest.LogCaptureFixture, read: Config, said: list[str], watchdog_ms: float
+) -> None:
+    alone.daemon._read_again = lambda: msgspec.structs.replace(read, endpoints=in_folder(alone.folder))
     with caplog.at_level(logging.INFO):
         signal.raise_signal(signal.SIGHUP)
         while "restart" not in caplog.text:
             alone.tick()
-    assert [record.getMessage() for record in caplog.records][-3:] == [
-        "no list of keys to read again: there is no endpoints.curve",
-        "configuration read again: now in force: realtime.watchdog_ms",
-        "not before a restart (systemctl restart tormagd): scene",
-    ]
-    assert alone.command("describe")["configuration"]["realtime"]["watchdog_ms"] == 800.0
-
-
-def test_a_watchdog_that_the_timeout_in_force_does_not_allow_is_refused(
-    alone: Running, caplog: pytest.LogCaptureFixture
-) -> None:
-    """In the file it is above the timeout, which waits for a restart."""
-    timeouts = DeviceTable(command_timeout_ms=30.0, measurement_timeout_ms=30.0)
-    alone.daemon._read_again = lambda: Config(realtime=RealTime(watchdog_ms=40.0), device=timeouts)
-    signal.raise_signal(signal.SIGHUP)
-    alone.until(lambda _: "stays as it was" in caplog.text, "the configuration is refused")
-    assert "realtime.watchdog_ms = 40.0: allowed is over device.command_timeout_ms = 50" in caplog.text
-    assert alone.command("describe")["configuration"]["realtime"]["watchdog_ms"] == WATCHDOG_MS
+    found = [record.getMessage() for record in caplog.records][-1 - len(said) :]
+    assert found == ["no list of keys to read again: there is no endpoints.curve", *said]
+    assert alone.command("describe")["configuration"]["realtime"]["watchdog_ms"] == watchdog_ms
 
 
 def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.LogCaptureFixture) -> None:

@@ -230,16 +230,16 @@ def planned(stamp_s: float) -> Plan:
 
 
 def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -> None:
-    way = Way(Budget())
+    way = Way()
     way.ticked(0.5, planned(-math.inf))
     way.to_duty.refresh()
-    found = way.report(400.0, 0.013)
+    found = way.report(400.0, 0.013, Budget())
     assert (found.to_duty_us.max, found.total_ms) == (0.0, None)
     for tick in range(1_000):
         # a new one every 10 ms, 20 ms old when it is followed first
         way.ticked(1.0 + tick * 1e-3, planned(1.0 + tick // 10 * 0.01 - 0.02))
     way.to_duty.refresh()
-    found = way.report(400.0, 0.013)
+    found = way.report(400.0, 0.013, Budget())
     assert (found.to_duty_us.max, found.to_duty_us.p50) == (
         pytest.approx(20_000.0, abs=1.0),
         pytest.approx(20_000.0, rel=0.04),
@@ -253,9 +253,9 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
     # one that has gone stale ends no way
     way.ticked(9.0, planned(-math.inf))
     way.to_duty.refresh()
-    found = way.report(None, 0.013)
+    found = way.report(None, 0.013, Budget())
     assert (found.to_duty_us.max, found.total_ms) == (pytest.approx(20_000.0, abs=1.0), None)
 
 
 def test_the_ways_budget_is_the_scenes_where_it_states_one() -> None:
-    assert [Way(each).report(None, 0.0).budget_ms for each in (Budget(delay_ms=150.0), Budget())] == [150.0, 400.0]
+    assert [Way().report(None, 0.0, each).budget_ms for each in (Budget(delay_ms=150.0), Budget())] == [150.0, 400.0]

@@ -8,12 +8,12 @@ import pytest
 from tormagd.assembly.build import Core
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Outside, Plan
-from tormagd.daemon.verdict import ARRIVES, CANNOT, FIELD, RENDERED, GapMotion, Judged, judged
+from tormagd.daemon.verdict import ARRIVES, CANNOT, FIELD, RENDERED, Judged, judged
 from tormagd.model.features import FEATURES
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import OperatingState
 
-CARRIAGES = GapMotion(gap_speed_mm_s=40.0, lag_s=0.01, tolerance_N=0.05, release_N_s=2.0)
+CARRIAGES = {"gap_speed_mm_s": 40.0, "lag_s": 0.01, "tolerance_N": 0.05, "release_N_s": 2.0}
 STRONG = DeviceFit(scale=1.25)
 NOTHING: tuple[Limit, ...] = ()
 
@@ -35,7 +35,7 @@ def found(
     gap_mm = core.portrait.gap_mm_at(device.model_N(shown_N))
     if math.isnan(planned.gap_mm):
         planned = planned.replaced(gap_mm=core.portrait.gap_mm_at(device.model_N(planned.governed_N)))
-    return judged(planned, state, gap_mm, core.portrait, device, CARRIAGES)
+    return judged(planned, state, gap_mm, core.portrait, device, **CARRIAGES)
 
 
 @pytest.mark.parametrize(("shown_N", "is_rendered"), [(1.449, False), (1.451, True), (1.549, True), (1.551, False)])
@@ -47,8 +47,8 @@ def test_it_is_rendered_within_what_the_scene_tolerates(core: Core, shown_N: flo
 def test_the_gap_is_held_against_the_plans_with_the_elements_memory_in_it(core: Core) -> None:
     planned_mm = core.portrait.gap_mm_at(STRONG.model_N(1.5)) - 3.0
     planned = plan(1.5, gap_mm=planned_mm)
-    assert judged(planned, OperatingState.ENABLED, planned_mm, core.portrait, STRONG, CARRIAGES).outcome == RENDERED
-    judgement = judged(planned, OperatingState.ENABLED, planned_mm + 8.0, core.portrait, STRONG, CARRIAGES)
+    assert judged(planned, OperatingState.ENABLED, planned_mm, core.portrait, STRONG, **CARRIAGES).outcome == RENDERED
+    judgement = judged(planned, OperatingState.ENABLED, planned_mm + 8.0, core.portrait, STRONG, **CARRIAGES)
     assert judgement == (ARRIVES, pytest.approx(1e3 * (8.0 / 40.0 + 0.01), abs=0.051), ())
 
 
@@ -101,4 +101,4 @@ def test_the_models_range_holds_where_its_field_was_not_followed(core: Core) -> 
 @pytest.mark.parametrize("state", [OperatingState.DISABLED, OperatingState.PAUSED, OperatingState.FAULT])
 def test_a_device_that_does_not_follow_says_its_state(core: Core, state: OperatingState) -> None:
     assert found(core, plan(1.5), 1.5, state) == (CANNOT, None, (str(state),))
-    assert judged(plan(1.5), state, None, core.portrait, STRONG, CARRIAGES).why == (str(state),)
+    assert judged(plan(1.5), state, None, core.portrait, STRONG, **CARRIAGES).why == (str(state),)

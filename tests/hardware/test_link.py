@@ -433,8 +433,7 @@ def test_the_quality_goes_with_the_measurement(link: DeviceLink) -> None:
         link.drive(0.0, 0.0, DriveMode.OFF)
         if tick % 2:
             link.receive(now_s, State(0.0, 0.0, 0.0, tick // 2 % 256))
-        if link.is_judging(now_s):
-            link.judge(now_s, frames=tick, damaged=tick, unsent=tick // 10)
+        link.judge(now_s, frames=tick, damaged=tick, unsent=tick // 10)
     measurement = link.measurement
     assert measurement.link.unanswered == pytest.approx(0.5, abs=0.01)
     assert (measurement.link.damaged, measurement.link.unsent) == pytest.approx((0.5, 0.1), abs=0.001)

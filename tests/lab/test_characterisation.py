@@ -207,8 +207,6 @@ def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(LabError, match=said):
             read_compression(path)
-    with pytest.raises(LabError, match="absent"):
-        read_columns(tmp_path / "absent.csv", ("a",))
 
 
 # -- relaxation --------------------------------------------------------------------------------------------------------

@@ -120,7 +120,7 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
         ((*TRAIN, data, "--out", "m.safetensors", *more), text, reason)
         for data, text, more, reason in (
             ("given", ROWS + "0,0,nan,40,1\n", (), "row 2, field_mT: 'nan'"),
-            ("absent", "", (), "cannot be read"),
+            ("absent", "", (), "absent: cannot be read: No such file"),
             ("given", GOOD, ("--out", "absent/m.safetensors"), "cannot write"),
             ("given", GOOD, ("--out", "."), "cannot write .: allowed is a file"),
             ("given", GOOD, ("--hidden", "0"), "hidden = 0"),

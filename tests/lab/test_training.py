@@ -103,11 +103,6 @@ def test_a_malformed_file_is_refused(tmp_path: Path, lines: tuple[str, ...], mes
         read_csv(path)
 
 
-def test_a_file_that_is_missing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(LabError, match=r"d\.csv: cannot be read: No such file"):
-        read_csv(tmp_path / "d.csv")
-
-
 def test_columns_may_stand_in_any_order(tmp_path: Path) -> None:
     lines = (HEADER + ",cycle,time_s", GOOD + ",1,2", GOOD + ",3,4")
     turned = [",".join(reversed(line.split(","))) for line in lines]

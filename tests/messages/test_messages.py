@@ -25,6 +25,7 @@ from tormagd_client.messages import (
 )
 from tormagd_client.printable import LONGEST_SHOWN
 
+WALL = {"handle_mm": 1.0, "stiffness_N_mm": 0.5}
 SETPOINT: dict[str, Any] = {"v": 1, "source": "a", "seq": 7, "stamp_ns": 10**18, "servo_cf": 1.5, "valid_for_ms": 50.0}
 REQUEST: dict[str, Any] = {"v": 1, "id": 3, "command": "status"}
 TYPES = (Setpoint, Telemetry, Request, Reply)
@@ -174,6 +175,12 @@ def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> Non
         ({"preview_N": [1.0]}, "preview_dt_ms = None"),
         ({"preview_N": [1.0], "preview_dt_ms": 0.0}, "preview_dt_ms = 0.0"),
         ({"preview_N": [1.0], "preview_dt_ms": math.inf}, "preview_dt_ms = inf"),
+        ({"contact": WALL | {"handle_mm": 10_001.0}}, "contact.handle_mm = 10001.0: allowed is -10000..10000"),
+        ({"contact": WALL | {"handle_mm": math.nan}}, "contact.handle_mm = nan: allowed is -10000..10000"),
+        ({"contact": WALL | {"stiffness_N_mm": -0.1}}, "contact.stiffness_N_mm = -0.1: allowed is 0..100"),
+        ({"contact": WALL | {"stiffness_N_mm": 101.0}}, "contact.stiffness_N_mm = 101.0: allowed is 0..100"),
+        ({"contact": WALL | {"friction_N": -0.1}}, "contact.friction_N = -0.1: allowed is 0..1000"),
+        ({"contact": WALL | {"friction_N": math.inf}}, "contact.friction_N = inf: allowed is 0..1000"),
     ],
 )
 def test_values_out_of_range_are_named(fields: dict[str, Any], name: str) -> None:

@@ -106,12 +106,10 @@ def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bo
     """Return the profile in `data`, the bytes of a profile's file; no file is read here.
 
     `serial_number`, `insert` and `model` are those in use; `model` is the model's fingerprint, SHA-256 in hexadecimal.
-    Raises ProfileError for data over MAX_BYTES, for data that are no profile, and for a profile of another device,
+    Raises ProfileError for data that are no profile, and for a profile of another device,
     insert or model. Values beyond the `bounds` of a device raise ProfileError, too. Its age and `gains` are not looked
     at.
     """
-    if len(data) > MAX_BYTES:
-        raise ProfileError(f"{len(data)} bytes: allowed is {MAX_BYTES}")
     try:
         profile = msgspec.json.decode(data, type=Profile)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

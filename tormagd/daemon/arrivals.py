@@ -41,12 +41,9 @@ class Arrivals:
         A message that came after the last `look` is seen only where the socket counts as ready. A socket that is found
         empty counts as ready no longer.
         """
-        if socket not in self._ready:
-            return False
-        if is_readable(socket):
-            return True
-        self._ready.discard(socket)
-        return False
+        if socket in self._ready and not is_readable(socket):
+            self._ready.discard(socket)
+        return socket in self._ready
 
 
 def is_readable(socket: "zmq.Socket[bytes]") -> bool:

@@ -115,8 +115,6 @@ class BlackBox:
 
         The keeper gets the new `header` and forgets all entries of the scene before, as do journal and packer here.
         """
-        if self._beside is None or self._folder is None:
-            return
         self.journal.take()
         self._packer.take()
         self._send(Begin(str(self._folder), header, self._key))

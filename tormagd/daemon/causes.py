@@ -78,8 +78,10 @@ class Causes:
         explanations of limits about publishers, and go before those of LIMITS. `measurement` is the newest; None
         without a device: LINK_DEGRADED and CLOCK then have no figures. Raises KeyError for a code that neither has.
         """
-        told = {Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered"}
-        told |= {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"}
+        told = {
+            Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered",
+            Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}",
+        }
         if measurement is not None:
             told[Limit.LINK_DEGRADED] = f"{LIMITS[Limit.LINK_DEGRADED].cause}: {measurement.link}"
             told[Limit.CLOCK] = f"{LIMITS[Limit.CLOCK].cause}: {measurement.link.clock_drift:+.1%}"

@@ -129,21 +129,19 @@ class Endpoint:
             peer = self._sender(frame, "setpoint")
             if not self._allowance.grants(peer, now_s):
                 self._drops.add("setpoint", peer, TOO_MUCH)
-                continue
-            if peer.key and not self.admission.has_role(peer.key, MAY["setpoint"]):
+            elif peer.key and not self.admission.has_role(peer.key, MAY["setpoint"]):
                 self._drops.add("setpoint", peer, OFF_THE_LIST)
-                continue
-            data = b"" if frame.more else frame.bytes
-            is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
+            else:
+                data = b"" if frame.more else frame.bytes
+                is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
         return self.inbox.playout.update(time.monotonic()) or is_newer
 
-    def publish(self, telemetry: Telemetry) -> None:
-        """Send one telemetry message to all subscribers. Never waits: a subscriber that is too slow misses it."""
-        self._send(self._telemetry, "telemetry", encode(telemetry))
+    def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
+        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its first part.
 
-    def publish_topic(self, topic: bytes, message: Motion | Verdict) -> None:
-        """Send one message to the subscribers of `topic`. Never waits."""
-        self._send(self._telemetry, "telemetry", topic, encode(message))
+        Never waits: a subscriber that is too slow misses it.
+        """
+        self._send(self._telemetry, "telemetry", *topic, encode(message))
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
         """Send control ticks to all subscribers of the recording, a row each with the fields `columns`. Never waits."""

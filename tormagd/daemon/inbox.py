@@ -22,11 +22,11 @@ from tormagd.daemon.source_clock import AHEAD_S, SourceClock
 from tormagd.daemon.source_manner import Arrival, Needs, SourceManner, needs_of
 from tormagd.daemon.stamp_unit import LOOKED_AT, StampUnit
 from tormagd.hardware.connection import clock_report
-from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
+from tormagd.hardware.link_statistics import WINDOW_S
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.safety.operating_state import RefusedError
 from tormagd.scenes.scene import Scene
-from tormagd_client.messages import MessageError, Setpoint, SetpointReport, SourceReport, decode
+from tormagd_client.messages import ClockReport, MessageError, Setpoint, SetpointReport, SourceReport, decode
 
 SOURCES = 16
 "Publishers that are kept apart; one more is refused until an old one has been silent."
@@ -464,7 +464,7 @@ def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: 
         )
 
 
-def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float, stamp_ns: int) -> tuple[str, str]:
+def _of_clock(clock: SourceClock, fit: ClockReport | None, now_s: float, stamp_ns: int) -> tuple[str, str]:
     """Return what is wrong with a publisher's clock, and the remedy; two empty texts where nothing is.
 
     Wrong are an offset that is not known yet, one beyond AHEAD_S, and a clock that was never set. So are a clock set

@@ -40,13 +40,13 @@ class SceneChange:
             raise RefusedError(
                 "bad_scene", f"args.scene is no text of 1..{LONGEST_NAME} characters", "tormagctl scene list"
             )
-        if self._changing is not None:
+        if self._changing is not None and not self._changing.done():
             raise RefusedError("busy", "another scene is being made ready", "tormagctl status")
         self._require()
         self.newest = SceneReport(scene=scene, is_over=False)
         self._changing = asyncio.get_running_loop().create_task(self._change(scene))
         # an unexpected error is reported at once, not when the task is collected
-        self._changing.add_done_callback(self._finish)
+        self._changing.add_done_callback(asyncio.Task.result)
 
     async def _change(self, scene: str) -> None:
         """Build the core and put it in place, if the device is still not in use; note in `newest` and log how it ended.
@@ -68,8 +68,3 @@ class SceneChange:
         else:
             log.warning("the scene stays as it was: %s; next: %s", error.cause, error.remedy)
         self.newest = SceneReport(scene=scene, is_over=True, error=error)
-
-    def _finish(self, changing: "asyncio.Task[None]") -> None:
-        """Allow the next change. Raises the exception of this one, if it ended unexpectedly."""
-        self._changing = None
-        changing.result()

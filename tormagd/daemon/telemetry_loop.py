@@ -101,7 +101,7 @@ class TelemetryLoop:
         self._newest: Telemetry
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
-        self._way = Way(core.scene.budget)
+        self._way = Way()
         self.topics = Topics(config, core, control, inference, endpoint)
         self._service = Service()
         self._mark: Mark | None = None
@@ -123,7 +123,6 @@ class TelemetryLoop:
         "Replaced by a reload, which changes only keys that are looked at each time they are used."
         self._core, self.topics.core, self._profiles = core, core, profiles
         self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
-        self._way.budget = core.scene.budget
         self._status: msgspec.Raw | None = None
         self._reported_s = -math.inf
 
@@ -166,8 +165,14 @@ class TelemetryLoop:
         start_ns = time.monotonic_ns()
         endpoint, connections = self._endpoint, self._endpoint.admission.connections()
         tick = self._ticks[-1]
-        forces_N, handle = (tick.setpoint_cf, tick.measured_cf), (tick.handle_mm, tick.handle_rate_mm_s)
-        self._following.look(tick.operating_state, tick.limits, *forces_N, *handle)
+        self._following.look(
+            tick.operating_state,
+            tick.limits,
+            tick.setpoint_cf,
+            tick.measured_cf,
+            tick.handle_mm,
+            tick.handle_rate_mm_s,
+        )
         # requests that wait now are answered with this snapshot; later ones wait for the next
         self._status, self._answers = None, min(endpoint.requests.count, REQUESTS)
         # no snapshot is packed without a listener
@@ -186,17 +191,12 @@ class TelemetryLoop:
         Calibrations do while it is neither driven nor busy, and no scene is being changed. Profiles see no device while
         its calibration is awaited.
         """
-        serial_number, is_driven = self._serial_number(), self._control.stepper.safety.is_driven
+        serial_number, is_driven = self._connection.serial_number, self._control.stepper.safety.is_driven
         change = self._scene_change.newest
         is_idle = not (is_driven or self.is_busy()) and (change is None or change.is_over)
         self._calibrations.look(serial_number, self.config, is_idle=is_idle)
         is_awaited = self._calibrations.is_awaited(serial_number)
         self._profiles.look(None if is_awaited else serial_number, is_driven)
-
-    def _serial_number(self) -> int | None:
-        """Return the connected device's serial number; None while it is not known."""
-        identity = None if self._connection.link is None else self._connection.link.identity
-        return None if identity is None else identity.serial_number
 
     def _publish_ticks(self) -> None:
         """Publish the kept ticks if a peer listens to the recording, and drop them in any case."""
@@ -257,7 +257,7 @@ class TelemetryLoop:
         found = conditions(
             time.monotonic(), self.config, self._connection, control.stepper, control.output, sensor_doubted=doubted
         )
-        return found.replaced(busy=True) if self._calibrations.is_awaited(self._serial_number()) else found
+        return found.replaced(busy=True) if self._calibrations.is_awaited(self._connection.serial_number) else found
 
     def is_busy(self) -> bool:
         """Tell whether the device homes or opens, or has been asked to."""
@@ -278,13 +278,18 @@ class TelemetryLoop:
         A tick must be kept: IndexError is raised otherwise. The message has the setpoint's age (None without one), the
         handle's motion, the verdict and the newest mark. Its number is that of the telemetry periods so far.
         """
-        stamp = self._endpoint.inbox.newest
-        age_s = None if stamp is None else now_s - stamp.stamp_s
-        planner, stepper = self._inference.planner, self._control.stepper
-        believed = beliefs(planner, stepper, now_s, self._core.scene.terms)
-        told = self.topics.handle(), self.topics.verdict()
-        known = self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed
-        return snapshot(self._ticks[-1], *known, *told, self._mark)
+        newest = self._endpoint.inbox.newest
+        return snapshot(
+            self._ticks[-1],
+            self.timing.runs,
+            self._is_homed(),
+            self.is_busy(),
+            None if newest is None else now_s - newest.stamp_s,
+            beliefs(self._inference.planner, self._control.stepper, now_s, self._core.scene.terms),
+            self.topics.handle(),
+            self.topics.verdict(),
+            self._mark,
+        )
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
         """Tell systemd what is new: readiness, which is logged, the status line, and that the daemon lives.
@@ -330,7 +335,7 @@ class TelemetryLoop:
         """Return the result of a request: for `status` and `describe` a report, for any other what `command` returns.
 
         A `status` is packed once, as msgpack, for all who ask in a telemetry period; a snapshot must have been made
-        before. The others are plain data. Raises RefusedError for a request that is refused.
+        before. Raises RefusedError for a request that is refused.
         """
         if request.command == "status":
             # built once for everybody who asks in this period
@@ -339,15 +344,15 @@ class TelemetryLoop:
             return self._status
         return self._describe() if request.command == "describe" else self.command(request)
 
-    def _describe(self) -> Any:
-        """Return what does not change from tick to tick, as plain data with the keys of `Description`.
+    def _describe(self) -> Description:
+        """Return what does not change from tick to tick.
 
         Firmware and serial number are None until a device has said them. `portrait` has forces, N, from the open gap to
         the closed one, and their rates at the gap's speed, N/s, as learned by now. It has every PORTRAIT_STEP-th point.
         """
         link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
         scaled_mm_s = device.scale * self._core.gap_speed_mm_s
-        description = Description(
+        return Description(
             version=__version__,
             build=str(settle()),
             configuration=msgspec.to_builtins(self.config),
@@ -362,7 +367,6 @@ class TelemetryLoop:
             ),
             configuration_file=self._config_file,
         )
-        return msgspec.to_builtins(description)
 
     def command(self, request: Request) -> dict[str, Any]:
         """Carry out a request that is no question, and return its result as plain data.
@@ -534,7 +538,9 @@ class TelemetryLoop:
                 "rates": {group.name: group.report() for group in self._groups},
                 "phases_us": {name: spent.report for name, spent in self._phases.spent.items()},
                 "late_ticks_by": dict(self._phases.blamed),
-                "way": self._way.report(device_us, self._inference.planner.believe.carriages.lag_s),
+                "way": self._way.report(
+                    device_us, self._inference.planner.believe.carriages.lag_s, self._core.scene.budget
+                ),
                 "black_box": self._box.report(),
             }
         return self._reports

@@ -9,7 +9,7 @@ from tormagd.daemon.beat import Beat
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.verdict import CANNOT, GapMotion, Judged, judged
+from tormagd.daemon.verdict import CANNOT, Judged, judged
 from tormagd.safety.codes import Limit
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, VERSION, Motion, Verdict
 
@@ -70,7 +70,7 @@ class Topics:
         message = Motion(
             v=VERSION, t_ns=heard_ns, device_s=measured.handle_time_s, handle_mm=place_mm, handle_mm_s=rate_mm_s
         )
-        self._endpoint.publish_topic(MOTION_TOPIC, message)
+        self._endpoint.publish(message, MOTION_TOPIC)
         return True
 
     def _publish_verdicts(self) -> bool:
@@ -84,12 +84,12 @@ class Topics:
         if in_force is not None and in_force is not self._judged:
             self._judged, is_said = in_force, True
             verdict = self._verdict(in_force.source, in_force.seq, self._judge())
-            self._endpoint.publish_topic(VERDICT_TOPIC, verdict)
+            self._endpoint.publish(verdict, VERDICT_TOPIC)
         other = self._endpoint.inbox.passed_over()
         if other is not None and other != self._passed_over:
             self._passed_over, is_said = other, True
             refused = Judged(CANNOT, None, (str(Limit.OTHER_SOURCE),))
-            self._endpoint.publish_topic(VERDICT_TOPIC, self._verdict(*other, refused))
+            self._endpoint.publish(self._verdict(*other, refused), VERDICT_TOPIC)
         return is_said
 
     def _judge(self) -> Judged:
@@ -105,7 +105,10 @@ class Topics:
             measured.gap_mm if measured is not None and measured.is_homed else None,
             core.portrait,
             believe.device,
-            GapMotion(core.gap_speed_mm_s, believe.carriages.lag_s, force.tolerance_rms_N, force.release_N_s),
+            gap_speed_mm_s=core.gap_speed_mm_s,
+            lag_s=believe.carriages.lag_s,
+            tolerance_N=force.tolerance_rms_N,
+            release_N_s=force.release_N_s,
         )
 
     @staticmethod

@@ -29,23 +29,17 @@ class Judged(NamedTuple):
     why: tuple[str, ...] = ()
 
 
-class GapMotion(NamedTuple):
-    """Figures of the gap's motion: its greatest speed, and its lag; and of the scene: its force tolerance and release
-    rate."""
-
-    gap_speed_mm_s: float
-    lag_s: float
-    tolerance_N: float
-    release_N_s: float
-
-
 def judged(
     plan: Plan,
     state: OperatingState,
     gap_mm: float | None,
     portrait: Portrait,
     device: DeviceFit,
-    motion: GapMotion,
+    *,
+    gap_speed_mm_s: float,
+    lag_s: float,
+    tolerance_N: float,
+    release_N_s: float,
 ) -> Judged:
     """Return the judgement on the setpoint that `plan` was made for: RENDERED, ARRIVES in some time, or CANNOT, and
     why.
@@ -66,14 +60,14 @@ def judged(
     # unless the gap is held, it differs from the portrait's by the element's memory and the handle's rate
     if Limit.CEILING not in plan.limits and Limit.MODEL_RANGE not in plan.limits:
         gap_mm -= plan.gap_mm - portrait.gap_mm_at(device.model_N(plan.governed_N))
-    if abs(device.force_N(portrait.force_N_at(gap_mm)) - asked_N) <= motion.tolerance_N:
+    if abs(device.force_N(portrait.force_N_at(gap_mm)) - asked_N) <= tolerance_N:
         return Judged(RENDERED, 0.0)
     if why := tuple(str(limit) for limit in plan.limits if _holds(limit, plan, aim_mm)):
         return Judged(CANNOT, None, why)
-    moves_s = abs(aim_mm - gap_mm) / motion.gap_speed_mm_s
+    moves_s = abs(aim_mm - gap_mm) / gap_speed_mm_s
     if Limit.TAKEOVER in plan.limits:
-        moves_s = max(moves_s, abs(asked_N - plan.governed_N) / motion.release_N_s)
-    return Judged(ARRIVES, round(1e3 * (moves_s + motion.lag_s), 1))
+        moves_s = max(moves_s, abs(asked_N - plan.governed_N) / release_N_s)
+    return Judged(ARRIVES, round(1e3 * (moves_s + lag_s), 1))
 
 
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:

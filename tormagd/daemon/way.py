@@ -24,9 +24,7 @@ class Way:
     `to_duty` has the delays, us.
     """
 
-    def __init__(self, budget: Budget) -> None:
-        self.budget = budget
-        "The scene's."
+    def __init__(self) -> None:
         self.to_duty = Histogram()
         self._stamp_s = -math.inf
 
@@ -43,12 +41,12 @@ class Way:
             if stamp_s > -math.inf:  # -inf: the plan follows no setpoint
                 self.to_duty.add(now_s, (now_s - stamp_s) * 1e6)
 
-    def report(self, device_us: float | None, lag_s: float) -> WayReport:
+    def report(self, device_us: float | None, lag_s: float, budget: Budget) -> WayReport:
         """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known.
 
         `device_us` is the link's median round trip, us, None without one; `lag_s` is the carriages' lag. The sum, ms,
-        has the 99th percentile of the delay to the duty, as of the last refresh of `to_duty`. The budget is the
-        scene's, or else BUDGET_MS.
+        has the 99th percentile of the delay to the duty, as of the last refresh of `to_duty`. `budget` is
+        the scene's; where it states no delay, that is BUDGET_MS.
         """
         to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
@@ -58,5 +56,5 @@ class Way:
             device_us=device_us,
             carriages_ms=round(carriages_ms, 2),
             total_ms=total_ms,
-            budget_ms=BUDGET_MS if self.budget.delay_ms is UNSET else self.budget.delay_ms,
+            budget_ms=BUDGET_MS if budget.delay_ms is UNSET else budget.delay_ms,
         )

@@ -17,7 +17,6 @@ from tormagd.hardware.backend import Backend, BackendError, Received, Sent, Stre
 from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
-from tormagd.hardware.link_statistics import ClockFit
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
@@ -60,7 +59,6 @@ class Connection:
     def __init__(self, device: Device, open_backend: Callable[[], Backend], on_loss: Callable[[], None]) -> None:
         """Begin closed. `on_loss` is called whenever `state` leaves RUNNING, but not by `close`."""
         self._device, self._open_backend, self._on_loss = device, open_backend, on_loss
-        self._is_wanted = False
         self._backend: Backend | None = None
         self._stream: Stream | None = None
         self._link: DeviceLink | None = None
@@ -110,9 +108,10 @@ class Connection:
         return self._remedy or _REMEDIES.get(self.state, "")
 
     @property
-    def link(self) -> DeviceLink | None:
-        """The conversation since the port was last opened; None while the port is not open."""
-        return self._link
+    def serial_number(self) -> int | None:
+        """The device's serial number; None without an open port, and until the device has said it."""
+        identity = None if self._link is None else self._link.identity
+        return None if identity is None else identity.serial_number
 
     @property
     def measurement(self) -> Measurement | None:
@@ -125,13 +124,31 @@ class Connection:
         return self._unfinished if self._link is None else self._link.pending
 
     def open(self, now_s: float) -> None:
-        """Open the port, and keep it wanted: where that fails, `exchange` tries again later, and `cause` says why.
+        """Open the port and begin a conversation, in which an unfinished RETRACT is sent again; tell `traffic` so.
 
-        Call `close` before another `open`: a port that is open is not closed by it. `traffic` is told of a port that
-        opens. Raises what a plugin's backend raises besides BackendError.
+        Where the port does not open, `exchange` tries again later, and `cause` says why. That is logged, the same
+        reason as before for debugging only. Call `close` before another `open`: a port that is open is not closed by
+        it. Raises what a plugin's backend raises besides BackendError.
         """
-        self._is_wanted = True
-        self._open(now_s)
+        try:
+            self._backend = self._open_backend()
+        except BackendError as error:
+            # the first failure is news, the same one again is not
+            log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
+            self._wait(now_s, LinkState.BACK_OFF, str(error), error.remedy)
+            self._notice()
+            return
+        self._remedy = ""
+        self._link = DeviceLink(now_s)
+        if self._unfinished is DeviceRequest.RETRACT:
+            self._link.request(now_s, self._unfinished)
+        self._unfinished = DeviceRequest.NONE
+        stream = getattr(self._backend, "stream", None)
+        self._stream = stream if isinstance(stream, FrameStream | CanStream) else None
+        if self.traffic is not None:
+            self.traffic.connected(self.memory())
+        log.info("%s is open", self._device.port)
+        self._notice()
 
     def receive(self, now_s: float) -> None:
         """Read what has come from the device, and hand it to `traffic` and the conversation; never wait.
@@ -151,8 +168,7 @@ class Connection:
             self.traffic.read(now_s, self._stream.received)
         for message in messages:
             link.receive(now_s, message)
-            if link.state is not self._seen:
-                self._notice()
+            self._notice()
 
     def exchange(
         self, now_s: float, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
@@ -165,8 +181,8 @@ class Connection:
         due. Call it after `receive`, so that what has come by then does not count as silence. Raises EncodeError for a
         value that does not fit the wire; BackendError is not raised.
         """
-        if self._link is None and self._is_wanted and now_s >= self._reopen_s:
-            self._open(now_s)
+        if self._link is None and self._waiting is not LinkState.CLOSED and now_s >= self._reopen_s:
+            self.open(now_s)
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return
@@ -184,11 +200,10 @@ class Connection:
         except BackendError as error:
             self._lose(now_s, str(error), error.remedy)
             return
+        heard = backend.statistics
         if self.traffic is not None and self._stream is not None:
-            self.traffic.wrote(now_s, sent, backend.statistics.unsent)
-        if link.is_judging(now_s):
-            heard = backend.statistics
-            link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
+            self.traffic.wrote(now_s, sent, heard.unsent)
+        link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
         self._notice()
         if link.state is LinkState.LOST:
             self._lose(now_s, link.cause, "")
@@ -200,7 +215,6 @@ class Connection:
         RETRACT too. A running device hears no more Drives, and opens its gap by its own command timeout. It may be
         called again.
         """
-        self._is_wanted = False
         self._release()
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
         self._seen = LinkState.CLOSED
@@ -264,32 +278,6 @@ class Connection:
             damaged_share=None if link is None or link.measurement is None else round(link.quality.damaged, 4),
         )
 
-    def _open(self, now_s: float) -> None:
-        """Open the port, begin a conversation, in which an unfinished RETRACT is sent again, and tell `traffic` so.
-
-        Where the port does not open, log why and wait in BACK_OFF; the same reason as before is logged for debugging
-        only. Raises what opening raises besides BackendError.
-        """
-        try:
-            self._backend = self._open_backend()
-        except BackendError as error:
-            # the first failure is news, the same one again is not
-            log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
-            self._wait(now_s, LinkState.BACK_OFF, str(error), error.remedy)
-            self._notice()
-            return
-        self._remedy = ""
-        self._link = DeviceLink(now_s)
-        if self._unfinished is DeviceRequest.RETRACT:
-            self._link.request(now_s, self._unfinished)
-        self._unfinished = DeviceRequest.NONE
-        stream = getattr(self._backend, "stream", None)
-        self._stream = stream if isinstance(stream, FrameStream | CanStream) else None
-        if self.traffic is not None:
-            self.traffic.connected(self.memory())
-        log.info("%s is open", self._device.port)
-        self._notice()
-
     def _send(self, backend: Backend, message: Message, sent: list[Sent]) -> None:
         """Send a message, and add its frame to `sent` where the backend has a stream."""
         backend.send(message)
@@ -348,7 +336,7 @@ class Connection:
             log.warning("%s: %s; next: %s", self._device.port, self.cause, self.remedy)
 
 
-def clock_report(fit: ClockFit | None, way_s: float = 0.0) -> ClockReport | None:
+def clock_report(fit: ClockReport | None, way_s: float = 0.0) -> ClockReport | None:
     """Return a clock's fit, rounded for `status`; None for None.
 
     `way_s` is how long the clock's messages were on their way, s; it is taken off the offset.

@@ -97,7 +97,7 @@ class DeviceLink:
     """
 
     __match_args__: ClassVar = (
-        "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
+        "_acknowledged", "_asked_s", "_broken", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
         "_heard_s", "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_nonce", "_number", "_quality_watch",
         "_received_s", "_reported_s", "_request", "_request_due_s", "_requested_s", "_right_mm", "_sense", "_sensed_s",
         "_state", "_states", "_status", "_told", "cause", "clock", "identity", "quality", "repeated", "round_trip",
@@ -108,7 +108,6 @@ class DeviceLink:
         self.repeated = 0
         """States that were dropped: they repeat an earlier one, or were overtaken on their way."""
         self._drives = self._states = 0
-        self._counter = 0
         self._request = DeviceRequest.NONE
         self._request_due_s = self._requested_s = now_s
         self._begin(now_s, "waiting for the device to say who it is")
@@ -169,10 +168,6 @@ class DeviceLink:
         """The request that the device has not acknowledged; NONE where there is none."""
         return self._request
 
-    def is_silent(self, now_s: float) -> bool:
-        """Tell whether a running device has sent nothing for longer than SILENT_S."""
-        return self.state is _RUNNING and now_s - self._heard_s > SILENT_S
-
     def receive(self, now_s: float, message: Message) -> None:
         """Take one message that came from the device at `now_s`: State, Sense, Status or Identity.
 
@@ -200,7 +195,7 @@ class DeviceLink:
         or a missing Identity, and a Home or Clear is given up after GIVE_UP_S. The newest Drive is noted as sent at
         `now_s`. What is returned counts as sent.
         """
-        self.round_trip.drive(self._counter, now_s)
+        self.round_trip.drive(self._drives % 256, now_s)
         self._change_state(now_s)
         is_waiting = False
         if self._request is not _NO_REQUEST:
@@ -224,9 +219,8 @@ class DeviceLink:
         Duties are -1..1 of the supply voltage; positive opens. They are checked where the Drive is encoded, and that
         the device runs is not checked at all. Call `due` after it, which notes when it was sent.
         """
-        self._counter = (self._counter + 1) % 256
         self._drives += 1
-        return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._counter)
+        return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._drives % 256)
 
     def request(self, now_s: float, request: DeviceRequest) -> None:
         """Ask the device for a routine: `due` repeats the command until a Status acknowledges it.
@@ -254,18 +248,15 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Renew `quality`, which the measurement carries from now on, from the backend's counters.
+        """Renew `quality`, which the measurement carries from then on, from the backend's counters, where that is due.
 
         These count frames received and damaged, and messages not taken at once, since the port was opened; they only
-        grow. Call it when `is_judging`: earlier calls shorten the second that `quality` spans.
+        grow.
         """
-        counts = Counts(self._drives, self._states, frames, damaged, unsent)
-        self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
-        self._measurement = None
-
-    def is_judging(self, now_s: float) -> bool:
-        """Tell whether `judge` is due."""
-        return self._quality_watch.is_due(now_s)
+        if self._quality_watch.is_due(now_s):
+            counts = Counts(self._drives, self._states, frames, damaged, unsent)
+            self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
+            self._measurement = None
 
     def lose(self, cause: str) -> None:
         """End the conversation in LOST, from any state: the port failed, for `cause`.
@@ -284,7 +275,7 @@ class DeviceLink:
         # the break was heard a tick ago: so the core has seen the measurement that shows it, and names it better
         if self._broken:
             self._begin(now_s, self._broken)
-        elif self.is_silent(now_s):
+        elif self.state is _RUNNING and now_s - self._heard_s > SILENT_S:
             self.state = LinkState.LOST
             self.cause = f"no message for {SILENT_S * 1e3:.0f} ms"
         elif self.state is _IDENTIFYING and now_s - self._asked_s > UNANSWERED_S:

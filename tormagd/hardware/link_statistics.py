@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import compress
 from typing import ClassVar, Final, TypeAlias, final
 
-from firmware_protocol.value import Value
+from tormagd_client.messages import ClockReport
 
 ROUND_TRIPS = 256
 "Round trips that percentiles are taken from: a quarter of a second of control."
@@ -52,7 +52,7 @@ class RoundTrip:
     """
 
     __match_args__: ClassVar = (
-        "_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure", "_usual",
+        "_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure",
     )  # fmt: skip
 
     def __init__(self) -> None:
@@ -65,7 +65,6 @@ class RoundTrip:
         self._newest_s = 0.0
         self._unsure: deque[float] = deque(maxlen=ROUND_TRIPS)
         self._recent: deque[float] = deque(maxlen=ROUND_TRIPS)
-        self._usual: deque[float] = deque(maxlen=USUAL_OF)
 
     def drive(self, counter: int, now_s: float) -> None:
         """Note that the Drive with this counter, 0..255, goes out at `now_s`; the time of that counter's last Drive is
@@ -127,7 +126,6 @@ class RoundTrip:
         else:
             self._lead = drive_counter - state
             self._recent.clear()
-            self._usual.clear()
             if (self._newest - drive_counter) % 256 < 128:
                 self._take(self._newest_s - self._sent_s[drive_counter])
         self._unsure.clear()
@@ -135,7 +133,6 @@ class RoundTrip:
     def _take(self, round_trip_s: float) -> None:
         if round_trip_s >= 0.0:
             self._recent.append(round_trip_s)
-            self._usual.append(round_trip_s)
 
     @property
     def usual_s(self) -> float:
@@ -143,7 +140,7 @@ class RoundTrip:
 
         A device that stood still once answers all waiting Drives late, which a mean would call a slow line.
         """
-        ordered_s = sorted(self._usual)
+        ordered_s = sorted(list(self._recent)[-USUAL_OF:])
         return ordered_s[len(ordered_s) // 2] if ordered_s else 0.0
 
     @property
@@ -164,23 +161,6 @@ class RoundTrip:
 
 
 @final
-class ClockFit(Value):
-    """A straight line through the host's time less the device's, over the host's time.
-
-    `offset_s` is its value at the newest window, with the State's way from the device in it. `drift_ppm` is positive
-    where the device's clock runs fast. `residual_us` is the standard deviation around the line. `windows` were looked
-    at, `outliers` of them were left out.
-    """
-
-    def __init__(self, offset_s: float, drift_ppm: float, residual_us: float, windows: int, outliers: int) -> None:
-        self.offset_s: Final = offset_s
-        self.drift_ppm: Final = drift_ppm
-        self.residual_us: Final = residual_us
-        self.windows: Final = windows
-        self.outliers: Final = outliers
-
-
-@final
 class DeviceClock:
     """The device's clock against the host's, by regression over the least delayed State of each half second.
 
@@ -194,7 +174,7 @@ class DeviceClock:
         self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)
         self._least: tuple[float, float] = (math.inf, 0.0)
         self._ends_s = -math.inf
-        self._fit: ClockFit | None = None
+        self._fit: ClockReport | None = None
         self._is_fitted = True
         self._newest_s = -math.inf
         self._standing = 0
@@ -219,11 +199,12 @@ class DeviceClock:
         if offset_s < self._least[0]:
             self._least = (offset_s, host_s)
 
-    def fit(self) -> ClockFit | None:
-        """Return the line through the last half minute, or since the clock was set; None where no line fits yet.
+    def fit(self) -> ClockReport | None:
+        """Return the line of the host's time less the device's; None where no line fits yet.
 
-        A line takes MIN_WINDOWS windows, three seconds; the window that is not over yet does not count. It is computed
-        once a window.
+        It goes through the last half minute, or from when the clock was set. Nothing is rounded, and `offset_s` has the
+        State's way in it. A line takes MIN_WINDOWS windows, three seconds; the window that is not over yet does not
+        count. It is computed once a window.
         """
         if not self._is_fitted:
             self._fit = _newest_line(list(self._windows))
@@ -245,7 +226,7 @@ class DeviceClock:
         self._ends_s = host_s + WINDOW_S
 
 
-def _newest_line(windows: Windows) -> ClockFit | None:
+def _newest_line(windows: Windows) -> ClockReport | None:
     """Return the line through the newest of `windows`, which are in the order of time; None where no line fits.
 
     The line is tried through all windows, then without the older half, and so on while MIN_WINDOWS are left. It fits
@@ -260,7 +241,7 @@ def _newest_line(windows: Windows) -> ClockFit | None:
     return None
 
 
-def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
+def _robust_line(windows: Windows) -> tuple[ClockReport, bool]:
     """Return the line through the windows, in the order of time, and whether all of the NEWEST_WINDOWS lie off it.
 
     Windows further than OUTLIER deviations from a line of median slope and level are left out. Raises
@@ -280,7 +261,7 @@ def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
         [(time_s - centre_s) ** 2 for _, time_s in kept], 0.0
     )
     squares = [(offset_s - level_s - slope * (time_s - centre_s)) ** 2 for offset_s, time_s in kept]
-    fit = ClockFit(
+    fit = ClockReport(
         offset_s=level_s + slope * (newest_s - centre_s),
         # host - device falls by the drift with every second of the host
         drift_ppm=-slope * 1e6,
