@@ -218,7 +218,7 @@ def test_a_package_that_a_check_on_a_plant_lacks_is_told_with_what_brings_it_alo
 
 
 def test_every_measured_way_is_shown_with_what_it_costs(ctl, checked_here):
-    text = ctl("scene", "explain", "brain").ended(0).out
+    text = ctl("scene", "explain", "aorta_1").ended(0).out
     assert all(said in text for said in ("1000 / 500 Hz, newton", "chosen, runs here", "contact", "signal, frozen"))
 
 
