@@ -44,7 +44,7 @@ class SlowFriction:
     """
 
     factor: float = 1.0
-    "k, without its bounds: what a fit that errs by rate takes from it comes back at the rate where it was learned."
+    "k, before its bounds: a fit that errs at another rate, and comes back, leaves it as it was."
     learned: float = 0.0
     "Share of the factor that was learned at a creep, 0..1."
     slowness: float = 1.0
