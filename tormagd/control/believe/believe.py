@@ -183,8 +183,9 @@ class Believe:
                 self.slow.slide(now_s, measured.handle.sliding_mm_s)
             if measured.is_homed:
                 model_N = self.memory.force_N(self._nominal.now(measured))
-                self._hear(now_s, measured, model_N)
-                slid_N = self.slow.followed_N if self._nominal.contact.slides else model_N
+                slides = self._nominal.contact.slides
+                slid_N = self.slow.follow(model_N, measured.handle_mm) if slides else model_N
+                self._hear(now_s, measured, model_N, slid_N)
         return self._belief(measured, slid_N)
 
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
@@ -222,8 +223,10 @@ class Believe:
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
         return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, self.sensor.doubted_s)
 
-    def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
+    def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
         """Learn from the newest reading, with the model's force `model_N` at the measured gap.
+
+        `slid_N` is that force as far as friction has followed it.
 
         Where friction is mobilised and the handle moves, the reading counts as one at speed. It counts as one at a
         creep else, and for a handle that is stuck or rests beside a moved gap. The watch on a brake's encoder takes
@@ -232,7 +235,6 @@ class Believe:
         slides = self._nominal.contact.slides
         if slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
-            self.slow.follow(model_N, measured.handle_mm)
         if measured.number == self.read or now_s - self.read_s < MIN_DT_S:
             return
         if now_s - measured.sensed_s > self._unsensed_s:
@@ -245,8 +247,7 @@ class Believe:
             rate_mm_s < MOVING_MM_S or self._is_stuck(measured, model_N) or self.handle.moved_gap_at_rest(model_N)
         )
         if is_mobilised and not is_slow:
-            slid_N = self.slow.followed_N * self.slow.factor_at(rate_mm_s) if slides else model_N
-            self._hear_at_speed(now_s, measured, slid_N, dt_s)
+            self._hear_at_speed(now_s, measured, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
         else:
             self._hear_at_creep(now_s, measured, dt_s, is_mobilised)
 

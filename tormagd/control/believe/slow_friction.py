@@ -80,8 +80,8 @@ class SlowFriction:
         self.creep_mm_s = max(low_pass(from_mm_s, sliding_mm_s, now_s - self.slid_s, SLOWS_S), sliding_mm_s)
         self.slid_s = now_s
 
-    def follow(self, model_N: float, handle_mm: float) -> None:
-        """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`.
+    def follow(self, model_N: float, handle_mm: float) -> float:
+        """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`, and return it.
 
         A fall is followed at once. A rise is followed by 1 - exp(-BRISTLES_N_MM travel / model_N), with the handle's
         travel since the last call. The first call counts from 0 mm and 0 N.
@@ -91,6 +91,7 @@ class SlowFriction:
             rise_N *= 1.0 - math.exp(-BRISTLES_N_MM * abs(handle_mm - self.handle_mm) / model_N)
         self.followed_N += rise_N
         self.handle_mm = handle_mm
+        return self.followed_N
 
     def rescale(self, before_N: float, after_N: float, rate_mm_s: float) -> None:
         """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N` to `after_N`.
