@@ -38,12 +38,16 @@ COMPILED = {
     "tormagd/control/ask": ("skill", "forecast", "path", "way", "governor"),
     "tormagd/control/aim": ("portrait", "floors", "aim"),
     "tormagd/control/move": ("motor", "pid", "reference", "homing", "opening", "watch", "actuator", "carriages"),
-    "tormagd/assembly": ("conditions",),
+    "tormagd/assembly": ("conditions", "journal"),
     "tormagd/simulation": (
         *("curve", "axis", "gap_field", "warmth", "element", "second_element", "tactile_pad"),
         *("pressed_pad", "hand", "plant", "motion", "firmware", "device"),
     ),
-    "tormagd/daemon": ("sequence", "source_clock", "rate_group", "telemetry"),
+    "tormagd/daemon": (
+        *("rate_group", "beat", "sequence", "stamp_unit", "source_clock", "source_manner", "hold", "playout", "inbox"),
+        *("tally", "allowance", "arrivals", "requests", "telemetry", "way", "topics"),
+        *("control_loop", "inference_loop", "black_box", "telemetry_loop"),
+    ),
     "tormagd/lab": ("ideal_actuator",),
     "tormagd": ("closed_loop",),
 }

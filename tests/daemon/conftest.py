@@ -1,6 +1,11 @@
 """What the daemon's tests share: one core."""
 
+import sys
+from pathlib import Path
+
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config

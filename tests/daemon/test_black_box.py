@@ -4,7 +4,6 @@ import contextlib
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock, patch
 
@@ -13,7 +12,7 @@ import pytest
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Hello
 from tormagd.assembly.build import Core
-from tormagd.assembly.journal import MAX_ENTRIES, Journal
+from tormagd.assembly.journal import MAX_ENTRIES, TEACH, Journal
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
@@ -149,7 +148,7 @@ def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: Ca
 
 
 def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) -> None:
-    rig.box.journal.taught(SimpleNamespace())  # type: ignore[arg-type]
+    rig.box.journal._entries.append((TEACH, object()))
     rig.tick()
     assert "cannot be written" in rig.box.report().refusal
     rig.tick(100)

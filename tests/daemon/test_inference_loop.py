@@ -1,13 +1,13 @@
 """When plans are made: in the beat that brings a setpoint, and at the latest when due."""
 
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
+from failing_search import FailingSearch
 
-from tormagd.assembly.journal import Journal
+from tormagd.assembly.build import Core
+from tormagd.assembly.journal import AFRESH, PLAN, Journal
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.inbox import SetpointInbox
@@ -23,20 +23,29 @@ DUE_NS = 4 * TICK_NS
 class Rig:
     """An inference loop on a clock that moves with the beats; each begins 50 us after it was due."""
 
-    def __init__(self, planner: Any = None, period_ns: int = DUE_NS) -> None:
+    def __init__(self, core: Core, period_ns: int = DUE_NS) -> None:
         self.due_ns = 1_000 * TICK_NS
-        self.planned_ns: list[int] = []
+        self.search = FailingSearch(core)
         self.failed, self.inbox, self.journal = Mock(), SetpointInbox(), Journal()
-        planner = planner or SimpleNamespace(plan=self.plan)
         self.loop = InferenceLoop(
-            planner, self.inbox, period_ns, journal=self.journal, on_failure=self.failed, clock_ns=self.clock_ns
+            self.search.core.planner(),
+            self.inbox,
+            period_ns,
+            journal=self.journal,
+            on_failure=self.failed,
+            clock_ns=self.clock_ns,
         )
 
     def clock_ns(self) -> int:
         return self.due_ns + 50 * US
 
-    def plan(self, *_arguments: Any) -> None:
-        self.planned_ns.append(self.due_ns)
+    def planned_ns(self) -> list[int]:
+        """When the plans since the last call were due."""
+        return [
+            round(entry[1] * 1e9) - 50 * US
+            for entry in self.journal.take()
+            if isinstance(entry, tuple) and entry[0] == PLAN
+        ]
 
     def beat(self, beats: int = 1, *, is_asked: bool = False) -> None:
         """So many beats are over, the last of which runs."""
@@ -45,8 +54,8 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
-    made = Rig()
+def rig(core: Core) -> Iterator[Rig]:
+    made = Rig(core)
     yield made
     made.failed.assert_not_called()
 
@@ -58,21 +67,21 @@ def test_a_setpoint_is_planned_in_its_beat_and_the_next_plan_is_due_a_period_lat
     rig.beat(is_asked=True)
     for _ in range(5):
         rig.beat()
-    assert [(each_ns - asked_ns) // TICK_NS for each_ns in rig.planned_ns] == [0, 2, 6]
+    assert [(each_ns - asked_ns) // TICK_NS for each_ns in rig.planned_ns()] == [0, 2, 6]
     assert rig.loop.timing.lateness_us == pytest.approx(50.0)
 
 
 @pytest.mark.parametrize(("period_ns", "plans"), [(TICK_NS, 401), (DUE_NS, 101), (round(1e9 / 83.0), 34)])
-def test_without_setpoints_it_plans_when_due_and_never_chases_what_it_missed(period_ns: int, plans: int) -> None:
-    rig = Rig(period_ns=period_ns)
+def test_without_setpoints_it_plans_when_due_and_never_chases_what_it_missed(
+    core: Core, period_ns: int, plans: int
+) -> None:
+    rig = Rig(core, period_ns)
     for _ in range(401):
         rig.beat()
-    assert len(rig.planned_ns) == plans
-    rig.planned_ns.clear()
+    assert len(rig.planned_ns()) == plans
     rig.beat(60)
-    assert len(rig.planned_ns) == 1
     rig.beat()
-    assert len(rig.planned_ns) == (2 if period_ns == TICK_NS else 1)
+    assert len(rig.planned_ns()) == (2 if period_ns == TICK_NS else 1)
 
 
 def test_what_the_daemon_does_before_its_first_beat_is_no_stall_of_planning(rig: Rig) -> None:
@@ -81,21 +90,19 @@ def test_what_the_daemon_does_before_its_first_beat_is_no_stall_of_planning(rig:
 
 
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), ZeroDivisionError(), RuntimeError()])
-def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(error: Exception) -> None:
+def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(core: Core, error: Exception) -> None:
     """The one that makes planning fail would make it fail again and again."""
-    planner = Mock(**{"plan.side_effect": [error, None]})
-    rig = Rig(planner)
-    inbox = rig.inbox
-    rejected = TimedSetpoint(1.0, 0.0, 0.1)
+    rig = Rig(core)
+    inbox, rejected = rig.inbox, TimedSetpoint(1.0, 0.0, 0.1)
     inbox.playout.in_force = Taken(rejected, "a", 1)
+    rig.search.error = error
     rig.beat(is_asked=True)
     assert (rig.failed.call_count, inbox.newest, inbox.refused) == (1, None, 1)
     assert "no gap could be planned" in str(inbox.last_refusal)
+    first_s, rig.search.error = rig.clock_ns() * 1e-9, None
     rig.beat(is_asked=True)
     assert (rig.failed.call_count, inbox.refused) == (1, 1)
-    assert [name for name, *_ in planner.mock_calls] == ["plan", "afresh", "plan"]
-    assert [call.args[1] for call in planner.plan.call_args_list] == [rejected, None]
-    # and it is written down in that order: what a replay has to do
+    # the planner began anew in between, and all is written down in that order: what a replay has to do
+    assert rig.loop.planner.planned.number > 1
     second_s = rig.clock_ns() * 1e-9
-    first_s = (rig.clock_ns() - TICK_NS) * 1e-9
-    assert rig.journal.take() == [("plan", first_s, rejected), ("afresh", first_s), ("plan", second_s, None)]
+    assert rig.journal.take() == [(PLAN, first_s, rejected), (AFRESH, first_s), (PLAN, second_s, None)]

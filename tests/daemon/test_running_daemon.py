@@ -15,13 +15,13 @@ from typing import Any, ClassVar
 
 import msgspec
 import pytest
+from failing_search import FailingSearch
 
 from firmware_protocol.build import settle
+from firmware_protocol.codec import Message
 from tormagd.assembly.build import Core
 from tormagd.closed_loop import VirtualPort
 from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, load_calibration
-from tormagd.control.core import Planner
-from tormagd.control.records import Plan
 from tormagd.daemon import daemon as daemon_module, telemetry_loop
 from tormagd.daemon.beat import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
@@ -92,7 +92,7 @@ class Port:
 
     def __init__(self) -> None:
         self.line = VirtualPort(VirtualDevice(NEAR_HOME, ReversingHand(2.0), seed=1))
-        self.is_plugged_in = True
+        self.is_plugged_in, self.is_mute = True, False
 
     def open(self) -> "Port":
         if not self.is_plugged_in:
@@ -109,6 +109,11 @@ class Port:
             raise BackendError("the port is gone", "plug it in")
         return self.line.receive()
 
+    def send(self, message: Message) -> None:
+        if self.is_mute:
+            raise BackendError("the port takes nothing", "plug it in")
+        self.line.send(message)
+
     def close(self) -> None:
         os.close(self._fd)
 
@@ -116,27 +121,12 @@ class Port:
         return getattr(self.line, name)
 
 
-class FailingPlanner:
-    """Plans as the core's does, until its error is set."""
-
-    def __init__(self, planner: Planner) -> None:
-        self._planner = planner
-        self.error: Exception | None = None
-
-    def plan(self, *arguments: Any) -> Plan:
-        if self.error is not None:
-            raise self.error.with_traceback(None)  # or it would grow by each time, and take long to log
-        return self._planner.plan(*arguments)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._planner, name)
-
-
 class Running:
     """A daemon that beats when the test says so, and an operator's client, which publishes, too."""
 
     def __init__(self, runner: asyncio.Runner, clock: Clock, core: Core, folder: Path) -> None:
-        self.clock, self.port, self.core = clock, Port(), core
+        self.search = FailingSearch(core)
+        self.clock, self.port, self.core = clock, Port(), self.search.core
         self._runner, self.folder = runner, str(folder)
         self.clients: list[Client] = []
         self.client = self.publisher("test")
@@ -160,8 +150,6 @@ class Running:
 
     async def _begun(self, config: Config) -> None:
         self.daemon = Daemon(config, self.core, self.port.open, list(NOT_GRANTED), config_file=CONFIG_FILE)
-        self.planner = FailingPlanner(self.daemon._inference.planner)
-        self.daemon._inference.planner = self.planner  # type: ignore[assignment]
         # what was bound before the clock was made
         self.daemon._inference._clock_ns = self.daemon._phases._clock_ns = time.monotonic_ns
         self.clock.slow()
@@ -336,7 +324,7 @@ def test_a_daemon_describes_what_it_runs(alone: Running) -> None:
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), TypeError("nobody expects this")])
 def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(alone: Running, error: Exception) -> None:
     alone.tick()
-    alone.planner.error = error
+    alone.search.error = error
     alone.tick(100)
     assert ("PLAN_FAILED" in alone.command("status")["faults"]) == isinstance(error, DomainError)
     alone.command("stop")
@@ -348,7 +336,7 @@ def test_the_watchdog_is_fed_while_plans_are_fresh(alone: Running, monkeypatch: 
     monkeypatch.setattr(telemetry_loop, "notify", notified.append)
     alone.tick(100)
     assert "WATCHDOG=1" in notified
-    alone.planner.error = TypeError("nobody expects this")
+    alone.search.error = TypeError("nobody expects this")
     alone.tick(round(2 * WATCHDOG_MS))
     notified.clear()
     alone.tick(100)
@@ -717,6 +705,16 @@ def test_a_mark_stands_in_every_snapshot_that_follows(alone: Running) -> None:
     told = alone.command("mark", text="it stuck")
     assert told["text"] == "it stuck"
     assert alone.until(lambda status: status["mark"] is not None, "the mark")["mark"] == told
+
+
+def test_the_measurement_that_a_step_was_given_is_kept_though_driving_loses_the_device(armed: Running) -> None:
+    """What explains a fault is what the step saw."""
+    control, connection = armed.daemon._control, armed.daemon._connection
+    armed.port.is_mute = True
+    armed.tick()
+    assert (control.measurement is None, connection.measurement) == (False, None)
+    armed.tick()
+    assert control.measurement is None
 
 
 def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming(armed: Running) -> None:
