@@ -1,6 +1,7 @@
 """An open serial port: frames are written to its descriptor and read from it, never waiting."""
 
 import contextlib
+import fcntl
 import os
 import termios
 from typing import Final, final
@@ -14,6 +15,8 @@ from tormagd.hardware.frame_stream import FrameStream
 READ_BYTES: Final = 4_096
 UNSENT_BYTES: Final = 512
 "Some frames may wait for the driver; more bytes than this mean that nobody reads at the other end."
+_NONE: Final = bytes(4)
+"How FIONREAD says that no byte waits: an int of 0."
 
 
 @final
@@ -41,13 +44,12 @@ class SerialPort:
         Raises BackendError when the device was unplugged or the port cannot be read.
         """
         try:
+            # `read` on an empty terminal waits for a kernel worker (flush_to_ldisc), up to 100 ms on a busy machine
+            if fcntl.ioctl(self._fd, termios.FIONREAD, _NONE) == _NONE:
+                return self.stream.unpack(b"")
             data = os.read(self._fd, READ_BYTES)
-        except BlockingIOError:
-            return self.stream.unpack(b"")
         except OSError as error:
-            raise BackendError(f"{self._port.port}: reading failed: {error.strerror}") from error
-        if not data:
-            raise BackendError(f"{self._port.port}: the device was unplugged")
+            raise BackendError(f"{self._port.port}: unplugged, or not readable: {error.strerror}") from error
         return self.stream.unpack(data)
 
     def send(self, message: Message) -> None:
