@@ -61,6 +61,7 @@ NOTHING = {"proc/self/limits": LIMITS.format(memlock="0", rtprio="0")}
 CAPABLE = NOTHING | {"proc/self/status": f"Name:\tx\nCapEff:\t{1 << 23 | 1 << 14:016x}\n"}
 SWAPPING = {"proc/swaps": "Filename Type\n/dev/sda2 partition 1 0 -2\n"}
 CLOCK = "sys/devices/system/clocksource/clocksource0/current_clocksource"
+GROUPED = {"proc/sys/kernel/sched_autogroup_enabled": "1"}
 FORCED = {"proc/version": DYNAMIC, "sys/kernel/debug/sched/preempt": "none voluntary (full)"}
 
 
@@ -104,6 +105,8 @@ CASES = [
         "warn",
         "always",
     ),
+    (checks.autogroup, Config(), GROUPED, "warn", "on"),
+    (checks.autogroup, REALTIME, GROUPED, "ok", "on"),
     (
         checks.usb_latency,
         REALTIME,

@@ -408,6 +408,22 @@ def huge_pages(config: Config, machine: Machine) -> Finding:
     )
 
 
+def autogroup(config: Config, machine: Machine) -> Finding:
+    """Judge whether the kernel shares processors between sessions first: WARN where it does, without
+    `realtime.fifo_priority`.
+
+    Beside busy programs a kernel worker that carries a serial port's bytes then waits for up to 100 ms, and the device
+    counts as silent. OK also for a kernel without autogroups (sched(7)).
+    """
+    is_on = machine.text("/proc/sys/kernel/sched_autogroup_enabled") == "1"
+    return _finding(
+        "autogroup",
+        not is_on or config.realtime.fifo_priority > 0,
+        "on" if is_on else "off",
+        "see sched_fifo above, or sudo sysctl kernel.sched_autogroup_enabled=0",
+    )
+
+
 def run_directory(config: Config, machine: Machine) -> Finding:
     """Judge whether the caller can write where the configured control socket lies: FAIL where not, or where there is no
     folder.
@@ -518,6 +534,7 @@ OF_MACHINE: tuple[Check, ...] = (
     clock_source,
     swap,
     huge_pages,
+    autogroup,
     port_holder,
     usb_latency,
 )

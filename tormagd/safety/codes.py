@@ -274,7 +274,8 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.MEASUREMENT_STALE: Explanation(
         "no state came for `device.measurement_timeout_ms`, 50 ms, or they came too late to close the loop",
-        "check cable and supply, and the round trip in `tormagctl firmware`; then `tormagctl arm`",
+        "check cable and supply, the round trip in `tormagctl firmware`, and what `tormagctl doctor` says of this "
+        "machine; then `tormagctl arm`",
         Reaction.OPENING,
         52.0,
         "at once; 50 ms of nothing, which begin with a tick, and a tick to tell the device",
