@@ -151,7 +151,7 @@ def told(good, fake_daemon, status_with):
 
 def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
     """Whatever whoever calls is allowed: nothing that was refused is unlimited, and nothing that is set recommended."""
-    machine.write(SWAPPING)
+    machine.write(SWAPPING | GROUPED)
     refused = told(REFUSED)
     assert [name for name, each in refused.items() if each["verdict"] == "fail"] == ["sched_fifo", "memlock"]
     assert (refused["sched_fifo"]["found"], "LimitRTPRIO=90" in refused["sched_fifo"]["remedy"]) == (
@@ -159,6 +159,7 @@ def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
         True,
     )
     assert all("its container or cgroup withholds" in refused[name]["remedy"] for name in ("sched_fifo", "memlock"))
+    assert refused["autogroup"]["verdict"] == "warn"
     assert (refused["swap"]["verdict"], "unlimited" in str(refused["memlock"]["found"])) == ("warn", False)
     assert not [each for each in refused.values() if each["remedy"].startswith("set realtime.")]
     machine.write(NOTHING)  # what whoever calls may not do changes nothing

@@ -192,11 +192,12 @@ def of_daemon(known: Running) -> tuple[Finding, ...]:
 
 
 def _in_force(known: Running) -> Config:
-    """Return a daemon's configuration as it is in force: `lock_memory` is False where the kernel refused it."""
-    config = known.config
-    if "realtime.lock_memory" not in refused(known.status.not_granted):
-        return config
-    return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, lock_memory=False))
+    """Return a daemon's configuration as it is in force: `lock_memory` and `fifo_priority` count as not asked for where
+    the kernel refused them."""
+    config, lacking = known.config, refused(known.status.not_granted)
+    nothing = {"lock_memory": False, "fifo_priority": 0}
+    kept = {key: value for key, value in nothing.items() if f"realtime.{key}" in lacking}
+    return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, **kept))
 
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:

@@ -1,7 +1,6 @@
 """An open serial port: frames are written to its descriptor and read from it, never waiting."""
 
 import contextlib
-import fcntl
 import os
 import termios
 from typing import Final, final
@@ -15,8 +14,6 @@ from tormagd.hardware.frame_stream import FrameStream
 READ_BYTES: Final = 4_096
 UNSENT_BYTES: Final = 512
 "Some frames may wait for the driver; more bytes than this mean that nobody reads at the other end."
-_NONE: Final = bytes(4)
-"How FIONREAD says that no byte waits: an int of 0."
 
 
 @final
@@ -45,7 +42,7 @@ class SerialPort:
         """
         try:
             # `read` on an empty terminal waits for a kernel worker (flush_to_ldisc), up to 100 ms on a busy machine
-            if fcntl.ioctl(self._fd, termios.FIONREAD, _NONE) == _NONE:
+            if not self._port.in_waiting:
                 return self.stream.unpack(b"")
             data = os.read(self._fd, READ_BYTES)
         except OSError as error:
