@@ -2,8 +2,9 @@
 
 The patient's tip is where the handle was half a round trip ago; what it feels comes back as late. The bound moves the
 gap by the device's own motors, which stop at once, along the device's true force over gap. It knows what the run's
-controller knows: the newest message, and the handle's place and speed. *Infinite* is the same without motors. *Opened*
-is the run until the hand pulls; from there its motors only open.
+controller knows: the newest message, and the handle's place and speed. A hand that moves feels what was asked, with the
+friction of its speed. *Infinite* is the same without motors. *Opened* is the run until the hand pulls; from there its
+motors only open.
 """
 
 import math
@@ -48,6 +49,7 @@ ONSET_N, COUNTED_N = 0.2, 0.3
 "Over the waiting level: where a wall is felt, and what it has to reach to count."
 HELD_N = EARLY_N = 0.1
 PULLS_N = 0.05
+RESTING_MM_S = 1.0
 GRID_MM = 0.05
 MASS_KG = 0.15
 
@@ -233,7 +235,7 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
     scenario = Scenario(case, core_of(case))
     plant = Plant(parameters, scenario.felt)
     drive = drive_of(parameters) if has_motors else None
-    bound = Bound(scenario.core, brake_of(parameters), drive, case.push_mm_s)
+    bound = Bound(scenario.core, brake_of(parameters), drive)
     put_gap(plant, scenario.core.scene.insert.gap_open_mm)
     plant.advance(PERIOD_S)
     for _ in scenario.begin(plant.time_s):
@@ -246,16 +248,13 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
 class Bound:
     """A gap that the device's own motors move, to where its true force is the one wanted."""
 
-    def __init__(self, core: Core, brake: Brake, drive: Drive | None, push_mm_s: float) -> None:
-        self._core, self._drive = core, drive
-        force = core.scene.force
-        # what waits is what the hand feels at its speed; all else here is the level it slides at
-        faster_N = brake.sliding_N(force.waiting_N, push_mm_s) - force.waiting_N
-        self._waiting_N, self._most_N = force.waiting_N - faster_N, force.most_N
+    def __init__(self, core: Core, brake: Brake, drive: Drive | None) -> None:
+        self._core, self._drive, self._sliding_N = core, drive, brake.sliding_N
         self._gap_mm = np.arange(brake.gap_mm[0], brake.gap_mm[-1], GRID_MM)
         moment_Tm = np.interp(self._gap_mm, brake.gap_mm, brake.moment_Tm)
         self._fresh_N = np.interp(moment_Tm, brake.strength_Tm, brake.fresh_N)
         self._speed_mm_s, self._is_pushing = 0.0, True
+        self._offset_N, self._scale = 0.0, 1.0
 
     def update(self, plant: Plant, setpoint: TimedSetpoint | None) -> None:
         """Moves the gap for the next tick."""
@@ -263,11 +262,21 @@ class Bound:
         if abs(truth.force_N) > PULLS_N:
             self._is_pushing = truth.force_N > 0.0
         strength = truth.kinetic_N / float(np.interp(truth.gap_mm, self._gap_mm, self._fresh_N))
+        self._offset_N, self._scale = self._friction(abs(truth.handle_mm_s))
         put_gap(plant, self._moved(truth.gap_mm, self._wanted_mm(setpoint, truth, strength)))
 
+    def _friction(self, rate_mm_s: float) -> tuple[float, float]:
+        """Offset, N, and scale of what a hand feels at this rate, over the kinetic force. A hand that rests feels what
+        it gives: there both are the same."""
+        if rate_mm_s < RESTING_MM_S:
+            return 0.0, 1.0
+        offset_N = self._sliding_N(0.0, rate_mm_s)
+        return offset_N, self._sliding_N(1.0, rate_mm_s) - offset_N
+
     def _gaps_for(self, forces_N: Array, strength: float) -> Array:
-        bounded_N = np.clip(forces_N, self._waiting_N, self._most_N)
-        return np.interp(-bounded_N / strength, -self._fresh_N, self._gap_mm)
+        force = self._core.scene.force
+        kinetic_N = (np.clip(forces_N, force.waiting_N, force.most_N) - self._offset_N) / self._scale
+        return np.interp(-kinetic_N / strength, -self._fresh_N, self._gap_mm)
 
     def _wanted_mm(self, setpoint: TimedSetpoint | None, truth: Truth, strength: float) -> float:
         travel = Travel(truth.handle_mm, truth.handle_mm_s, self._is_pushing)
@@ -281,7 +290,8 @@ class Bound:
         weights = np.maximum(slopes * slopes, FLATTEST_N_MM**2) * np.gradient(TIMES_S)
         speed_mm_s = max(abs(self._speed_mm_s), self._core.gap_speed_mm_s)
         path = nearest_path_mm(truth.gap_mm, PERIOD_S, TIMES_S, wanted_mm.tolist(), weights.tolist(), speed_mm_s, 1)
-        waiting_N = max(self._waiting_N, float(self._fresh_N[-1]) * strength)
+        open_N = self._scale * float(self._fresh_N[-1]) * strength + self._offset_N
+        waiting_N = max(self._core.scene.force.waiting_N, open_N)
         most_N = wall.force_N(truth.handle_mm) - wall.friction_N + waiting_N + EARLY_N
         return max(path[0], float(self._gaps_for(np.array(most_N), strength)))
 
