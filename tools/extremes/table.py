@@ -306,8 +306,8 @@ def forecast(stage: Forecast, draw: Draw) -> object:
 
 def path(stage: Path, draw: Draw) -> object:
     wanted_N = [draw(1.2) for _ in TIMES_S]
-    forces_N, sent_N = stage.pursue(draw(1.1), draw(1.1), abs(draw.bounded(PLAN_S)), wanted_N, UNSEEN, 0.02)
-    return [forces_N, sent_N, stage.is_near(draw(1.0), draw(1.2), UNSEEN)]
+    forces_N, sent_mm = stage.pursue(draw(70.0), draw(70.0), abs(draw.bounded(PLAN_S)), wanted_N, UNSEEN, 0.02)
+    return [forces_N, sent_mm, stage.is_near(70.0, draw(1.2), UNSEEN)]
 
 
 def skill(stages: list[Skill], draw: Draw) -> object:

@@ -9,7 +9,7 @@ import pytest
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import EARLY_N, Governor
 from tormagd.control.ask.way import SLID_MM, Way
-from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.believe.strength import UNSEEN, DeviceFit
 from tormagd.control.records import Ask, Handle, Measured, TimedSetpoint, Travel, Wall
 from tormagd.model.displacement import TURN_MM, Turn
 from tormagd.safety.codes import Limit
@@ -32,10 +32,10 @@ class Following:
         self.governor = Governor(0.0, PORTRAIT, scene, 38.0)
         self.now_s = 0.0
 
-    def ask(self, travel: Travel, force_N: float = 0.0, **law: object) -> Ask:
+    def ask(self, travel: Travel, force_N: float = 0.0, device: DeviceFit = UNSEEN, **law: object) -> Ask:
         self.now_s += PERIOD_S
         setpoint = TimedSetpoint(force_N, self.now_s, 0.1, **law)
-        return self.governor.update(self.now_s, setpoint, DeviceFit(), 0.0, travel)
+        return self.governor.update(self.now_s, setpoint, device, 0.0, travel)
 
 
 @pytest.fixture
@@ -64,6 +64,16 @@ def test_the_gap_passes_the_place_of_a_stiff_wall_at_speed(following: Following)
     gap_N = [following.ask(Travel(place_mm, 30.0), wall=wall).path_N[0] for place_mm in places_mm]
     felt_mm = next(place for place, each_N in zip(places_mm, gap_N, strict=True) if each_N > 0.8 + EARLY_N)
     assert (felt_mm - wall.place_mm) / 30.0 == pytest.approx(at_once_s, abs=0.01)
+
+
+@pytest.mark.parametrize("learned_N_s", [-0.5, 0.0, 0.5])
+def test_what_is_learned_on_the_way_leaves_the_gap_where_it_is(following: Following, learned_N_s: float) -> None:
+    gaps_mm = []
+    for place_mm in np.arange(9.0, 15.0, 30.0 * PERIOD_S).tolist():
+        device = UNSEEN.shifted(learned_N_s * following.now_s)
+        ask = following.ask(Travel(place_mm, 30.0), device=device, wall=Wall(10.0, 1.0, 0.6))
+        gaps_mm.append(PORTRAIT.gap_mm_at(device.model_N(ask.path_N[0])))
+    assert np.diff(gaps_mm[-20:]) == pytest.approx(-38.0 * PERIOD_S, rel=0.02)
 
 
 def test_from_one_wall_to_the_next_the_force_goes_along_a_ramp() -> None:

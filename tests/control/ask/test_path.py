@@ -60,10 +60,10 @@ def test_no_more_of_it_is_told_than_is_asked_for() -> None:
 @pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: float, is_near: bool, way: float) -> None:
-    """Either way, by the model's force: 40 mm for 1 N of it."""
+    """Either way, by the model's force: 40 mm for 1 N of it; 1.5 N are at 70 mm."""
     path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEED_MM_S)
     to_N = 1.5 + way * share * NEAR_S * SPEED_MM_S / 40.0
-    assert path.is_near(device.force_N(1.5), device.force_N(to_N), device) is is_near
+    assert path.is_near(70.0, device.force_N(to_N), device) is is_near
 
 
 GRID = 4

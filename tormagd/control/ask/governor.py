@@ -69,8 +69,11 @@ class Governor:
     "Number of the publisher whose setpoint was followed last; 0 for the first one, and before it."
     is_passing: bool
     "Whether the force is on the ramp to the forces of its holder."
-    sent_N: float | None
-    "Force of the gap that the carriages were sent to; None where nothing is known ahead."
+    sent_mm: float | None
+    """The portrait's gap that the carriages were sent to; None where nothing is known ahead. A gap, not its force: what
+    is known of the device may have changed since."""
+    from_mm: float
+    "The portrait's gap that the newest plan asked for, where `sent_mm` is not None."
     expected_N: float | None
     "Force that the lagging gap should give by now on its path; None where it follows no path."
     law_N: float | None
@@ -161,7 +164,7 @@ class Governor:
         wall = setpoint.wall
         if not travel.is_pushing and (wall is not None or setpoint.withdraw_N is not None):
             self._feed_forecast(setpoint.stamp_s, heard_N, soon_s)
-            self.sent_N, self.expected_N = None, None
+            self.sent_mm, self.expected_N = None, None
             path_N = [force_N] * len(PATH_S)
             if held_N is None and force_N < self.asked_N:
                 self.is_passing = False  # a hand that draws back is let go at once, off any ramp
@@ -182,9 +185,11 @@ class Governor:
         self.is_passing = self.is_passing and abs(path_N[0] - self.asked_N) > step_N
         if self.is_passing:
             governed_N = self.asked_N + math.copysign(step_N, path_N[0] - self.asked_N)
-            path_N, self.sent_N, self.expected_N = [governed_N] * len(PATH_S), None, None
+            path_N, self.sent_mm, self.expected_N = [governed_N] * len(PATH_S), None, None
             limits, foresight = (*limits, Limit.TAKEOVER), 0.0
         self.asked_N, self.above_N = path_N[0], max(path_N[0] - lowest_N, 0.0)
+        if self.sent_mm is not None:
+            self.from_mm = self._path.gap_mm(self.asked_N, device)
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def foresee(self) -> bool:
@@ -250,7 +255,7 @@ class Governor:
         """Return the forces (7) at PATH_S on the best path for a handle that pushes against `wall` at its present rate.
 
         The forces are within `bounds`, with what is left of a ramp between walls, `blend_N`, added. The gap closes
-        early by at most EARLY_N over the force at each moment, and passes the wall's place at speed. Updates `sent_N`
+        early by at most EARLY_N over the force at each moment, and passes the wall's place at speed. Updates `sent_mm`
         and `expected_N`.
         """
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
@@ -293,7 +298,7 @@ class Governor:
 
         They are within `bounds`. Now is `soon_s` after its stamp and playout. With the term forecast and a preview
         shorter than TIMES_S, the preview's last force goes to the forecast, which goes on from there. The preview's
-        mean slope then becomes `slope_N_s`. Otherwise the forecast forgets. Updates `sent_N` and `expected_N`. Raises
+        mean slope then becomes `slope_N_s`. Otherwise the forecast forgets. Updates `sent_mm` and `expected_N`. Raises
         DomainError for a force beyond LARGEST. Call it only for a setpoint with a preview.
         """
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
@@ -319,12 +324,14 @@ class Governor:
         """Return the forces (7) at PATH_S, within `bounds`, on the gap's best path for `wanted_N` at TIMES_S.
 
         `most_N` are upper bounds at PATH_S, in pairs as `Path.pursue` takes them; None: none. `force_N` is where the
-        path begins during a ramp. Updates `sent_N` and `expected_N`.
+        path begins during a ramp. Updates `sent_mm` and `expected_N`.
         """
-        from_N, sent_N = self._left_from(force_N)
-        path_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, wanted_N, device, lag_s, most_N)
+        from_mm, sent_mm = self._left_from(force_N, device)
+        path_N, self.sent_mm = self._path.pursue(from_mm, sent_mm, dt_s, wanted_N, device, lag_s, most_N)
         # the path sets out sooner by as much as the carriages come later
-        expected_N = from_N if self.is_passing or self.expected_N is None else self.expected_N
+        expected_N = self.asked_N if self.expected_N is None else self.expected_N
+        if self.is_passing:
+            expected_N = force_N
         if dt_s > 0.0:
             expected_N += dt_s / (lag_s + dt_s) * (path_N[0] - expected_N)
         self.expected_N = expected_N
@@ -343,7 +350,7 @@ class Governor:
         """Return the forces (7) at PATH_S along the setpoints' slope, or the forecast, weighted by `foresight`, 0..1.
 
         Now is `soon_s` after the newest stamp and its playout; the slope carries AHEAD_S at most. Off a ramp, where the
-        gap gets there within NEAR_S, a `foresight` above 0 mixes in the best path for these forces. Updates `sent_N`
+        gap gets there within NEAR_S, a `foresight` above 0 mixes in the best path for these forces. Updates `sent_mm`
         and `expected_N`: None where no such path is followed.
         """
         begins_s = soon_s + foresight * lag_s
@@ -354,23 +361,25 @@ class Governor:
             for place, forecast_N in enumerate(self.forecast.forces_N(begins_s, times_s)):
                 path_N[place] += foresight * (forecast_N - path_N[place])
         path_N = [within(each_N, bounds) for each_N in path_N]
-        from_N, sent_N = self._left_from(force_N)
-        self.sent_N, self.expected_N = None, None
-        if foresight > 0.0 and not self.is_passing and self._path.is_near(sent_N, path_N[-1], device):
-            pursued_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, path_N, device, lag_s)
+        from_mm, sent_mm = self._left_from(force_N, device)
+        self.sent_mm, self.expected_N = None, None
+        if foresight > 0.0 and not self.is_passing and self._path.is_near(sent_mm, path_N[-1], device):
+            pursued_N, self.sent_mm = self._path.pursue(from_mm, sent_mm, dt_s, path_N, device, lag_s)
             for place, each_N in enumerate(pursued_N):
                 path_N[place] += foresight * (within(each_N, bounds) - path_N[place])
         return path_N[: len(PATH_S)]
 
-    def _left_from(self, force_N: float) -> tuple[float, float]:
-        """Return two forces, N: that at the last plan, and that which the carriages were sent to then.
+    def _left_from(self, force_N: float, device: DeviceFit) -> tuple[float, float]:
+        """Return two of the portrait's gaps, mm: that at the last plan, and that which the carriages were sent to then.
 
-        Where no path was followed, both are the force at the last plan. During a ramp to a publisher's forces both are
-        `force_N`, what the ramp leads to. Changes nothing.
+        Where no path was followed, both are those of the force at the last plan. During a ramp to a publisher's forces
+        both are those of `force_N`, what the ramp leads to. Changes nothing.
         """
         # a ramp leads to what is asked, whatever the gap can make of it
-        from_N = force_N if self.is_passing else self.asked_N
-        return from_N, from_N if self.is_passing or self.sent_N is None else self.sent_N
+        if self.is_passing or self.sent_mm is None:
+            gap_mm = self._path.gap_mm(force_N if self.is_passing else self.asked_N, device)
+            return gap_mm, gap_mm
+        return self.from_mm, self.sent_mm
 
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
@@ -406,7 +415,7 @@ class Governor:
     def _forget(self) -> None:
         """Forget the setpoint that was followed: its slope, wall, path and forecast."""
         self.stamp_s, self.slope_N_s, self.last_N = -math.inf, 0.0, 0.0
-        self.sent_N, self.expected_N = None, None
+        self.sent_mm, self.from_mm, self.expected_N = None, 0.0, None
         self.law_N, self.law_mm, self.blend_N, self.was_pushing = None, 0.0, 0.0, True
         self.forecast.forget()
 

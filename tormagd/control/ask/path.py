@@ -13,6 +13,7 @@ from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.believe.strength import DeviceFit
+from tormagd.model.features import require_number
 
 PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
 "The times, from the moment that is planned for, at which a plan looks at the force to come."
@@ -46,27 +47,32 @@ class Path:
         self._portrait: Final = portrait
         self._gap_speed_mm_s: Final = gap_speed_mm_s
 
-    def is_near(self, from_N: float, to_N: float, device: DeviceFit) -> bool:
-        """Tell whether the device's gap, at its top speed, gets from the force `from_N` to `to_N` within NEAR_S."""
-        portrait = self._portrait
-        away_mm = portrait.gap_mm_at(device.model_N(from_N)) - portrait.gap_mm_at(device.model_N(to_N))
-        return abs(away_mm) < NEAR_S * self._gap_speed_mm_s
+    def gap_mm(self, force_N: float, device: DeviceFit) -> float:
+        """Return the portrait's gap at which the device gives `force_N`; its nearer end where none does."""
+        return self._portrait.gap_mm_at(device.model_N(force_N))
+
+    def is_near(self, from_mm: float, to_N: float, device: DeviceFit) -> bool:
+        """Tell whether the device's gap, at its top speed, gets from `from_mm` to the force `to_N` within NEAR_S.
+
+        It does not from a gap of NaN.
+        """
+        return abs(from_mm - self.gap_mm(to_N, device)) < NEAR_S * self._gap_speed_mm_s
 
     def pursue(
         self,
-        from_N: float,
-        sent_N: float,
+        from_mm: float,
+        sent_mm: float,
         dt_s: float,
         wanted_N: list[float],
         device: DeviceFit,
         lag_s: float,
         most_N: list[tuple[float, float]] | None = None,
     ) -> tuple[list[float], float]:
-        """Find the best path for the forces `wanted_N` at TIMES_S, and return forces (7) at PATH_S and a force to send.
+        """Find the best path for the forces `wanted_N` at TIMES_S, and return forces (7) at PATH_S and a gap to send.
 
-        `wanted_N` has n >= 7 forces, for the first n of TIMES_S. The carriages are to be sent now to the gap of the
-        force to send. The gap follows its carriages with the time constant SPEEDING_UP_S + `lag_s`, and the forces (7)
-        are those of the gap. `dt_s` ago, the gap gave `from_N` and the carriages were sent to the gap for `sent_N`.
+        `wanted_N` has n >= 7 forces, for the first n of TIMES_S. The carriages are to be sent now to the gap to send.
+        The gap follows its carriages with the time constant SPEEDING_UP_S + `lag_s`, and the forces (7) are those of
+        the gap. `dt_s` ago, the gap was at `from_mm` and the carriages were sent to `sent_mm`; gaps are the portrait's.
 
         With `most_N` None the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7),
         N, opens the path where it would give more; `wanted_N` has to be of a time constant later already. Its pairs are
@@ -78,6 +84,7 @@ class Path:
         """
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
+        require_number("sent_mm", sent_mm)
         wanted_mm: list[float] = []
         weights: list[float] = []
         for place, force_N in enumerate(wanted_N):
@@ -87,20 +94,19 @@ class Path:
                 wanted_mm[place - 1] += late_s * CHANGES_PER_S[place - 1] * (gap_mm - wanted_mm[place - 1])
             wanted_mm.append(gap_mm)
             weights.append(LASTS_S[place] * slope_N_mm * slope_N_mm)
-        sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(from_N))
         path_mm = nearest_path_mm(sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
         if most_N is not None:
             lead_mm = late_s * self._gap_speed_mm_s
             for place, (now_N, then_N) in enumerate(most_N):
                 least_mm = portrait.gap_mm_at(device.model_N(now_N)) - lead_mm
                 path_mm[place] = max(path_mm[place], least_mm, portrait.gap_mm_at(device.model_N(then_N)))
-        forces_N: list[float] = []
+        gap_mm, forces_N = from_mm, []
         left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for to_mm in path_mm:
             gap_mm = to_mm + (gap_mm - to_mm) * left
             forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
             left = left_in_a_step
-        return forces_N, device.force_N(portrait.force_N_at(path_mm[0]))
+        return forces_N, path_mm[0]
 
 
 def nearest_path_mm(
