@@ -9,9 +9,8 @@ import pytest
 from firmware_protocol.codec import Message
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
-from tormagd.commission.course import COLUMNS, PREVIEW_STEP_S, Asked, Course, Found, Heard, drive
+from tormagd.commission.course import COLUMNS, PREVIEW_STEP_S, Asked, Course, Found, Heard, Known, drive
 from tormagd.commission.finding import Finding
-from tormagd.commission.known import Known
 from tormagd.commission.sequence import STEPS, Step, Stopped, due, sequence
 from tormagd.config import Config, Rates
 from tormagd.control.records import TimedSetpoint

@@ -12,8 +12,7 @@ from tormagd.assembly.build import build_core
 from tormagd.commission.calibration import calibration
 from tormagd.commission.finding import finding
 from tormagd.commission.page import page_of
-from tormagd.commission.report import Report, begun
-from tormagd.commission.sequence import STEPS, Stopped
+from tormagd.commission.sequence import STEPS, Report, Stopped, begun
 from tormagd.config import Config, Rates, load_calibration
 from tormagd.control.move.motor import margins
 from tormagd.simulation.hand import ReversingHand, SteadyHand

@@ -17,9 +17,7 @@ from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.commission import course
 from tormagd.commission.finding import Finding
-from tormagd.commission.known import Known
-from tormagd.commission.report import begun
-from tormagd.commission.sequence import STEPS, Stopped
+from tormagd.commission.sequence import STEPS, Stopped, begun
 from tormagd.config import Config
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
@@ -432,7 +430,7 @@ def test_the_steps_that_are_run_are_numbered_one_by_one(monkeypatch, tmp_path, c
     monkeypatch.setattr(ctl_commission, "STEPS", [step._replace(course=finds_nothing) for step in STEPS])
     run = SimpleNamespace(progress=Progress(), follow=lambda course: next(course, None))
     kept = ctl_commission.Kept(tmp_path / "7.json", begun(None, 7, 0, None, Config().motor))
-    kept.follow(run, Known(Config(), 1e-3, 0.6, 2.0, None))
+    kept.follow(run, course.Known(Config(), 1e-3, 0.6, 2.0, None))
     numbers = re.findall(r"step (\d) of (\d)", capsys.readouterr().err)
     assert numbers == [(str(number), "8") for number in range(1, 9)]
 

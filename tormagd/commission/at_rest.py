@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from tormagd.commission.course import PLACES, Columns, Course, Row, given, watch
+from tormagd.commission.course import PLACES, Columns, Course, Known, Row, given, watch
 from tormagd.commission.finding import Finding, finding
-from tormagd.commission.known import Known
 from tormagd.commission.of_carriages import SIDES
 
 REST_S = 3.0

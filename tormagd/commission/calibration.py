@@ -7,7 +7,7 @@ import msgspec
 
 from tormagd.commission.gains import Corners, stiffest, tunings
 from tormagd.commission.of_carriages import BACK_EMF, FRICTION, INERTIA, RESISTANCE, nominals
-from tormagd.commission.report import Report
+from tormagd.commission.sequence import Report
 from tormagd.config import Config
 
 DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.commission.finding import Finding
+from tormagd.config import Config
 from tormagd.safety.codes import FAULTS, Fault
 
 Columns: TypeAlias = dict[str, npt.NDArray[Any]]
@@ -54,6 +55,26 @@ PREVIEW_STEP_S, PREVIEW_STEPS = 0.02, 15
 "Spacing, and length, of the forces that are told ahead."
 MOVING_MM_S = 5.0
 HANDLE_PATIENCE_S = 30.0
+CLEAR_N = 0.1
+"At the open end the firmware holds back a duty that would push on, and the least force grows with the device."
+
+
+class Known(NamedTuple):
+    """The daemon's configuration, its control period, s, and the least and most force that it gives, N.
+
+    `weight_N` is the weight that a person hangs up; None: none is at hand. No value is checked.
+    """
+
+    config: Config
+    period_s: float
+    least_N: float
+    most_N: float
+    weight_N: float | None = None
+
+    def force_N(self, share: float) -> float:
+        """Return the force at a share, 0 to 1, of the range, which begins CLEAR_N over the device's least force."""
+        low_N = self.least_N + CLEAR_N
+        return low_N + share * (self.most_N - low_N)
 
 
 class Asked(NamedTuple):

@@ -9,9 +9,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.commission.course import Columns, Course, watch
+from tormagd.commission.course import Columns, Course, Known, watch
 from tormagd.commission.finding import Array, Finding, finding
-from tormagd.commission.known import Known
 from tormagd.commission.of_force import GAINS, ready
 from tormagd.commission.regression import fitted
 from tormagd.config import Motor

@@ -11,6 +11,7 @@ from tormagd.commission.course import (
     Asked,
     Columns,
     Course,
+    Known,
     Row,
     StoppedError,
     columns_of,
@@ -19,7 +20,6 @@ from tormagd.commission.course import (
     watch,
 )
 from tormagd.commission.finding import Array, Finding, finding
-from tormagd.commission.known import Known
 from tormagd.commission.regression import fitted
 
 SLIDING_MM_S = 20.0

@@ -4,8 +4,7 @@ from datetime import UTC, datetime
 from html import escape
 
 from tormagd.commission.finding import Finding
-from tormagd.commission.report import Report
-from tormagd.commission.sequence import STEPS
+from tormagd.commission.sequence import STEPS, Report
 from tormagd.dashboard.html import page, table
 
 FAIL = "FAIL"

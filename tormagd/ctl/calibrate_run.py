@@ -18,12 +18,12 @@ from tormagd.commission.course import (
     Device,
     Found,
     Heard,
+    Known,
     Row,
     StoppedError,
     drive,
     watch,
 )
-from tormagd.commission.known import Known
 from tormagd.commission.of_force import enabled
 from tormagd.config import Config
 from tormagd.ctl.operate import home

@@ -9,10 +9,9 @@ import msgspec
 
 from tormagd.bounded_file import in_place_of, read_bounded
 from tormagd.commission.calibration import calibration
-from tormagd.commission.known import Known
+from tormagd.commission.course import Known
 from tormagd.commission.page import page_of
-from tormagd.commission.report import MAX_BYTES, Report, begun
-from tormagd.commission.sequence import STEPS, Findings, Step, Stopped, due, sequence
+from tormagd.commission.sequence import MAX_BYTES, STEPS, Findings, Report, Step, Stopped, begun, due, sequence
 from tormagd.config import Config, checked
 from tormagd.ctl.calibrate import agree
 from tormagd.ctl.calibrate_run import Run, connected, known_of

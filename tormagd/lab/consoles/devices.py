@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from tormagd.commission.report import Report
+from tormagd.commission.sequence import Report
 from tormagd.lab.consoles.summary import Summary
 
 DAY_S = 86_400.0
