@@ -17,10 +17,10 @@ from tormagd.daemon.telemetry import tick_record
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
 from tormagd.lab.twin.command import figures_of
+from tormagd.lab.twin.estimate import keys_of, value_at
 from tormagd.lab.twin.excerpt import Excerpt, excerpt_of
 from tormagd.lab.twin.fit import COMBINATIONS, twin_of
 from tormagd.lab.twin.force import STRENGTH
-from tormagd.lab.twin.law import keys_of, value_at
 from tormagd.recording.ticks import decode_ticks
 from tormagd.recording.writer import RecordingWriter
 from tormagd.simulation.device import VirtualDevice

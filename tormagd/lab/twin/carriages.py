@@ -13,9 +13,8 @@ import numpy as np
 from tormagd.commission.of_carriages import SIDES
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.errors import LabError
-from tormagd.lab.twin.estimate import Estimate, Prior, Values, estimated, named
+from tormagd.lab.twin.estimate import Estimate, Prior, Values, estimated, named, value_at, with_values
 from tormagd.lab.twin.excerpt import GRID_HZ, IDLE_A, Excerpt, Moves
-from tormagd.lab.twin.law import value_at, with_values
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import pull_of_magnets_N
 

@@ -17,10 +17,10 @@ from typing import Any
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.pages import subplots
+from tormagd.lab.twin.estimate import keys_of, value_at
 from tormagd.lab.twin.excerpt import Excerpt, excerpt_of
 from tormagd.lab.twin.fit import EXPLAINED_N, Twin, twin_of
-from tormagd.lab.twin.force import STRENGTH
-from tormagd.lab.twin.law import along, fresh_along, keys_of, value_at
+from tormagd.lab.twin.force import STRENGTH, along, fresh_along
 from tormagd.lab.twin.plant_file import motion_for, write_plant
 from tormagd.simulation.parameters import PlantParameters, load_plant
 

@@ -1,9 +1,13 @@
-"""Least squares about a prior: the plant that fits, and 95 % intervals of whatever the data tell of it."""
+"""Least squares about a prior: the plant that fits, and 95 % intervals of whatever the data tell of it.
+
+What is fitted stands at keys of a plant file, as `motor.resistance_Ohm`.
+"""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
@@ -18,8 +22,56 @@ ROUNDS = 12
 STEP = 1e-3
 "Of a derivative, in widths of the prior."
 
+PARTS = PlantParameters.__struct_fields__[: PlantParameters.__struct_fields__.index("assumed")]
+"Tables of the plant card."
+
 Values = dict[str, float]
 PlantOf = Callable[[Values], PlantParameters]
+
+
+def value_at(plant: PlantParameters, key: str) -> float:
+    """Return the number at a key of the plant file, as `motor.resistance_Ohm`; `.0` is the first of a list.
+
+    Raises AttributeError or IndexError for a key that is none, ValueError or TypeError for one of no number.
+    """
+    found: Any = plant
+    for name in key.split("."):
+        found = found[int(name)] if name.isdigit() else getattr(found, name)
+    return float(found)
+
+
+def keys_of(plant: PlantParameters) -> list[str]:
+    """Return the keys of all numbers in a plant file, as `value_at` takes them; not of what is assumed, of [pad] or
+    [second].
+
+    They stand in the order of the file; each number of a list has its own key.
+    """
+    tables = msgspec.to_builtins(plant)
+    named = ((f"{title}.{name}", value) for title in PARTS for name, value in tables[title].items())
+    listed = (
+        [f"{key}.{place}" for place in range(len(value))] if isinstance(value, list | tuple) else [key]
+        for key, value in named
+        if not isinstance(value, str)
+    )
+    return [key for keys in listed for key in keys]
+
+
+def with_values(plant: PlantParameters, values: Mapping[str, float]) -> PlantParameters:
+    """Return the plant with other numbers at some keys, as `value_at` takes them; `plant` itself stays.
+
+    Neither numbers nor bounds are checked. A key of a name that the table has not raises TypeError, of a table
+    AttributeError.
+    """
+    for key, value in values.items():
+        table, name, *index = key.split(".")
+        part = getattr(plant, table)
+        new: Any = value
+        if index:
+            listed = list(getattr(part, name))
+            listed[int(index[0])] = value
+            new = tuple(listed)
+        plant = msgspec.structs.replace(plant, **{table: msgspec.structs.replace(part, **{name: new})})
+    return plant
 
 
 class Prior(NamedTuple):

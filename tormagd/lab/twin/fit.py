@@ -11,10 +11,9 @@ from tormagd.lab.arrays import rms
 from tormagd.lab.errors import LabError
 from tormagd.lab.ideal_carriage import friction_of
 from tormagd.lab.twin.carriages import SUPPLY_STEP_V, fit_carriages, lag_s
-from tormagd.lab.twin.estimate import TOLD, Estimate
+from tormagd.lab.twin.estimate import TOLD, Estimate, value_at, with_values
 from tormagd.lab.twin.excerpt import EVERY_TICK, GRID_HZ, Excerpt
-from tormagd.lab.twin.force import DRIFT_MN_MIN, EXPONENT, STRENGTH, Fitted, fit_force
-from tormagd.lab.twin.law import PIVOT_MM, strength_N, value_at, with_values
+from tormagd.lab.twin.force import DRIFT_MN_MIN, EXPONENT, PIVOT_MM, STRENGTH, Fitted, fit_force, strength_N
 from tormagd.simulation.parameters import PlantParameters
 
 CHOICE = (STRENGTH, EXPONENT, "field.hysteresis_percent", "friction.static_to_kinetic")

@@ -8,8 +8,7 @@ import msgspec
 
 from tormagd.lab.errors import LabError
 from tormagd.lab.twin.fit import STANDS_FOR, Twin
-from tormagd.lab.twin.force import EXPONENT
-from tormagd.lab.twin.law import PIVOT_MM
+from tormagd.lab.twin.force import EXPONENT, PIVOT_MM
 from tormagd.simulation.parameters import Assumed, PlantParameters, load_plant
 
 SLIDE = "slide the handle both ways at over 20 mm/s for a minute, at several forces"
