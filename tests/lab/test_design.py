@@ -23,10 +23,10 @@ from tormagd.lab.design.optimisation import (
     coverage,
     coverage_as_made,
     solve,
+    sweep,
 )
 from tormagd.lab.design.phase_portrait import PhasePortrait, Region
 from tormagd.lab.design.selection import ForceTask, Verdict, judge, rank
-from tormagd.lab.design.sweep import sweep
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import Elastomer

@@ -11,9 +11,8 @@ import numpy as np
 
 from tormagd.config import Position
 from tormagd.lab import executors
-from tormagd.lab.design.optimisation import Design, Problem, Run, coverage_as_made
+from tormagd.lab.design.optimisation import Design, Problem, Run, coverage_as_made, sweep
 from tormagd.lab.design.phase_portrait import Region
-from tormagd.lab.design.sweep import sweep
 from tormagd.lab.main import Found
 from tormagd.lab.options import GAP_SPEED, SEED, whole, within
 

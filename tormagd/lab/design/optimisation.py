@@ -15,7 +15,8 @@ A constraint is told to the solvers as one: the elastomer must bear the field of
 import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 from typing import Any, Literal, TypeAlias
 
 import msgspec
@@ -25,6 +26,7 @@ from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differen
 from tormagd.lab.arrays import Array
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.phase_portrait import PhasePortrait, Region
+from tormagd.lab.executors import finished
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
@@ -270,3 +272,14 @@ class _Search:
 
 def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult) -> Array:
     return np.asarray(result.x) if cost(result.x) < cost(start) else start
+
+
+def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
+    """Solve every run on `executor` and return the outcomes by run, in the order of the runs.
+
+    Equal runs are solved once. The progress is shown on stderr. Raises what the first run to fail, in time, raised,
+    DomainError as `solve`; runs that have not begun are then cancelled. `executor` is left open.
+    """
+    wanted = list(dict.fromkeys(runs))
+    outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}
+    return {run: outcomes[run] for run in wanted}

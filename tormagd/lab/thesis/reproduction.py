@@ -13,10 +13,9 @@ import numpy as np
 
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.brake import CLOSED_MM, OPEN_MM, Brake
-from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage
+from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage, sweep
 from tormagd.lab.design.phase_portrait import PhasePortrait
 from tormagd.lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
-from tormagd.lab.design.sweep import sweep
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.main import Found
 from tormagd.lab.options import GAP_SPEED, SEED, WORKERS
