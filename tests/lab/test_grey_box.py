@@ -8,8 +8,7 @@ import pytest
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import fit_network
-from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series
-from tormagd.lab.training.memory import relaxed_N
+from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series, relaxed_N
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
 

@@ -22,7 +22,7 @@ from tormagd.lab.main import Found
 from tormagd.lab.motor.fit import THINNED_HZ, fit_volts
 from tormagd.lab.motor.identification import identify
 from tormagd.lab.motor.log import Log, read_log
-from tormagd.lab.pages import subplots
+from tormagd.lab.pages import draw_beside
 
 VAGUE_SHARE = 0.5
 
@@ -99,16 +99,13 @@ def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
     half = len(log.t_s) // 2
     fitted = fit_volts(log.part(slice(None, half)))
     time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))
-    figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
-    above.plot(time_s, measured, color="#222222", label="measured")
-    above.plot(time_s, predicted, color="#d1495b", linewidth=1.0, label="from the fit of the other half")
-    above.legend(frameon=False, ncols=2)
-    above.set_ylabel("input, V")
-    above.set_title(
-        f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {result['holdout_voltage_nrmse']:.1%}; gaps where it "
-        "stands",
-        loc="left",
+    draw_beside(
+        path,
+        time_s,
+        measured,
+        predicted,
+        labels=("from the fit of the other half", "input, V", "difference, V"),
+        title=f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {result['holdout_voltage_nrmse']:.1%}; "
+        "gaps where it stands",
+        widths=(1.5, 1.0, 0.8),
     )
-    below.plot(time_s, measured - predicted, color="#2a6f97", linewidth=0.8)
-    below.set(xlabel="time, s", ylabel="difference, V")
-    figure.savefig(path, dpi=110)

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,6 +135,19 @@ class Dataset:
                 f"at validation_share = {validation_share:g}"
             )
         return self.subset(~validation), self.subset(validation)
+
+
+def records(time_s: Array) -> list[slice]:
+    """Return the rows of each record in times (n), in order: a new one begins wherever time goes back."""
+    starts = [0, *(np.flatnonzero(np.diff(time_s) < 0) + 1).tolist(), len(time_s)]
+    return [slice(first, last) for first, last in itertools.pairwise(starts)]
+
+
+def times_of(data: Dataset) -> Array:
+    """Return `time_s` of the data. Raises `DomainError` where they have none."""
+    if data.time_s is None:
+        raise DomainError("time_s", None, "a column of the data: a model with memory needs it")
+    return data.time_s
 
 
 def read_csv(path: Path) -> Dataset:

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from tormagd.lab.arrays import Array, Mask
-from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.memory import records, relaxed_N, times_of
+from tormagd.lab.training.dataset import Dataset, records, times_of
 from tormagd.model.features import FIELD, RATE
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.relaxation import PronySeries
@@ -90,6 +89,52 @@ def elastic_parts_N(model: ForceModel, data: Dataset) -> tuple[Array, Array]:
 
 def _with_memory(series: tuple[PronySeries, PronySeries], parts: tuple[Array, Array], data: Dataset) -> Array:
     return relaxed_N(series[0], parts[0], data) + relaxed_N(series[1], parts[1], data)
+
+
+def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
+    """Return the force with memory (n), N, from the force without, `elastic_N` (n), along the records of `data`.
+
+    Of `data` only the times count. `time_s` counts from the last rest. A record that begins later counts as having been
+    run before, from the rest on, as often as the time allows. Laboratories cycle a specimen until it repeats and then
+    record. Raises `DomainError` without `time_s`.
+    """
+    times = times_of(data)
+    # records with the same times run side by side: a laboratory repeats one program, and rows are slow one by one
+    alike: dict[bytes, list[slice]] = {}
+    for rows in records(times):
+        alike.setdefault(times[rows].tobytes(), []).append(rows)
+    forces = np.empty(len(data))
+    for group in alike.values():
+        relaxed = _relax_alike(series, np.column_stack([elastic_N[rows] for rows in group]), times[group[0]])
+        for rows, column in zip(group, relaxed.T, strict=True):
+            forces[rows] = column
+    return forces
+
+
+def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
+    """Return the force with memory (n x r), N, of r records with the same times `time_s` (n), s from the last rest.
+
+    `driving_N` (n x r) is the force without memory. A first time above 0 makes the first step a ramp as long as the
+    second; from 0 it is a jump.
+    """
+    first_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 and time_s[0] > 0 else 0.0
+    # rounded, so that steps that are equal but for the rounding of the time share one update
+    steps_s = np.round(np.diff(time_s, prepend=time_s[0] - first_s), 9).tolist()
+    known = {dt_s: series.discretise(dt_s) for dt_s in set(steps_s)}
+    decays = np.array([known[dt_s].decays for dt_s in steps_s])[:, :, np.newaxis]
+    gains = np.array([known[dt_s].gains for dt_s in steps_s])[:, :, np.newaxis]
+    duration_s = float(time_s[-1] - time_s[0]) + first_s
+    passes = 1 + (round((float(time_s[0]) - first_s) / duration_s) if duration_s > 0 else 0)
+    last_N = np.zeros(driving_N.shape[1])
+    branches = np.zeros((len(series.times_s), driving_N.shape[1]))
+    fractions = np.array(series.fractions)
+    remembered = np.empty_like(driving_N)
+    for _ in range(passes):
+        for row, now_N in enumerate(driving_N):
+            branches = branches * decays[row] + (now_N - last_N) * gains[row]
+            remembered[row] = fractions @ branches
+            last_N = now_N
+    return (1.0 - sum(series.fractions)) * driving_N + remembered
 
 
 def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries, PronySeries]:

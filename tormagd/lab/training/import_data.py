@@ -22,8 +22,7 @@ from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.options import within
 from tormagd.lab.pages import subplots
-from tormagd.lab.training.dataset import ALLOWED, Dataset, write_csv
-from tormagd.lab.training.memory import records
+from tormagd.lab.training.dataset import ALLOWED, Dataset, records, write_csv
 from tormagd.model.displacement import MOBILISED_MM
 
 MAX_FILE_BYTES = 1 << 28

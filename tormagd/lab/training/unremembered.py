@@ -16,9 +16,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from tormagd.lab.arrays import Array
-from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.dataset import Dataset, records, times_of
 from tormagd.lab.training.law import mobilised_N
-from tormagd.lab.training.memory import records, times_of
 from tormagd.model.features import CIP, FIELD
 from tormagd.model.memory import Memory
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
-from tormagd.lab.pages import subplots
+from tormagd.lab.pages import draw_beside
 from tormagd.lab.twin.estimate import keys_of, value_at
 from tormagd.lab.twin.excerpt import Excerpt, excerpt_of
 from tormagd.lab.twin.fit import EXPLAINED_N, Twin, twin_of
@@ -111,14 +111,15 @@ def draw(path: Path, twin: Twin, way: Excerpt) -> None:
     `way` has to be the first recording of the twin: its zero and memory are taken. A file there is replaced. Raises
     OSError, and ModuleNotFoundError where matplotlib is not installed.
     """
-    figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
     zero_N = 1e-3 * (twin.force.zeros[0]["zero_mN"] + twin.force.zeros[0]["drift_mN_min"] * way.minute)
     explained_N = along(twin.plant, way, twin.force.memory_N, fresh_along(twin.plant, way)) + zero_N
-    above.plot(way.time_s, way.force_N, color="#222222", linewidth=0.6, label="measured")
-    above.plot(way.time_s, explained_N, color="#d1495b", linewidth=0.6, label="by the plant's laws")
-    above.legend(frameon=False, ncols=2)
-    above.set(ylabel="force, N")
-    above.set_title(f"Model error {1e3 * twin.force.error_N:.1f} mN RMS, allowed {1e3 * EXPLAINED_N:g}", loc="left")
-    below.plot(way.time_s, 1e3 * (way.force_N - explained_N), color="#2a6f97", linewidth=0.5)
-    below.set(xlabel="time, s", ylabel="difference, mN")
-    figure.savefig(path, dpi=110)
+    draw_beside(
+        path,
+        way.time_s,
+        way.force_N,
+        explained_N,
+        labels=("by the plant's laws", "force, N", "difference, mN"),
+        title=f"Model error {1e3 * twin.force.error_N:.1f} mN RMS, allowed {1e3 * EXPLAINED_N:g}",
+        widths=(0.6, 0.6, 0.5),
+        finer=1e3,
+    )
