@@ -69,13 +69,6 @@ def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, ctl, file):
     assert file.read_text() == "precious"
 
 
-def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, ctl):
-    made = ctl(*fake_daemon.at, "--json", "record", str(tmp_path), "--duration", "0.1").ended(0).result
-    (file,) = tmp_path.iterdir()
-    assert made["file"] == str(file)
-    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.mcap", file.name)
-
-
 def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon, tmp_path, ctl):
     folder, config = tmp_path / "recordings", tmp_path / "t.toml"
     folder.mkdir()
@@ -88,6 +81,7 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     names = [row["name"] for row in listed["recordings"]]
     assert len(names) > 1
     assert names[-1] == Path(made["file"]).name
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.mcap", names[-1])
     assert {row["is_marked"] for row in listed["recordings"]} == {False}
     # what an operator keeps, stays; the copy says what its seals say
     kept = ctl(*command, "recordings", "mark", str(folder / names[-1])).ended(0).result["file"]

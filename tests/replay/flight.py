@@ -24,10 +24,13 @@ from tormagd.inverse.solution import Answer, Question
 from tormagd.keeping import Part
 from tormagd.recording.black_box import is_tick, write_black_box
 from tormagd.recording.keeper import Ring
+from tormagd.replay.rerun import Rerun, rerun
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import RefusedError
 from tormagd.simulation.device import VirtualDevice
+from tormagd_client.messages import TickRecord
 
+COLUMNS = TickRecord.__struct_fields__
 PART_TICKS, SNAPSHOT_TICKS = 20, 500
 PLAYOUT_S = 0.02
 NS = 1_000_000_000
@@ -165,6 +168,11 @@ class Flight:
         """Its black box; `changes` are of the header."""
         write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.ring.parts(), key)
         return path
+
+
+def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
+    """What the core makes of these entries."""
+    return rerun(core, COLUMNS, entries, from_s)
 
 
 def frames(path: Path) -> list[dict[str, Any]]:

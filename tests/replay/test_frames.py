@@ -2,12 +2,11 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from flight import Flight, frames
+from flight import COLUMNS, Flight, again, frames
 from mcap.reader import make_reader
 
 from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier, decode
@@ -20,11 +19,9 @@ from tormagd.recording.black_box import BlackBoxFile, read_black_box
 from tormagd.replay.__main__ import main as run
 from tormagd.replay.rebuild import ReplayError, rebuilt, recorded
 from tormagd.replay.rehearse import changed, rehearse, script
-from tormagd.replay.rerun import Rerun, rerun, ticks_of
+from tormagd.replay.rerun import ticks_of
 from tormagd.safety.codes import Fault
-from tormagd_client.messages import TickRecord
 
-COLUMNS = TickRecord.__struct_fields__
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5
 "And when the newest snapshot before it is, one of two a second."
 DAMAGED_FROM_S = 3.0
@@ -44,10 +41,6 @@ def can_path(on_can: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module", params=["serial", "can"])
 def box(request: pytest.FixtureRequest, path: Path, can_path: Path) -> BlackBoxFile:
     return read_black_box(path if request.param == "serial" else can_path)
-
-
-def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
-    return rerun(core, COLUMNS, entries, from_s)
 
 
 def place_of(entries: list[Any], name: str, tick: int) -> int:
@@ -149,9 +142,6 @@ def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, t
 # -- what would have happened instead: the simulator, with what was asked of the recorded one --------------------------
 
 
-Fly = Callable[..., Flight]
-
-
 def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(path: Path) -> None:
     known = recorded(read_black_box(path), path.parent)
     todo = script(known.columns, read_black_box(path).entries)
@@ -169,7 +159,7 @@ def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(
     assert instead.faults["FOLLOWING_ERROR"] < 3.5
 
 
-def test_a_limit_that_was_too_narrow(fly: Fly, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_limit_that_was_too_narrow(fly: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Recorded: carriages that were 0.02 mm apart; with 2 mm that would have been no fault."""
     narrow = Config(limits=Limits(skew_warning_mm=0.02, skew_fault_mm=0.02))
     path = fly("drag_left=+300%@2.5", until_s=3.6, config=narrow).write(tmp_path / "narrow.mcap")

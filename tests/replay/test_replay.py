@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from flight import Flight, asked, frames, planted
+from flight import COLUMNS, Flight, again, asked, frames, planted
 from mcap.writer import Writer
 
 from firmware_protocol.build import SWITCH, settle
@@ -27,11 +27,9 @@ from tormagd.recording.black_box import BlackBoxFile, Derived, read_black_box, w
 from tormagd.recording.reader import RecordingError, Seen, read_recording
 from tormagd.recording.seal import State, verified
 from tormagd.replay.rebuild import ReplayError, differences, rebuilt, recorded
-from tormagd.replay.rerun import Rerun, rerun, ticks_of
+from tormagd.replay.rerun import rerun, ticks_of
 from tormagd.safety.codes import Fault
-from tormagd_client.messages import TickRecord
 
-COLUMNS = TickRecord.__struct_fields__
 CHANGED_TICK = 3_210
 TICKS = 4_000
 ROOT = Path(__file__).parents[2]
@@ -45,10 +43,6 @@ NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]
 @pytest.fixture(scope="module")
 def box(path: Path) -> BlackBoxFile:
     return read_black_box(path)
-
-
-def again(core: Core, box: BlackBoxFile, from_s: float = 0.0) -> Rerun:
-    return rerun(core, COLUMNS, box.entries, from_s)
 
 
 # -- the same again ------------------------------------------------------------------------------------------------
@@ -72,12 +66,12 @@ def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fl
     box = read_black_box(flown.write(tmp_path / "thesis.mcap"))
     answers = [entry for entry in box.entries if entry[0] == ANSWER]
     assert len(answers) > 100
-    done = again(flown.core, box)
+    done = again(flown.core, box.entries)
     assert (done.difference, done.gaps, done.ticks) == (None, 0, 3_000)
-    assert again(flown.core, box, 2.7).difference is None
+    assert again(flown.core, box.entries, 2.7).difference is None
     # another field in one of them is found
     answers[-5][1]["Answer"]["solution"]["FieldSolution"]["field_mT"] += 0.5
-    assert again(flown.core, box, 2.7).difference is not None
+    assert again(flown.core, box.entries, 2.7).difference is not None
 
 
 def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> None:
@@ -92,14 +86,14 @@ def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> Non
     for _ in range(500):
         flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
     box = read_black_box(flown.write(tmp_path / "confirmed.mcap"))
-    assert again(flown.core, box).difference is None
+    assert again(flown.core, box.entries).difference is None
     box.entries.remove([CONFIRM, "device"])
-    assert again(flown.core, box, flown.loop.now_s - 0.5).difference is not None
+    assert again(flown.core, box.entries, flown.loop.now_s - 0.5).difference is not None
 
 
 @pytest.mark.parametrize(("from_s", "begins_s"), [(0.2, 0.0), (2.9, 2.5), (3.7, 3.5)])
 def test_it_is_from_the_middle_of_the_run(core: Core, box: BlackBoxFile, from_s: float, begins_s: float) -> None:
-    done = again(core, box, from_s)
+    done = again(core, box.entries, from_s)
     assert (done.difference, done.from_s, done.ticks) == (
         None,
         pytest.approx(begins_s, abs=1e-9),
@@ -119,7 +113,7 @@ def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Pa
     flight = fly(*([fault] if fault else []), until_s=2.8, silent_s=silent_s)
     assert str(flight.loop.stepper.safety.faults[0]) == told
     box = read_black_box(flight.write(tmp_path / "planted.mcap"))
-    done = again(core, box)
+    done = again(core, box.entries)
     assert done.difference is None
     ticks = ticks_of(COLUMNS, box.entries)
     assert done.ticks == len(ticks) > 2_700
@@ -158,11 +152,11 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     tried, latched, afresh = box.entries[place - 2 : place + 1]
     assert (tried[0], tried[1], latched) == ("plan", afresh[1], ["latch", "PLAN_FAILED"])
     assert math.isnan(tried[2][0])
-    done = again(core, box)
+    done = again(core, box.entries)
     assert (done.difference, done.ticks, done.snapshots) == (None, 3_600, 7)
     # a plan that fails here alone is no such plan
     entries = [*box.entries[: place - 1], *box.entries[place + 1 :]]
-    found = again(core, msgspec.structs.replace(box, entries=entries), 3.0).difference
+    found = again(core, entries, 3.0).difference
     assert (found.tick, found.field, found.recorded, found.replayed) == (
         3_101,
         "plan",
@@ -174,7 +168,7 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
 def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
     """A part was lost: 20 ticks are missing, and the rest up to the next snapshot says nothing."""
     places = list(ticks_of(COLUMNS, box.entries))
-    done = rerun(core, COLUMNS, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
+    done = again(core, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
     assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
 
 
@@ -194,7 +188,7 @@ def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxF
 def test_a_changed_number_is_found_in_its_tick(core: Core, box: BlackBoxFile, column, add, shows) -> None:
     record = list(ticks_of(COLUMNS, box.entries).values())[CHANGED_TICK - 1]
     entries = planted(box.entries, CHANGED_TICK, COLUMNS.index(column), getattr(record, column) + add)
-    done = rerun(core, COLUMNS, entries, 3.0)
+    done = again(core, entries, 3.0)
     assert (done.difference.tick, done.difference.field, done.ticks) == (CHANGED_TICK, shows, CHANGED_TICK - 1 - 3_000)
 
 
@@ -205,13 +199,13 @@ def test_a_changed_setpoint_is_found_in_its_tick(core: Core, box: BlackBoxFile) 
     _, now_s, setpoint = entries[place]
     entries[place] = ["plan", now_s, [setpoint[0] + 1e-9, *setpoint[1:]]]
     tick = 1 + next(number for number, p in enumerate(places) if p > place)
-    found = rerun(core, COLUMNS, entries, 3.0).difference
+    found = again(core, entries, 3.0).difference
     assert (found.tick, found.field) == (tick, "setpoint_cf")
 
 
 def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> None:
     entries = [it for it in box.entries if not (it[0] == "command" and it[1] == "home")]
-    assert rerun(core, COLUMNS, entries).difference.field == "request"
+    assert again(core, entries).difference.field == "request"
 
 
 def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
@@ -220,7 +214,7 @@ def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: B
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(entries[place]))
     state[1]["Stepper"]["measure"]["Measure"]["measured"]["Measured"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
     entries[place] = state
-    assert rerun(core, COLUMNS, entries, 1.5).difference.field == "state.step.measure.measured.handle.sliding_mm_s"
+    assert again(core, entries, 1.5).difference.field == "state.step.measure.measured.handle.sliding_mm_s"
 
 
 @pytest.mark.parametrize(
@@ -305,7 +299,7 @@ def test_one_that_breaks_off_late_is_replayed_so_far(core: Core, path: Path, tmp
     (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     box = read_black_box(tmp_path / "broken.mcap")
     assert not box.is_complete
-    done = again(core, box)
+    done = again(core, box.entries)
     assert done.difference is None
     assert 1_000 < done.ticks < TICKS
 
@@ -353,7 +347,7 @@ def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
             spoilt = [*entries[place][:inner], spoilt, *entries[place][inner + 1 :]]
         entries[place] = spoilt
         with contextlib.suppress(ReplayError):
-            assert rerun(core, COLUMNS, entries).ticks <= 61
+            assert again(core, entries).ticks <= 61
 
 
 def test_a_list_that_says_it_is_endless_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
