@@ -10,7 +10,7 @@ from typing import TypeVar
 from tqdm import tqdm
 
 from tormagd.lab.errors import LabError
-from tormagd.lab.options import WORKERS
+from tormagd.lab.main import WORKERS
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")

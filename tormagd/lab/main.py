@@ -1,7 +1,8 @@
 """`tormag-lab NAME`: the laboratory's commands. Each is a module, loaded when asked for.
 
 A module has `add_options(parser)` and `run(options)`, which returns a `Found`. `--json` prints its figures as one JSON
-object; otherwise they are printed for a person.
+object; otherwise they are printed for a person. The types of its options stand here: a number outside its range is
+refused with what is allowed, and exit code 2.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from tormagd import __version__
+from tormagd.ctl.commands import Within
 from tormagd.force_file import ForceFileError
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.told import lines
@@ -53,6 +55,36 @@ COMMANDS = {
     "fleet": ("consoles.command", "what the recordings of many consoles say of each"),
 }
 "By name, a command's module in `tormagd.lab`, and what it does."
+
+
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """Return a type for argparse: it reads a whole number from `least` to `most`, as `int` does.
+
+    It raises ArgumentTypeError, which names the text and the range, for anything else.
+    """
+
+    def number(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{text[:40]!r}: allowed is a whole number {least}..{most}")
+        return value
+
+    return number
+
+
+def within(least: float, most: float, unit: str) -> Callable[[str], float]:
+    """Return the type of a finite number in this range, of this unit. It raises ArgumentTypeError for any other
+    text."""
+    return Within(least, most, f" {unit}").__call__
+
+
+SEED = whole(0, 2**31)
+WORKERS = whole(1, 1024)
+"Processes on one machine."
+GAP_SPEED = within(1e-6, 1e4, "mm/s")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -29,8 +29,7 @@ from tormagd.config import load_config
 from tormagd.control.records import TimedSetpoint
 from tormagd.interrupt import interrupted_by
 from tormagd.lab.errors import LabError
-from tormagd.lab.main import Found
-from tormagd.lab.options import whole, within
+from tormagd.lab.main import Found, whole, within
 from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

@@ -13,8 +13,7 @@ from tormagd.config import Position
 from tormagd.lab import executors
 from tormagd.lab.design.optimisation import Design, Problem, Run, coverage_as_made, sweep
 from tormagd.lab.design.phase_portrait import Region
-from tormagd.lab.main import Found
-from tormagd.lab.options import GAP_SPEED, SEED, whole, within
+from tormagd.lab.main import GAP_SPEED, SEED, Found, whole, within
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -25,8 +25,7 @@ from tormagd.config import Config, Rates
 from tormagd.control.move.watch import SENSOR_FAULT_S
 from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
 from tormagd.lab.errors import LabError
-from tormagd.lab.main import Found
-from tormagd.lab.options import WORKERS, within
+from tormagd.lab.main import WORKERS, Found, within
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Fault
 from tormagd.scenes.scene import load_scene

@@ -17,8 +17,7 @@ from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, cover
 from tormagd.lab.design.phase_portrait import PhasePortrait
 from tormagd.lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
 from tormagd.lab.human_pulse import pulse_profile
-from tormagd.lab.main import Found
-from tormagd.lab.options import GAP_SPEED, SEED, WORKERS
+from tormagd.lab.main import GAP_SPEED, SEED, WORKERS, Found
 from tormagd.lab.pages import write_page
 from tormagd.lab.thesis import page
 from tormagd.lab.thesis.errata import errata, table_2_4_errors

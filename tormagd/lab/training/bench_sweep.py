@@ -29,8 +29,7 @@ from tormagd.control.core import Stepper
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.records import Plan
 from tormagd.lab.arrays import Array, Mask
-from tormagd.lab.main import Found
-from tormagd.lab.options import SEED
+from tormagd.lab.main import SEED, Found
 from tormagd.lab.training.dataset import Dataset, write_csv
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.physics.field import PowerFieldLaw

@@ -19,8 +19,7 @@ import numpy as np
 from tormagd.bounded_file import read_bounded
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
-from tormagd.lab.main import Found
-from tormagd.lab.options import within
+from tormagd.lab.main import Found, within
 from tormagd.lab.pages import subplots
 from tormagd.lab.training.dataset import ALLOWED, Dataset, records, write_csv
 from tormagd.model.displacement import MOBILISED_MM

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tormagd.lab.errors import LabError
-from tormagd.lab.main import Found
-from tormagd.lab.options import SEED
+from tormagd.lab.main import SEED, Found
 from tormagd.lab.training.dataset import Dataset, read_csv
 from tormagd.lab.training.law import fit_law_model
 from tormagd.lab.training.unremembered import identify
