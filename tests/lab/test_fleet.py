@@ -14,8 +14,7 @@ from distributed import LocalCluster
 
 from tormagd.commission.finding import Finding
 from tormagd.commission.sequence import Report
-from tormagd.lab.consoles.devices import Console, Drift, consoles
-from tormagd.lab.consoles.summary import Summary, files, read, read_all
+from tormagd.lab.consoles.summary import Console, Drift, Summary, consoles, files, read, read_all
 from tormagd.lab.main import main
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter

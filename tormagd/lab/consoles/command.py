@@ -18,8 +18,7 @@ import pyarrow.parquet
 
 from tormagd.commission.sequence import Report
 from tormagd.lab import executors
-from tormagd.lab.consoles.devices import Console, Drift, consoles
-from tormagd.lab.consoles.summary import SUFFIX, Summary, files, read_all
+from tormagd.lab.consoles.summary import SUFFIX, Console, Drift, Summary, consoles, files, read_all
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.told import table
