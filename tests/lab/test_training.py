@@ -19,12 +19,20 @@ from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
 from tormagd.lab.training import train_model
 from tormagd.lab.training.bench_sweep import LOADED_MM, LOADED_STEP_MM, loading, sliding, strokes
-from tormagd.lab.training.dataset import ALLOWED, COLUMNS, Dataset, read_csv, write_csv
+from tormagd.lab.training.dataset import (
+    ALLOWED,
+    COLUMNS,
+    Dataset,
+    leave_cycles_out,
+    leave_one_out,
+    random_split,
+    read_csv,
+    write_csv,
+)
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series, relaxed_N
 from tormagd.lab.training.law import Law, fit_law, fit_law_model
 from tormagd.lab.training.levenberg_marquardt import jacobian, train
-from tormagd.lab.training.metrics import leave_cycles_out, leave_one_out, random_split
 from tormagd.lab.training.unremembered import identify
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.features import FIELD

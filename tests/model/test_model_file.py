@@ -21,9 +21,8 @@ from tormagd.assembly.build import build_core
 from tormagd.config import Config, Rates
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.records import Handle, Measured
-from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.dataset import Dataset, fit_metrics, not_rising_share
 from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
-from tormagd.lab.training.metrics import fit_metrics, not_rising_share
 from tormagd.model import model_file
 from tormagd.model.displacement import Turn
 from tormagd.model.features import FEATURES, LARGEST, UNITS, Element, Scaling

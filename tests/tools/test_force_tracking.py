@@ -28,7 +28,7 @@ from rendering.signals import (
 
 from tormagd.lab.arrays import rms
 from tormagd.lab.human_pulse import pulse_profile
-from tormagd.lab.training.metrics import not_rising_share
+from tormagd.lab.training.dataset import not_rising_share
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.inserts import INSERTS, insert

@@ -8,7 +8,7 @@ from rendering.device_draws import SAMPLES, device
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.lab.arrays import Array, Json
 from tormagd.lab.pages import table
-from tormagd.lab.training.metrics import force_metrics, not_rising_share
+from tormagd.lab.training.dataset import force_metrics, not_rising_share
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path

@@ -13,7 +13,7 @@ import numpy as np
 
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.lab.errors import LabError
-from tormagd.lab.training.metrics import not_rising_share
+from tormagd.lab.training.dataset import not_rising_share
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
 from tormagd.scenes.scene import scene_path

@@ -9,10 +9,16 @@ from tqdm import tqdm
 
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.tactile.pads import PADS, PadRecord, cyclic_records, holding_records
-from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.dataset import (
+    Dataset,
+    force_metrics,
+    leave_cycles_out,
+    leave_one_out,
+    not_rising_share,
+    random_split,
+)
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
-from tormagd.lab.training.metrics import force_metrics, leave_cycles_out, leave_one_out, not_rising_share, random_split
 from tormagd.model.features import CIP
 from tormagd.model.model_file import ForceModel
 from tormagd.simulation.parameters import PadParameters

@@ -16,8 +16,8 @@ import torch
 from tormagd.lab.main import Found
 from tormagd.lab.tactile.models import FULL, Effort
 from tormagd.lab.tactile.pads import cyclic_records, holding_records
+from tormagd.lab.training.dataset import force_metrics, not_rising_share, random_split
 from tormagd.lab.training.grey_box import fit_grey_box
-from tormagd.lab.training.metrics import force_metrics, not_rising_share, random_split
 from tormagd.model.memory import Memory
 from tormagd.model.model_file import ForceModel, save_model
 from tormagd.simulation.parameters import PlantError, load_plant

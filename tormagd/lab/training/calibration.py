@@ -26,8 +26,7 @@ from tormagd.bounded_file import in_place_of
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.tables import read_columns
-from tormagd.lab.training.dataset import ALLOWED, Dataset, write_csv
-from tormagd.lab.training.metrics import fit_metrics
+from tormagd.lab.training.dataset import ALLOWED, Dataset, fit_metrics, write_csv
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.model.features import FEATURES, FIELD, Element
 from tormagd.model.model_file import ForceModel, save_model

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 
 from tormagd.lab.arrays import Mask
-from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.dataset import Dataset, random_split, trained_metrics
 from tormagd.lab.training.levenberg_marquardt import Training, train
-from tormagd.lab.training.metrics import random_split, trained_metrics
 from tormagd.model.features import CIP, Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata, Ranges

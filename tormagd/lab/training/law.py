@@ -21,8 +21,7 @@ from scipy.special import expit
 from scipy.stats.qmc import Halton
 
 from tormagd.lab.arrays import Array
-from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.metrics import trained_metrics
+from tormagd.lab.training.dataset import Dataset, trained_metrics
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.features import FEATURES, FIELD, RATE, Element
 from tormagd.model.memory import NO_MEMORY, Memory
