@@ -34,8 +34,8 @@ def test_enabling_is_bumpless(running) -> None:
 
 
 def test_enabling_wants_a_measurement(bench) -> None:
-    assert bench.refused("enable").code == "not_fresh"
-    assert bench.stepper.safety.operating_state is OperatingState.DISABLED
+    refused = bench.refused("enable").code
+    assert (refused, bench.stepper.safety.operating_state) == ("not_fresh", OperatingState.DISABLED)
 
 
 # -- counts that jump ----------------------------------------------------------------------------------------------

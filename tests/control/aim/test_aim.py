@@ -179,8 +179,7 @@ def test_the_force_law_stands_around_the_search(core, planned, first, moving, wr
     misled = core._replace(element=core.element._replace(search=WrongSolver(wrong_mT)))
     wrong = planned(misled.planner(), 1.0, moving())
     assert wrong.field_mT == pytest.approx(first(1.0, moving()).field_mT, rel=LAW_SHARE + 0.01)
-    (replaced,) = wrong.outside
-    assert replaced == Outside("field_mT", wrong_mT, wrong.field_mT)
+    assert wrong.outside == (Outside("field_mT", wrong_mT, wrong.field_mT),)
     assert Limit.MODEL_RANGE in wrong.limits
 
 
@@ -244,15 +243,15 @@ def test_nan_never_travels(core, moving, history: list[tuple[float, TimedSetpoin
         now_s += elapsed_s
         plan = planner.plan(now_s, setpoint, None if changes is None else moving(number=number, **changes))
         device, lag_s = planner.believe.device, planner.believe.carriages.lag_s
-        numbers = (plan.governed_N, plan.field_mT, plan.gap_mm, plan.gap_speed_mm_s, plan.confidence, plan.trim)
-        assert all(math.isfinite(value) for value in (*numbers, plan.gap_acceleration_mm_s2, lag_s))
-        assert plan.predicted_N is None or math.isfinite(plan.predicted_N)
+        # gap, its speed and the lag are held within bounds below, where no NaN is
+        told = [plan.governed_N, plan.field_mT, plan.predicted_N or 0.0, plan.gap_acceleration_mm_s2]
+        told += [plan.confidence, plan.trim, plan.min_gap_mm]
+        told += [getattr(device, name) for name in DeviceFit.__match_args__]
+        assert all(map(math.isfinite, told))
         assert abs(plan.gap_speed_mm_s) <= CONFIG.position.gap_speed_mm_s
-        assert 45.0 <= plan.gap_mm <= 95.0
+        assert max(45.0, plan.min_gap_mm) <= plan.gap_mm <= 95.0
         assert CONFIG.trim.least <= device.scale <= CONFIG.trim.most
-        assert all(math.isfinite(getattr(device, name)) for name in DeviceFit.__match_args__)
         assert plan.governed_N <= max(core.scene.force.most_N, device.force_N(core.portrait.min_N))
-        assert plan.gap_mm >= plan.min_gap_mm
         assert 0.0 <= lag_s <= MAX_LAG_S
         assert plan.number == number + 1
 

@@ -162,6 +162,14 @@ class Pushed:
         return self._way.update(measured, zero_N, is_sensor_believed)
 
 
+@pytest.fixture
+def pushed() -> Pushed:
+    """One that was pushed on to 5 mm."""
+    made = Pushed(1)
+    made.at(5.0, 1.5)
+    return made
+
+
 @pytest.mark.parametrize("push_sign", [1, -1])
 def test_a_held_handle_withdraws_once_the_hand_pulls(push_sign: int) -> None:
     pushed = Pushed(push_sign)
@@ -170,24 +178,17 @@ def test_a_held_handle_withdraws_once_the_hand_pulls(push_sign: int) -> None:
     assert pushed.at(back_mm, 0.2).is_pushing
     pulled = pushed.at(back_mm, -0.2)
     assert (pulled.is_pushing, pulled.place_mm, pulled.rate_mm_s) == (False, pytest.approx(back_mm), -5.0)
-    assert not pushed.at(back_mm + 2.0 * TURN_MM, -0.2).is_pushing
-    assert pushed.at(back_mm + 2.0 * TURN_MM, 0.3).is_pushing
+    assert [pushed.at(back_mm + 2.0 * TURN_MM, hand_N).is_pushing for hand_N in (-0.2, 0.3)] == [False, True]
 
 
-def test_a_sensor_that_is_not_believed_shows_no_way_but_a_handle_that_comes_back_does() -> None:
-    pushed = Pushed(1)
-    pushed.at(5.0, 1.5)
+def test_a_sensor_that_is_not_believed_shows_no_way_but_a_handle_that_comes_back_does(pushed: Pushed) -> None:
     assert pushed.at(4.8, -0.5, is_sensor_believed=False).is_pushing
     assert not pushed.at(5.0 - 1.01 * SLID_MM, -0.5, is_sensor_believed=False).is_pushing
 
 
-def test_a_hand_that_pulls_where_the_encoder_shows_nothing_is_let_go() -> None:
-    pushed = Pushed(1)
-    pushed.at(5.0, 1.5)
-    assert pushed.at(5.0, -0.09).is_pushing
-    assert not pushed.at(5.0, -0.11).is_pushing
-    assert not pushed.at(5.0, 0.09).is_pushing
-    assert pushed.at(5.0, 0.11).is_pushing
+def test_a_hand_that_pulls_where_the_encoder_shows_nothing_is_let_go(pushed: Pushed) -> None:
+    are_pushing = [pushed.at(5.0, hand_N).is_pushing for hand_N in (-0.09, -0.11, 0.09, 0.11)]
+    assert are_pushing == [True, False, False, True]
 
 
 @pytest.mark.parametrize("push_sign", [1, -1])
@@ -200,15 +201,11 @@ def test_what_a_sensors_zero_is_off_by_is_no_hand_that_pulls(push_sign: int, zer
     assert not pushed.at(5.0, -0.11, zero_N=zero_N).is_pushing
 
 
-def test_a_tremor_of_a_held_handle_changes_no_way() -> None:
-    pushed = Pushed(1)
-    pushed.at(5.0, 1.5)
+def test_a_tremor_of_a_held_handle_changes_no_way(pushed: Pushed) -> None:
     for time_s in np.arange(0.0, 2.0, 0.001):
         swing = math.sin(math.tau * 8.0 * time_s)
         assert pushed.at(5.0 + 0.1 * swing, 1.0 + 0.5 * swing).is_pushing
 
 
-def test_a_silent_device_keeps_its_place_and_way() -> None:
-    pushed = Pushed(1)
-    pushed.at(5.0, 1.5)
+def test_a_silent_device_keeps_its_place_and_way(pushed: Pushed) -> None:
     assert pushed._way.update(None, 0.0, is_sensor_believed=True) == Travel(5.0, 0.0)

@@ -83,20 +83,15 @@ def test_a_zero_that_a_reversal_tells_ends_it(known, hear, moving) -> None:
     assert (known.planned.limits, known.believe.zero.zero_N) == ((Limit.SENSOR_ZERO,), pytest.approx(-0.3, abs=0.02))
 
 
-def test_an_operator_says_that_the_device_has_changed_and_it_is_learned_anew(known, hear, moving) -> None:
+@pytest.mark.parametrize(("wrong", "share", "limits"), [("device", 0.75, ()), ("sensor", 1.0, (Limit.SENSOR,))])
+def test_an_operator_says_whether_device_or_sensor_has_changed(
+    known, hear, moving, wrong: str, share: float, limits: tuple[Limit, ...]
+) -> None:
+    """A device is learned anew; a sensor teaches nothing."""
     hear(known, 1.0, moving(force_N=0.75 * MODEL_N))
-    known.confirm("device")
-    assert (force_N(hear(known, 0.5, moving(force_N=0.75 * MODEL_N)).believe), known.planned.limits) == (
-        pytest.approx(0.75 * MODEL_N, abs=0.02),
-        (),
-    )
-
-
-def test_an_operator_says_that_the_sensor_is_wrong(known, hear, moving) -> None:
-    hear(known, 1.0, moving(force_N=0.75 * MODEL_N))
-    known.confirm("sensor")
-    assert Limit.SENSOR in hear(known, 0.1, moving(force_N=0.75 * MODEL_N)).planned.limits
-    assert force_N(known.believe) == pytest.approx(MODEL_N, abs=0.03)
+    known.confirm(wrong)
+    hear(known, 0.5, moving(force_N=0.75 * MODEL_N))
+    assert (force_N(known.believe), known.planned.limits) == (pytest.approx(share * MODEL_N, abs=0.02), limits)
 
 
 def test_without_a_dispute_there_is_nothing_to_confirm(known) -> None:

@@ -1,6 +1,7 @@
 """The sensor's zero: half the sum of the signed forces at a reversal, and what is not known of it between."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,29 +52,32 @@ def strokes(
     return zero, now_s
 
 
-@pytest.mark.parametrize("off_N", [0.0, 0.05, -0.1, 0.3])
-@pytest.mark.parametrize("scale", [0.7, 1.0, 1.4])
-def test_a_few_reversals_tell_the_zero_whatever_the_device(off_N: float, scale: float) -> None:
-    zero, now_s = strokes(off_N, number=20, scale=scale)
-    assert zero.zero_N == pytest.approx(off_N, abs=0.015 + 0.1 * abs(off_N))
-    assert zero.sd_N(now_s) < TARED_SD_N
-
-
-def test_one_reversal_is_enough_where_the_sensor_is_not_taken_for_tared() -> None:
-    zero, now_s = strokes(0.3, is_tared=False, number=2)
-    assert zero.zero_N == pytest.approx(0.3, abs=0.01)
-    assert zero.sd_N(now_s) < 0.03
+@pytest.mark.parametrize(
+    ("off_N", "turns", "within_N", "most_sd_N"),
+    [
+        *(
+            (off_N, {"number": 20, "scale": scale}, 0.015 + 0.1 * abs(off_N), TARED_SD_N)
+            for off_N in (0.0, 0.05, -0.1, 0.3)
+            for scale in (0.7, 1.0, 1.4)
+        ),
+        # one reversal is enough where the sensor is not taken for tared
+        (0.3, {"number": 2, "is_tared": False}, 0.01, 0.03),
+        # the force may be another after it
+        (0.1, {"number": 2, "is_tared": False, "scale": 1.2, "model_N": (0.8, 1.9)}, 0.01, 0.03),
+    ],
+)
+def test_reversals_tell_the_zero_whatever_the_device(
+    off_N: float, turns: dict[str, Any], within_N: float, most_sd_N: float
+) -> None:
+    zero, now_s = strokes(off_N, **turns)
+    assert zero.zero_N == pytest.approx(off_N, abs=within_N)
+    assert zero.sd_N(now_s) < most_sd_N
 
 
 def test_of_a_doubted_sensor_as_little_is_known_as_after_an_hour_of_drift() -> None:
     zero, _ = strokes(0.1)
     zero.doubt()
     assert zero.variance_N2 == pytest.approx(MAX_SD_N**2)
-
-
-def test_the_force_may_be_another_after_the_reversal() -> None:
-    zero, _ = strokes(0.1, is_tared=False, number=2, scale=1.2, model_N=(0.8, 1.9))
-    assert zero.zero_N == pytest.approx(0.1, abs=0.01)
 
 
 def test_without_a_reversal_nothing_is_told_and_less_and_less_is_known() -> None:

@@ -60,8 +60,7 @@ def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
 
 def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
     fit, is_held = observe(DeviceFit(1.0, 0.05), 2.0, 6.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
-    assert is_held
-    assert fit.scale == BOUNDS.max_scale
+    assert (is_held, fit.scale) == (True, BOUNDS.max_scale)
     assert fit.force_N(2.0) == pytest.approx(6.0, abs=0.1), "the offset takes what is left"
 
 
@@ -168,8 +167,7 @@ def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns_scale
     assert (found.scale_variance, found.covariance_N, found.offset_variance_N2) == pytest.approx(
         (*joseph[0], joseph[1, 1])
     )
-    assert (found.scale == fit.scale) is not learns_scale
-    assert (found.offset_N == fit.offset_N) is not learns_offset
+    assert (found.scale != fit.scale, found.offset_N != fit.offset_N) == (learns_scale, learns_offset)
 
 
 KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)

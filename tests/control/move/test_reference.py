@@ -111,14 +111,11 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
 
 
 def test_being_held_back_is_said() -> None:
-    reference, is_limited, _ = follow(MAX_MM_S2, Reference(95.0), Reference(45.0), DT_S, SPEEDS)
-    assert is_limited
-    _, is_limited, _ = follow(MAX_MM_S2, reference, Reference(reference.gap_mm), DT_S, SPEEDS)
-    assert not is_limited
-    _, is_limited, _ = follow(
-        MAX_MM_S2, reference, Reference(reference.gap_mm, 2.0 * LIMITS.gap_speed_mm_s), DT_S, SPEEDS
-    )
-    assert is_limited
+    reference = next(followed(95.0, [Reference(45.0)]))
+    far, here = Reference(45.0), Reference(reference.gap_mm)
+    targets = far, here, here.replaced(speed_mm_s=2.0 * LIMITS.gap_speed_mm_s)
+    are_limited = [follow(MAX_MM_S2, reference, target, DT_S, SPEEDS)[1] for target in targets]
+    assert are_limited == [True, False, True]
 
 
 @given(start=gaps, target=gaps, dt_s=periods)

@@ -212,8 +212,7 @@ def test_carriages_that_go_the_other_way_are_named(running, target_mm: float) ->
         output = running.step(target_mm, left_mm=at_mm, right_mm=at_mm)
         at_mm -= 15.0 * output.left_duty * PERIOD_S
         assert running.ticks < 300
-    assert running.opened_for
-    assert (running.faults[0], running.stepper.safety.needs_homing) == (Fault.WRONG_DIRECTION, True)
+    assert (running.opened_for[0], running.stepper.safety.needs_homing) == (Fault.WRONG_DIRECTION, True)
     assert abs(at_mm + 7.5) < 2.5
 
 
@@ -223,8 +222,7 @@ def test_a_carriage_that_goes_the_other_way_into_its_stop_is_named(running) -> N
         running.step(60.0, left_mm=at_mm, right_mm=at_mm)
         at_mm = min(at_mm + 0.015, -7.0)
         assert running.ticks < 300
-    assert set(running.faults) <= {Fault.WRONG_DIRECTION, Fault.NO_MOTION}
-    assert running.faults[0] is Fault.WRONG_DIRECTION
+    assert running.faults in ((Fault.WRONG_DIRECTION,), (Fault.WRONG_DIRECTION, Fault.NO_MOTION))
 
 
 @pytest.mark.parametrize("given", [(), ("pause",)])
@@ -232,8 +230,7 @@ def test_too_much_force_opens_and_is_then_a_fault(running, given: tuple[str, ...
     for command in given:
         running.command(command)
     limits = [running.step(force_N=3.0, **running.there).limits for _ in range(95)]
-    assert Limit.OVER_FORCE not in limits[25]
-    assert Limit.OVER_FORCE in limits[35]
+    assert [Limit.OVER_FORCE in limits[tick] for tick in (25, 35)] == [False, True]
     assert running.move.reference.gap_mm > 80.5
     assert running.run_into(Fault.OVER_FORCE, force_N=3.0, **running.there) < 20
 
