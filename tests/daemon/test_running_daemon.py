@@ -552,8 +552,7 @@ def test_what_may_not_be_done_yet_is_refused_and_stop_opens_and_latches(armed: R
     armed.command("stop")
     status = armed.until(lambda status: status["gap_mm"] > 94.0 and not status["is_busy"], "open")
     assert (status["operating_state"], status["fault_details"][0]["code"]) == ("FAULT", "STOPPED")
-    armed.command("clear-fault")
-    assert armed.command("status")["operating_state"] == "DISABLED"
+    assert armed.command("clear-fault")["operating_state"] == "DISABLED"
 
 
 def test_arming_is_one_word_beside_a_publisher_from_a_fault_on(armed: Running) -> None:
@@ -562,8 +561,8 @@ def test_arming_is_one_word_beside_a_publisher_from_a_fault_on(armed: Running) -
     armed.command("stop")
     assert armed.command("arm")["operating_state"] == "FAULT"  # the gap still opens
     status = armed.until(lambda status: status["arm"]["is_over"], "armed")
-    assert status["operating_state"] == "ENABLED"
-    assert status["arm"] == {"given": ["clear-fault", "enable"], "is_over": True, "error": None}
+    arm = {"given": ["clear-fault", "enable"], "is_over": True, "error": None}
+    assert (status["operating_state"], status["arm"]) == ("ENABLED", arm)
     assert status["governed_cf"] < 1.0
     assert "TAKEOVER" in status["limits"]
     armed.until(lambda status: status["measured_cf"] > 1.45, "1.5 N again")
@@ -727,7 +726,6 @@ def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming(armed
     armed.port.is_plugged_in = True
     status = armed.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "back, open")
     assert status["operating_state"] == "FAULT"
-    armed.command("clear-fault")
-    assert armed.command("status")["operating_state"] == "DISABLED"
+    assert armed.command("clear-fault")["operating_state"] == "DISABLED"
     armed.ask(0.5)
     armed.arm()
