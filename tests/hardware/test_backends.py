@@ -114,16 +114,6 @@ def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
     port.close()
 
 
-def test_a_port_whose_other_end_is_gone_was_unplugged() -> None:
-    far, near = os.openpty()
-    port = open_serial(Device(port=os.ttyname(near)), SerialOptions())
-    os.close(far)
-    os.close(near)
-    with pytest.raises(BackendError, match="unplugged"):
-        port.receive()
-    port.close()
-
-
 def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
     line: Line, port: SerialPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -442,22 +442,21 @@ def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
 def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     transport: str, case: Case, moving: ClosedLoop, lines: Callable[..., Line]
 ) -> None:
-    loop = moving
-    line = lines(transport, loop.device, case)
-    loop.device = line  # type: ignore[assignment]
+    line = lines(transport, moving.device, case)
+    moving.device = line  # type: ignore[assignment]
     samples = []
-    for sample in ticks(loop, case.bad_s):
+    for sample in ticks(moving, case.bad_s):
         samples.append(sample)
         if sample.safety.faults:
             break
     last = samples[-1]
     if last.safety.faults:
         assert last.safety.faults[0] in case.faults
-        check_safe(loop, last)
+        check_safe(moving, last)
     else:
         assert last.truth.force_N == pytest.approx(FORCE_N, abs=case.tolerance_N)
         assert case.tolerance_N > 0.05 or Limit.SATURATED not in last.output.limits
-    assert (loop.connection.state, loop.connection.losses) == (case.link, case.losses)
+    assert (moving.connection.state, moving.connection.losses) == (case.link, case.losses)
     if case.named:
         settled = samples[-SETTLED_TICKS:]
         assert case.named & {name for sample in settled for name in (*sample.safety.faults, *sample.output.limits)}
@@ -515,17 +514,18 @@ def test_host_and_device_meet_on_any_line_that_is_not_cut(
     assert link.identity is not None
 
 
-@pytest.mark.parametrize("transport", ["serial", "slcan", "tormagsim"])
+@pytest.mark.parametrize(("transport", "said"), [("serial", ": unplugged"), ("slcan", ""), ("tormagsim", "")])
 def test_a_device_that_goes_is_said_by_reading_and_writing_and_leaves_nothing_open(
-    transport: str, tmp_path: Path
+    transport: str, said: str, tmp_path: Path
 ) -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
     far = TRANSPORTS[transport](a_device(), tmp_path)
     backend = choose(far.configured, CONFIG.rates).open()
     far.close()
-    for use in (backend.receive, lambda: backend.send(Home(1))):
-        with pytest.raises(BackendError, match=far.configured.port):
-            use()
+    with pytest.raises(BackendError, match=far.configured.port + said):
+        backend.receive()
+    with pytest.raises(BackendError, match=far.configured.port):
+        backend.send(Home(1))
     backend.close()
     backend.close()
     assert len(list(Path("/proc/self/fd").iterdir())) == before

@@ -133,9 +133,8 @@ def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
     assert not link.measurement.is_homed
     link.request(0.021, DeviceRequest.RETRACT)
     assert [type(message) for message in link.due(0.021)] == [Hello]
-    assert link.state is LinkState.IDENTIFYING
+    assert (link.state, link.measurement) == (LinkState.IDENTIFYING, None)
     assert "reset" in link.cause
-    assert link.measurement is None
     told(link, 0.022, US, status(FIRST_NONCE), Sense(0.0, 0.0, 0.0, 0.0), State(5.0, 5.0, 0.0, 1))
     assert (link.state, link.measurement.left_mm) == (LinkState.RUNNING, 5.0)
     assert [type(message) for message in link.due(0.022)] == [Retract], "opening is still wanted"
@@ -155,9 +154,8 @@ def test_another_device_at_the_same_line_is_not_taken_for_the_first() -> None:
     link = running(nonce=FIRST_NONCE)
     link.receive(1.0, US.replaced(serial_number=78))
     link.due(1.001)
-    assert link.state is LinkState.IDENTIFYING
+    assert (link.state, link.measurement) == (LinkState.IDENTIFYING, None)
     assert "77 was replaced by device 78" in link.cause
-    assert link.measurement is None
 
 
 @pytest.mark.parametrize("behind", [0, 1, OVERTAKEN - 1])

@@ -206,5 +206,5 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
     each_tick = {message.name for message in database.messages if message.cycle_time == 1}
     layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
     assert len(layouts) == len(each_tick) == 3
-    assert sum(max_bits(struct.calcsize(layout.format)) for layout in layouts) == EXCHANGE_BITS
-    assert EXCHANGE_BITS == 395, "as firmware_protocol/README.md says"
+    # as firmware_protocol/README.md says
+    assert sum(max_bits(struct.calcsize(layout.format)) for layout in layouts) == EXCHANGE_BITS == 395
