@@ -31,14 +31,16 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 def in_place_of(path: Path) -> Iterator[Path]:
     """Give a path beside `path` to write to, which replaces `path` at the end. The folder must exist.
 
-    The caller makes that file, `path` with `.part` behind it; a file left there by another may be overwritten. After an
-    error, inside or at the end, that file is removed and `path` stays as it was. The caller sees to it that it is on
-    the disk (fsync). Raises IsADirectoryError where `path` is a folder, before anything is written, and OSError where
-    nothing was made or `path` cannot be replaced.
+    The caller makes that file, `path` with `.part` behind it. What another left there is removed first, a pipe or a
+    link too. To write to a pipe would wait for its reader, and a link's file is another's. After an error, inside or at
+    the end, that file is removed and `path` stays as it was. The caller sees to it that it is on the disk (fsync).
+    Raises IsADirectoryError where `path` is a folder, before anything is written, and OSError where nothing was made or
+    `path` cannot be replaced.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))
     beside = path.with_name(f"{path.name}.part")
+    beside.unlink(missing_ok=True)
     try:
         yield beside
         beside.replace(path)

@@ -260,6 +260,16 @@ def test_the_same_mistake_is_told_in_the_same_words(tmp_path: Path, text: str | 
     assert len(said) == 1
 
 
+@pytest.mark.parametrize("leave", [os.mkfifo, lambda part: part.symlink_to("other")], ids=["a pipe", "a link"])
+def test_what_another_left_is_not_written_through(tmp_path: Path, leave: Callable[[Path], object]) -> None:
+    (tmp_path / "other").write_text("another's")
+    leave(tmp_path / "a.part")
+    with in_place_of(tmp_path / "a") as beside:
+        os.close(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK))  # a pipe without a reader refuses that
+        beside.write_text("ours")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "ours", "other": "another's"}
+
+
 def test_what_could_not_be_written_whole_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(UnicodeEncodeError), in_place_of(tmp_path / "a") as beside:
         beside.write_text("half of it\ud800", "utf-8")
