@@ -114,6 +114,11 @@ def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
     assert is_kept in path.read_bytes()
 
 
+def test_a_folder_that_no_file_can_have_is_refused_by_name() -> None:
+    with pytest.raises(ProfileError, match="no file can have this name"):
+        keep(Path("a\0b"), 7)
+
+
 def test_a_refusal_is_over_when_a_profile_has_been_kept(rig: Rig, tmp_path: Path) -> None:
     (tmp_path / "00000007-MRE-50-40.json").write_bytes(b"nothing")
     rig.look(7, True)

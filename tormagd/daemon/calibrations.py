@@ -35,7 +35,7 @@ class Calibrations:
         self.configured = configured
         self._folder, self._take = folder, take
         self._of: int | None = None
-        self._making: tuple[int, asyncio.Future[Made]] | None = None
+        self._making: tuple[tuple[int, Config, Config], asyncio.Future[Made]] | None = None
         self._file = self._refusal = ""
 
     def is_awaited(self, serial_number: int | None) -> bool:
@@ -52,17 +52,19 @@ class Calibrations:
         The first look begins to read the file and to build a core, in another thread. A later one calls `take`, unless
         the calibrated configuration equals `running`, that in force. None, an unknown serial number, does nothing. A
         refused calibration is logged, and the device runs by the configuration alone. Where no core can be built by
-        that, the device stays awaited: nothing is tried again before `read_again`, or another device comes. Needs a
-        running event loop.
+        that, the device stays awaited: nothing is tried again before `read_again`, another device or another
+        configuration. A core of another configuration than now is not taken, but made anew. Needs a running event loop.
         """
         if not is_idle or serial_number is None or self._folder is None or serial_number == self._of:
             return
-        if self._making is None or self._making[0] != serial_number:
+        # the scene may have changed while the device was away
+        sought = serial_number, self.configured, running
+        if self._making is None or self._making[0] != sought:
             path = self._folder / f"{serial_number:08x}.toml"
             work = asyncio.get_running_loop().run_in_executor(
                 None, _make, path, serial_number, self.configured, running
             )
-            self._making = serial_number, work
+            self._making = sought, work
         elif self._making[1].done():
             self._note(serial_number, self._making[1])
 
@@ -103,7 +105,11 @@ def _make(path: Path, serial_number: int, configured: Config, running: Config) -
     """
     try:
         config = load_calibration(path, configured, serial_number)
-        return Made(config, None if config == running else build_core(config), str(path), "")
     except ConfigError as error:
         refusal = "" if isinstance(error.__cause__, FileNotFoundError) else str(error)
+    else:
+        try:
+            return Made(config, None if config == running else build_core(config), str(path), "")
+        except ConfigError as error:
+            refusal = f"{path}: {error}"
     return Made(configured, None if configured == running else build_core(configured), "", refusal)

@@ -80,6 +80,8 @@ class ProfileFolder:
                 os.fsync(file.fileno())
         except OSError as error:
             raise ProfileError(f"{path}: {error.strerror}") from error
+        except ValueError as error:  # a name with a zero in it
+            raise ProfileError(f"{path}: no file can have this name") from error
 
 
 class Profiles:
