@@ -415,6 +415,9 @@ def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon,
     assert Path(result["page"]).read_text(encoding="utf-8") == page
     kit.write_text("[]")
     assert "the kit prints" in ctl(*command, "--conformance", str(kit)).ended(2).error["hint"]
+    report = Path(result["page"]).with_suffix(".json")
+    report.write_text(report.read_text().replace('"serial_number": ', '"serial_number": 9'))
+    assert "allowed is" in ctl(*command, "--resume").ended(2).error["message"]
     for broken in (b"{}", b'{"v": 1, "\xff": 1}'):
         Path(result["page"]).with_suffix(".json").write_bytes(broken)
         assert "is no report" in ctl(*command).ended(2).error["hint"]

@@ -363,6 +363,8 @@ def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> No
         {"displacement_mm": 1e10},
         {"rate_mm_s": -1e308},
         {"preview_N": [float("nan")], "preview_dt_ms": 1.0},
+        {"preview_dt_ms": float("nan")},
+        {"preview_dt_ms": -1.0},
         {"contact": {"handle_mm": 1.0, "stiffness_N_mm": -0.1}},
     ],
 )

@@ -80,6 +80,9 @@ def commission(
             raise CommandError(Exit.REFUSED, "no_device", "no device is connected", "tormagctl firmware says why")
         path = folder / f"{serial_number:08x}.json"
         before = _decoded(path, Report, "it is no report: move it away") if path.exists() else None
+        if before is not None and before.serial_number != serial_number:
+            cause = f"{path}: serial_number = {before.serial_number}: allowed is {serial_number}, the device's"
+            raise usage_error(cause, "it is of another device: move it away")
         if is_resumed:
             if before is None:
                 raise usage_error(f"{path}: there is nothing to resume", "leave --resume out")

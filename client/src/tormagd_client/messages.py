@@ -98,14 +98,16 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         _require_within("displacement_mm", self.displacement_mm, 0.0, MAX_DISPLACEMENT_MM)
         _require_within("rate_mm_s", self.rate_mm_s, -MAX_RATE_MM_S, MAX_RATE_MM_S)
         _require_within("withdraw_cf", self.withdraw_cf, 0.0, MAX_FORCE_N)
+        spacing = self.preview_dt_ms
+        if self.preview_N is not None or spacing is not None:
+            is_spacing = spacing is not None and 0.0 < spacing <= 1_000.0
+            require(is_spacing, "preview_dt_ms", spacing, "above 0, to 1000 ms")
         if self.preview_N is not None:
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
             require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)
             for index, force_N in enumerate(self.preview_N):
                 if not 0.0 <= force_N <= MAX_FORCE_N:
                     raise ValueError(f"preview_N[{index}] = {force_N!r}: allowed is 0..{MAX_FORCE_N:g} N")
-            spacing = self.preview_dt_ms
-            require(spacing is not None and 0.0 < spacing <= 1_000.0, "preview_dt_ms", spacing, "above 0, to 1000 ms")
 
 
 class Tick(msgspec.Struct, frozen=True):
