@@ -56,6 +56,14 @@ def test_no_more_of_it_is_told_than_is_asked_for() -> None:
     assert len(nearest_path_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
 
 
+@pytest.mark.parametrize(("from_mm", "wanted_N"), [(89.9, (1.01, 1.0)), (50.1, (1.99, 2.0))])
+def test_no_carriages_are_sent_past_the_ends(from_mm: float, wanted_N: tuple[float, float]) -> None:
+    """The lead of a gap that is on its way to an end would."""
+    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEED_MM_S)
+    _, sent_mm = path.pursue(from_mm, from_mm, 1.0, [wanted_N[0]] + [wanted_N[1]] * 14, DeviceFit(), 0.0)
+    assert sent_mm == (90.0 if from_mm > 70.0 else 50.0)
+
+
 @pytest.mark.parametrize("device", [DeviceFit(), DeviceFit(scale=1.5, offset_N=0.1)])
 @pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
 @pytest.mark.parametrize("way", [1.0, -1.0])

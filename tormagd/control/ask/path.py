@@ -106,7 +106,8 @@ class Path:
             gap_mm = to_mm + (gap_mm - to_mm) * left
             forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
             left = left_in_a_step
-        return forces_N, path_mm[0]
+        # a path may lead past the portrait's ends, where no carriages are sent
+        return forces_N, min(max(path_mm[0], portrait.gap_mm[-1]), portrait.gap_mm[0])
 
 
 def nearest_path_mm(
