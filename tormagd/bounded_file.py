@@ -33,9 +33,9 @@ def in_place_of(path: Path) -> Iterator[Path]:
 
     The caller makes that file, `path` with `.part` behind it. What another left there is removed first, a pipe or a
     link too. To write to a pipe would wait for its reader, and a link's file is another's. After an error, inside or at
-    the end, that file is removed and `path` stays as it was. The caller sees to it that it is on the disk (fsync).
-    Raises IsADirectoryError where `path` is a folder, before anything is written, and OSError where nothing was made or
-    `path` cannot be replaced.
+    the end, that file is removed and `path` stays as it was. It is on the disk before it replaces `path`. Raises
+    IsADirectoryError where `path` is a folder, before anything is written, and OSError where nothing was made or `path`
+    cannot be replaced.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))
@@ -43,6 +43,8 @@ def in_place_of(path: Path) -> Iterator[Path]:
     beside.unlink(missing_ok=True)
     try:
         yield beside
+        with beside.open("rb") as file:
+            os.fsync(file.fileno())
         beside.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):

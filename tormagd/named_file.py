@@ -27,7 +27,7 @@ def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = 
     if name in names:
         return Path(str(folder / f"{name}{ending}"))
     try:
-        if (beside / name).exists():
+        if name and (beside / name).exists():
             return beside / name
     except OSError as error:  # a name that no file can have, or a directory that may not be entered
         reason = f"{error.strerror}; "

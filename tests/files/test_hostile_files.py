@@ -270,6 +270,15 @@ def test_what_another_left_is_not_written_through(tmp_path: Path, leave: Callabl
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "ours", "other": "another's"}
 
 
+def test_what_replaces_a_file_is_on_the_disk_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, synced = tmp_path / "a", []
+    path.write_text("old")
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append((path.read_text(), os.fstat(descriptor).st_size)))
+    with in_place_of(path) as beside:
+        beside.write_text("newer")
+    assert (synced, path.read_text()) == ([("old", 5)], "newer")
+
+
 def test_what_could_not_be_written_whole_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(UnicodeEncodeError), in_place_of(tmp_path / "a") as beside:
         beside.write_text("half of it\ud800", "utf-8")

@@ -103,6 +103,7 @@ def test_a_bad_plant_is_refused_with_key_value_and_what_is_allowed(
     ("text", "said"),
     [
         ('carriages = "sample_9"\n[pad]\n', "carriages = 'sample_9': allowed is a file or one of pad_1"),
+        ('carriages = ""\n[pad]\n', "carriages = '': allowed is a file or one of pad_1"),
         ('carriages = "sample_1"\n[pad]\n[motor]\n', "unknown field `motor`"),
         ('carriages = "sample_1"\n', "carriages = 'sample_1': allowed is a plant with one of [pad] and [second]"),
         ('carriages = "sample_1"\n[pad]\nmodulus_kPa = -1.0\n', ">= 1.0 - at `$.pad.modulus_kPa` (it is -1.0) (line"),

@@ -74,10 +74,8 @@ class ProfileFolder:
         path = self.path(profile.serial_number)
         try:
             self.folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-            with in_place_of(path) as beside, beside.open("wb") as file:
-                file.write(msgspec.json.format(msgspec.json.encode(profile)) + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
+            with in_place_of(path) as beside:
+                beside.write_bytes(msgspec.json.format(msgspec.json.encode(profile)) + b"\n")
         except OSError as error:
             raise ProfileError(f"{path}: {error.strerror}") from error
         except ValueError as error:  # a name with a zero in it
