@@ -249,7 +249,7 @@ class Bound:
     """A gap that the device's own motors move, to where its true force is the one wanted."""
 
     def __init__(self, core: Core, brake: Brake, drive: Drive | None) -> None:
-        self._core, self._drive, self._sliding_N = core, drive, brake.sliding_N
+        self._core, self._drive, self._brake = core, drive, brake
         self._gap_mm = np.arange(brake.gap_mm[0], brake.gap_mm[-1], GRID_MM)
         moment_Tm = np.interp(self._gap_mm, brake.gap_mm, brake.moment_Tm)
         self._fresh_N = np.interp(moment_Tm, brake.strength_Tm, brake.fresh_N)
@@ -262,16 +262,10 @@ class Bound:
         if abs(truth.force_N) > PULLS_N:
             self._is_pushing = truth.force_N > 0.0
         strength = truth.kinetic_N / float(np.interp(truth.gap_mm, self._gap_mm, self._fresh_N))
-        self._offset_N, self._scale = self._friction(abs(truth.handle_mm_s))
+        rate_mm_s = abs(truth.handle_mm_s)
+        # a hand that rests feels what it gives
+        self._offset_N, self._scale = (0.0, 1.0) if rate_mm_s < RESTING_MM_S else self._brake.felt(rate_mm_s)
         put_gap(plant, self._moved(truth.gap_mm, self._wanted_mm(setpoint, truth, strength)))
-
-    def _friction(self, rate_mm_s: float) -> tuple[float, float]:
-        """Offset, N, and scale of what a hand feels at this rate, over the kinetic force. A hand that rests feels what
-        it gives: there both are the same."""
-        if rate_mm_s < RESTING_MM_S:
-            return 0.0, 1.0
-        offset_N = self._sliding_N(0.0, rate_mm_s)
-        return offset_N, self._sliding_N(1.0, rate_mm_s) - offset_N
 
     def _gaps_for(self, forces_N: Array, strength: float) -> Array:
         force = self._core.scene.force

@@ -191,6 +191,12 @@ class Brake(NamedTuple):
         """Return the felt force of the open gap with a fresh element, while the handle moves at `hand_mm_s`."""
         return self.sliding_N(self.fresh_at_N(float(self.moment_Tm[-1])), hand_mm_s)
 
+    def felt(self, hand_mm_s: float) -> tuple[float, float]:
+        """Return offset, N, and scale of the felt force over the kinetic level, while the handle moves at
+        `hand_mm_s`."""
+        offset_N = self.sliding_N(0.0, hand_mm_s)
+        return offset_N, self.sliding_N(1.0, hand_mm_s) - offset_N
+
     def lags_Tm(self, moments_Tm: Array) -> Array:
         """Return the lag at each moment of a series; before the first the gap had been opened, and lagged
         `branch_Tm`."""
@@ -388,8 +394,7 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
     rested at `brake.rested_mm`. Neither `step_s` nor `hand_mm_s` is checked. Raises `DomainError` for a force that is
     NaN.
     """
-    offset_N = brake.sliding_N(0.0, hand_mm_s)
-    scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
+    offset_N, scale = brake.felt(hand_mm_s)
     # a gap that has been opened brakes a little more than one that was never closed
     least_N = brake.fresh_at_N(float(brake.moment_Tm[-1]), brake.lag.branch_Tm)
     greatest_N = brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.lag.branch_Tm)

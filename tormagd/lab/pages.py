@@ -51,22 +51,21 @@ def draw_beside(
     *,
     labels: tuple[str, str, str],
     title: str,
-    widths: tuple[float, float, float],
     finer: float = 1.0,
 ) -> None:
     """Draw `measured` and `explained` (n) over the time (n), s, and their difference times `finer`, as a picture.
 
-    `labels` are of the explained curve, of the quantity and of the difference, with their units; `widths` are the three
-    lines' in points. A file at `path` is replaced. Raises OSError, ModuleNotFoundError without matplotlib, and
-    ValueError for an ending that matplotlib does not know.
+    `labels` are of the explained curve, of the quantity and of the difference, with their units. A file at `path` is
+    replaced. Raises OSError, ModuleNotFoundError without matplotlib, and ValueError for an ending that matplotlib does
+    not know.
     """
     figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
-    above.plot(time_s, measured, color="#222222", linewidth=widths[0], label="measured")
-    above.plot(time_s, explained, color="#d1495b", linewidth=widths[1], label=labels[0])
+    above.plot(time_s, measured, color="#222222", linewidth=0.8, label="measured")
+    above.plot(time_s, explained, color="#d1495b", linewidth=0.8, label=labels[0])
     above.legend(frameon=False, ncols=2)
     above.set_ylabel(labels[1])
     above.set_title(title, loc="left")
-    below.plot(time_s, finer * (measured - explained), color="#2a6f97", linewidth=widths[2])
+    below.plot(time_s, finer * (measured - explained), color="#2a6f97", linewidth=0.8)
     below.set(xlabel="time, s", ylabel=labels[2])
     figure.savefig(path, dpi=110)
 

@@ -329,9 +329,9 @@ class Governor:
         from_mm, sent_mm = self._left_from(force_N, device)
         path_N, self.sent_mm = self._path.pursue(from_mm, sent_mm, dt_s, wanted_N, device, lag_s, most_N)
         # the path sets out sooner by as much as the carriages come later
-        expected_N = self.asked_N if self.expected_N is None else self.expected_N
-        if self.is_passing:
-            expected_N = force_N
+        expected_N = force_N if self.is_passing else self.expected_N
+        if expected_N is None:
+            expected_N = self.asked_N
         if dt_s > 0.0:
             expected_N += dt_s / (lag_s + dt_s) * (path_N[0] - expected_N)
         self.expected_N = expected_N

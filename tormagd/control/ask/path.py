@@ -14,6 +14,7 @@ from typing import Final, final
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.model.features import require_number
+from tormagd.model.force_curve import within
 
 PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
 "The times, from the moment that is planned for, at which a plan looks at the force to come."
@@ -98,8 +99,8 @@ class Path:
         if most_N is not None:
             lead_mm = late_s * self._gap_speed_mm_s
             for place, (now_N, then_N) in enumerate(most_N):
-                least_mm = portrait.gap_mm_at(device.model_N(now_N)) - lead_mm
-                path_mm[place] = max(path_mm[place], least_mm, portrait.gap_mm_at(device.model_N(then_N)))
+                least_mm = self.gap_mm(now_N, device) - lead_mm
+                path_mm[place] = max(path_mm[place], least_mm, self.gap_mm(then_N, device))
         gap_mm, forces_N = from_mm, []
         left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for to_mm in path_mm:
@@ -107,7 +108,7 @@ class Path:
             forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
             left = left_in_a_step
         # a path may lead past the portrait's ends, where no carriages are sent
-        return forces_N, min(max(path_mm[0], portrait.gap_mm[-1]), portrait.gap_mm[0])
+        return forces_N, within(path_mm[0], (portrait.gap_mm[-1], portrait.gap_mm[0]))
 
 
 def nearest_path_mm(

@@ -107,5 +107,4 @@ def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
         labels=("from the fit of the other half", "input, V", "difference, V"),
         title=f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {result['holdout_voltage_nrmse']:.1%}; "
         "gaps where it stands",
-        widths=(1.5, 1.0, 0.8),
     )

@@ -151,7 +151,6 @@ def draw(path: Path, twin: Twin, way: Excerpt) -> None:
         explained_N,
         labels=("by the plant's laws", "force, N", "difference, mN"),
         title=f"Model error {1e3 * twin.force.error_N:.1f} mN RMS, allowed {1e3 * EXPLAINED_N:g}",
-        widths=(0.6, 0.6, 0.5),
         finer=1e3,
     )
 
